@@ -1,0 +1,43 @@
+"""Bounded-uncertainty linear models of a plant, fitted to recorded transients and watched live.
+
+The public names are imported on first use (PEP 562), so that importing the package costs nothing and the
+live monitor never loads a solver, a plotting library or a bag reader.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from uncertain_lti.bag import read_transients as read_transients
+    from uncertain_lti.identification import fit as fit
+    from uncertain_lti.model import UncertainLTI as UncertainLTI
+    from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
+    from uncertain_lti.operating_point import OperatingPoint as OperatingPoint
+    from uncertain_lti.signals import SignalMap as SignalMap
+    from uncertain_lti.transient import Transient as Transient
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "EnvelopeMonitor": "monitor",
+    "OperatingPoint": "operating_point",
+    "SignalMap": "signals",
+    "Transient": "transient",
+    "UncertainLTI": "model",
+    "fit": "identification",
+    "read_transients": "bag",
+}
+
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
