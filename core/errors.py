@@ -1,8 +1,8 @@
-"""Errors meant for a person: each message is one sentence that names the file, topic or field, and the remedy."""
+"""Errors meant for a person: one sentence that names the file, topic or field, and the remedy."""
 
 
 class UncertainLTIError(Exception):
-    """Base of every error that this package raises on purpose; the command line prints it without a traceback."""
+    """Base of every error raised on purpose; the command line prints it without a traceback."""
 
 
 class BagError(UncertainLTIError):
