@@ -1,0 +1,65 @@
+"""Metadata and layout of the package, read by pip and by colcon; tool settings are in pyproject.toml."""
+
+from pathlib import Path
+
+from setuptools import setup
+
+NAME = "uncertain_lti_ros"
+ROOT = Path(__file__).resolve().parent
+
+
+def share(folder: str, pattern: str) -> list[tuple[str, list[str]]]:
+    """List the files under `folder` that match, to be installed to share/ with their folders."""
+    by_folder: dict[str, list[str]] = {}
+    for path in sorted((ROOT / folder).rglob(pattern)):
+        if path.is_file():
+            relative = path.relative_to(ROOT)
+            by_folder.setdefault(f"share/{NAME}/{relative.parent}", []).append(str(relative))
+    return list(by_folder.items())
+
+
+extras = {
+    # What `uncertain_lti.fit` needs. None of these asks for numpy 2, so a sourced ROS 2 keeps its numpy.
+    "fit": ["cvxpy", "daqp", "highspy", "osqp>=1", "piqp", "scipy"],
+    "frames": ["pandas"],
+    "plots": ["matplotlib"],
+    # Real rclpy where no ROS 2 is installed: wheels for x86_64 Linux.
+    "ros": ["ros-jazzy-common-interfaces==5.3.6", "ros-rclpy[fastrtps]==7.1.6"],
+    "test": ["hypothesis", "pytest", "pytest-timeout"],  # colcon test looks for pytest here
+    "dev": ["mypy", "ruff", "types-PyYAML"],
+}
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Linear models with bounded uncertainty, fitted to recorded transients and watched live in ROS 2",
+    long_description=(ROOT / "README.md").read_text() if (ROOT / "README.md").exists() else "",
+    long_description_content_type="text/markdown",
+    maintainer="uncertain-lti maintainers",
+    maintainer_email="maintainers@uncertain-lti.example",
+    license="Apache-2.0",
+    python_requires=">=3.11",
+    packages=["uncertain_lti", "uncertain_lti.identification", "uncertain_lti.plants", NAME],
+    package_dir={
+        "uncertain_lti": "core",
+        "uncertain_lti.identification": "core/identification",
+        "uncertain_lti.plants": "core/plants",
+    },
+    package_data={"uncertain_lti": ["py.typed"], "uncertain_lti.plants": ["*.json"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *share("launch", "*.launch.py"),
+        *share("config", "*"),
+    ],
+    zip_safe=False,
+    install_requires=["mcap", "numpy>=1.26", "PyYAML", "rosbags", "tqdm"],
+    extras_require=extras,
+    entry_points={
+        "console_scripts": [
+            "uncertain-lti = uncertain_lti.cli:main",
+            "envelope_monitor = uncertain_lti_ros.envelope_monitor:main",
+            "plant = uncertain_lti_ros.plant:main",
+        ]
+    },
+)
