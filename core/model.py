@@ -1,0 +1,647 @@
+"""UncertainLTI: the uncertain linear model, its one-step bounds, discrepancies and file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from uncertain_lti.errors import ModelError, SignalError
+from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.transient import Transient
+
+Array = NDArray[np.float64]
+
+FORMAT = "uncertain-lti/1"
+MAX_FILE_BYTES = 64 * 2**20
+_BLOCK = 4096  # samples per block of the vectorised path: stays in the cache
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How samples were cut when the model was fitted, and what the steps were; times in s."""
+
+    clock: str = ""
+    clock_type: str = ""
+    time: Mapping[str, str] = field(default_factory=dict)
+    dt_median: float | None = None
+    dt_min: float | None = None
+    dt_max: float | None = None
+    max_gap: float | None = None
+    min_step: float = 0.0
+    max_skew: float | None = None
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Normalised ranges of x (n,) and u (m,) seen in the fit; None where nothing was fitted."""
+
+    x_min: Array
+    x_max: Array
+    u_min: Array
+    u_max: Array
+
+    def outside(self, x: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
+        """(...,): z = [x; u] leaves the box in some element."""
+        x, u = np.asarray(x), np.asarray(u)
+        left_x = ((x < self.x_min) | (x > self.x_max)).any(axis=-1)
+        left_u = ((u < self.u_min) | (u > self.u_max)).any(axis=-1)
+        return np.asarray(left_x | left_u)
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """The alarm is raised while `violations` of the last `window` verdicts are violations.
+
+    margin multiplies the half-widths of the bounds that are judged.
+    """
+
+    violations: int = 1
+    window: int = 1
+    margin: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.violations <= self.window):
+            raise ModelError(
+                f"alarm: violations is {self.violations} of window {self.window}; it takes 1 <= violations <= window"
+            )
+        if not (math.isfinite(self.margin) and self.margin > 0):
+            raise ModelError(f"alarm: margin is {self.margin}; it must be a positive number")
+
+
+class UncertainLTI:
+    r"""dx/dt = (A ± ΔA) x + (B ± ΔB) u + (c ± Δc), measured with noise of at most v.
+
+    The bounds of one step from a recorded sample, Leibov (2006), eqs. (6)(7) with additive terms:
+
+    .. math::
+        h &= Δt (ΔA |x| + ΔB |u| + Δc) + v \\
+        x_{min}, x_{max} &= x + Δt (A x + B u + c) ∓ h
+
+    Parameters
+    ----------
+    A, dA : array (n, n)
+        Nominal elements and half-widths (>= 0), 1/s.
+    B, dB : array (n, m)
+        The same for the controls, 1/s.
+    c, dc : array (n,), optional
+        Drift and its half-width, 1/s; 0 by default.
+    v : array (n,), optional
+        Half-width of measurement noise, normalised; not multiplied by Δt; 0 by default.
+    signals : SignalMap, optional
+        Names, topics, operating point; default names x1.., u1.. and values used as they are.
+    sampling : Sampling, optional
+    domain : Domain, optional
+    alarm : Alarm, optional
+    fit, validation : mapping, optional
+        How the model was obtained; plain data that goes to the file as it is.
+
+    Raises
+    ------
+    ModelError
+        Shapes do not fit, a number is not finite, or a half-width is negative; names the field.
+    """
+
+    def __init__(
+        self,
+        A: ArrayLike,
+        B: ArrayLike,
+        dA: ArrayLike,
+        dB: ArrayLike,
+        c: ArrayLike | None = None,
+        dc: ArrayLike | None = None,
+        v: ArrayLike | None = None,
+        *,
+        signals: SignalMap | None = None,
+        sampling: Sampling | None = None,
+        domain: Domain | None = None,
+        alarm: Alarm | None = None,
+        fit: Mapping[str, Any] | None = None,
+        validation: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.A = _array(A, "A", None)
+        n = self.A.shape[0]
+        if self.A.ndim != 2 or self.A.shape != (n, n) or n == 0:
+            raise ModelError(f"A has shape {self.A.shape}; it must be square, one row per state")
+        self.B = _array(B, "B", None)
+        if self.B.size == 0:
+            self.B = np.zeros((n, 0))
+        if self.B.ndim != 2 or self.B.shape[0] != n:
+            raise ModelError(f"B has shape {self.B.shape}; it must have {n} rows, one per state")
+        m = self.B.shape[1]
+        zeros = np.zeros(n)
+        self.dA = _array(dA, "dA", (n, n), half_width=True)
+        self.dB = _array(dB if m else np.zeros((n, 0)), "dB", (n, m), half_width=True)
+        self.c = _array(zeros if c is None else c, "c", (n,))
+        self.dc = _array(zeros if dc is None else dc, "dc", (n,), half_width=True)
+        self.v = _array(zeros if v is None else v, "v", (n,), half_width=True)
+        for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+            getattr(self, name).flags.writeable = False
+        if signals is None:
+            signals = SignalMap(
+                tuple(Signal(f"x{i + 1}", "", f"x{i + 1}") for i in range(n)),
+                tuple(Signal(f"u{j + 1}", "", f"u{j + 1}") for j in range(m)),
+                source="model",
+            )
+        if (len(signals.states), len(signals.controls)) != (n, m):
+            raise ModelError(
+                f"{len(signals.states)} states and {len(signals.controls)} controls are named for "
+                f"A {self.A.shape} and B {self.B.shape}"
+            )
+        self.signals = signals
+        self.operating_point = OperatingPoint.of(signals.states, signals.controls)
+        self.sampling = sampling or Sampling(time=dict(signals.time))
+        unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
+        self.domain = domain or unbounded
+        self.alarm = alarm or Alarm()
+        self.fit = dict(fit or {})
+        self.validation = dict(validation or {})
+        # columns, contiguous: the verdict arithmetic walks over them in this order and no other
+        self._nominal = [np.ascontiguousarray(col) for col in np.hstack([self.A, self.B]).T]
+        self._spread = [np.ascontiguousarray(col) for col in np.hstack([self.dA, self.dB]).T]
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @property
+    def m(self) -> int:
+        """Number of controls."""
+        return int(self.B.shape[1])
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states."""
+        return tuple(s.name for s in self.signals.states)
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the controls."""
+        return tuple(s.name for s in self.signals.controls)
+
+    def __repr__(self) -> str:
+        text = f"UncertainLTI({self.n} states: {', '.join(self.state_names)}; {self.m} controls"
+        if self.m:
+            text += f": {', '.join(self.control_names)}"
+        if "criterion" in self.fit:
+            text += f"; fitted by {self.fit['criterion']} to {self.fit.get('transitions')} transitions"
+        return text + ")"
+
+    # --- one-step bounds ---
+
+    def centre_and_half(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike) -> tuple[Array, Array]:
+        """Centre and half-width of the bounds, each (..., n); see `bounds`."""
+        x = np.asarray(x, dtype=np.float64)
+        u = np.asarray(u, dtype=np.float64)
+        dt = np.asarray(dt, dtype=np.float64)
+        if x.shape[-1:] != (self.n,) or u.shape[-1:] != (self.m,):
+            raise ModelError(f"x has shape {x.shape} and u {u.shape}; they must end in {self.n} and {self.m}")
+        lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1], dt.shape)
+        if not lead:
+            return self._one(x, u, float(dt))
+        flat_x = np.broadcast_to(x, (*lead, self.n)).reshape(-1, self.n)
+        flat_u = np.broadcast_to(u, (*lead, self.m)).reshape(-1, self.m)
+        flat_dt = np.broadcast_to(dt, lead).reshape(-1)
+        centre, half = np.empty(flat_x.shape), np.empty(flat_x.shape)
+        for start in range(0, len(flat_dt), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            self._block(flat_x[part], flat_u[part], flat_dt[part], centre[part], half[part])
+        return centre.reshape(*lead, self.n), half.reshape(*lead, self.n)
+
+    # Both paths below do the same operations on each element in the same order (and never BLAS, whose order
+    # depends on shapes), so one sample and a million give the same bits.
+
+    def _one(self, x: Array, u: Array, dt: float) -> tuple[Array, Array]:
+        z = [*x.tolist(), *u.tolist()]
+        rate = self._nominal[0] * z[0]
+        spread = self._spread[0] * abs(z[0])
+        for value, nominal, half_width in zip(z[1:], self._nominal[1:], self._spread[1:], strict=True):
+            rate += nominal * value
+            spread += half_width * abs(value)
+        rate += self.c
+        spread += self.dc
+        rate *= dt
+        spread *= dt
+        return x + rate, spread + self.v
+
+    def _block(self, x: Array, u: Array, dt: Array, centre: Array, half: Array) -> None:
+        z = np.vstack([x.T, u.T])
+        size = np.abs(z)
+        product = np.empty(len(dt))
+        for i in range(self.n):
+            rate = z[0] * self._nominal[0][i]
+            spread = size[0] * self._spread[0][i]
+            for j in range(1, self.n + self.m):
+                rate += np.multiply(z[j], self._nominal[j][i], out=product)
+                spread += np.multiply(size[j], self._spread[j][i], out=product)
+            rate += self.c[i]
+            spread += self.dc[i]
+            rate *= dt
+            spread *= dt
+            np.add(z[i], rate, out=centre[:, i])
+            np.add(spread, self.v[i], out=half[:, i])
+
+    def bounds(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0) -> tuple[Array, Array]:
+        """One-step bounds, Leibov (2006), eqs. (6)(7) with the additive terms.
+
+        Parameters
+        ----------
+        x : array (..., n)
+            Normalised state at t_k.
+        u : array (..., m)
+            Normalised control at t_k.
+        dt : float or array (...)
+            Δt_k, s.
+        margin : float
+            Multiplies the half-widths.
+
+        Returns
+        -------
+        lower, upper : array (..., n)
+            Normalised x_min and x_max at t_{k+1}.
+
+        Raises
+        ------
+        ModelError
+            Shapes do not fit.
+        """
+        centre, half = self.centre_and_half(x, u, dt)
+        half = half * margin
+        return centre - half, centre + half
+
+    # --- the nominal model on its own ---
+
+    def simulate(self, x0: ArrayLike, u: ArrayLike, dt: ArrayLike) -> Array:
+        """Free run of the nominal model, x_{k+1} = x_k + Δt_k (A x_k + B u_k + c), as in eq. (3) with ΔA = ΔB = 0.
+
+        Parameters
+        ----------
+        x0 : array (n,)
+        u : array (N, m)
+        dt : float or array (N,)
+
+        Returns
+        -------
+        array (N+1, n)
+        """
+        u = np.asarray(u, dtype=np.float64)
+        dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(u),))
+        x = np.empty((len(u) + 1, self.n))
+        x[0] = x0
+        with np.errstate(over="ignore", invalid="ignore"):  # an unstable model runs away, and may
+            for k in range(len(u)):
+                x[k + 1] = x[k] + dt[k] * (self.A @ x[k] + self.B @ u[k] + self.c)
+        return x
+
+    def discrepancy(self, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
+        """Discrepancies (4) and (5) between the free-running nominal model and a recorded transient.
+
+        The run starts anew from the recorded sample at the start of every segment, and after every sample that
+        is not finite.
+
+        Parameters
+        ----------
+        transient : Transient
+            In recorded units.
+        W : array (n,), (N, n) or (N, n, n), optional
+            Weights of the arrival samples; default ones.
+
+        Returns
+        -------
+        sum_of_squares : float
+            Eq. (4), over k = 1..N.
+        largest : array (n,)
+            Eq. (5) for each state.
+        """
+        x = self.operating_point.normalise_x(transient.x)
+        u = self.operating_point.normalise_u(transient.u)
+        usable, dt = transient.usable, transient.dt
+        error = np.full((len(usable), self.n), np.nan)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
+        for start, stop in edges.reshape(-1, 2):
+            free = self.simulate(x[start], u[start:stop], dt[start:stop])
+            error[start:stop] = free[1:] - x[start + 1 : stop + 1]
+        weights = np.ones(self.n) if W is None else np.asarray(W, dtype=np.float64)
+        if weights.shape not in ((self.n,), (len(usable), self.n), (len(usable), self.n, self.n)):
+            raise ModelError(
+                f"W has shape {weights.shape}; it must be ({self.n},), ({len(usable)}, {self.n}) "
+                f"or ({len(usable)}, {self.n}, {self.n})"
+            )
+        diagonal = np.broadcast_to(
+            np.diagonal(weights, axis1=1, axis2=2) if weights.ndim == 3 else weights, error.shape
+        )[usable]
+        error = error[usable]
+        if weights.ndim == 3:
+            total = float(np.einsum("ki,kij,kj->", error, weights[usable], error))
+        else:
+            total = float(np.sum(diagonal * error**2))
+        largest = np.max(np.sqrt(diagonal) * np.abs(error), axis=0, initial=0.0)
+        return total, largest
+
+    def eigenvalues(self) -> NDArray[np.complex128]:
+        """Eigenvalues of A, 1/s, (n,), sorted by real part, greatest first."""
+        values = np.linalg.eigvals(self.A).astype(np.complex128)
+        return values[np.lexsort((values.imag, -values.real))]
+
+    def spectral_radius(self, dt: float | None = None) -> float:
+        """Largest |eigenvalue| of I + Δt A; above 1 the nominal recursion (3) runs away. dt: default dt_median."""
+        dt = self.sampling.dt_median if dt is None else dt
+        if dt is None:
+            raise ModelError("spectral radius: the model has no dt_median; give dt")
+        return float(np.abs(np.linalg.eigvals(np.eye(self.n) + dt * self.A)).max())
+
+    def with_(self, **changes: Any) -> UncertainLTI:
+        """The same model with some constructor arguments replaced."""
+        arguments = {
+            name: getattr(self, name)
+            for name in (
+                "A", "B", "dA", "dB", "c", "dc", "v", "signals", "sampling", "domain", "alarm", "fit", "validation"
+            )
+        }  # fmt: skip
+        return UncertainLTI(**{**arguments, **changes})
+
+    # --- the file ---
+
+    def to_dict(self) -> dict[str, Any]:
+        """The structure of the model file, format "uncertain-lti/1"."""
+        states = [
+            {key: getattr(s, key) for key in ("name", "topic", "type", "field", "unit", "steady", "scale")}
+            for s in self.signals.states
+        ]
+        controls = [
+            {
+                key: getattr(s, key)
+                for key in ("name", "topic", "type", "field", "unit", "steady", "scale", "max_hold", "delay")
+            }
+            for s in self.signals.controls
+        ]
+        s = self.sampling
+        return {
+            "format": FORMAT,
+            "states": states,
+            "controls": controls,
+            "sampling": {
+                "clock": s.clock,
+                "clock_type": s.clock_type,
+                "time": dict(s.time),
+                "dt_median": s.dt_median,
+                "dt_min": s.dt_min,
+                "dt_max": s.dt_max,
+                "max_gap": s.max_gap,
+                "min_step": s.min_step,
+                "max_skew": s.max_skew,
+            },
+            **{name: getattr(self, name).tolist() for name in ("A", "B", "dA", "dB", "c", "dc", "v")},
+            "domain": {
+                name: [v if math.isfinite(v) else None for v in getattr(self.domain, name).tolist()]
+                for name in ("x_min", "x_max", "u_min", "u_max")
+            },
+            "alarm": {
+                "violations": self.alarm.violations,
+                "window": self.alarm.window,
+                "margin": self.alarm.margin,
+            },
+            "fit": _plain(self.fit),
+            "validation": _plain(self.validation),
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model file; an existing file is replaced as a whole or not at all.
+
+        Raises
+        ------
+        ModelError
+            The file cannot be written.
+        """
+        text = _layout(self.to_dict())
+        folder = os.path.dirname(os.path.abspath(path))
+        temporary = None
+        try:
+            descriptor, temporary = tempfile.mkstemp(dir=folder, prefix=".model-", suffix=".tmp")
+            with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            mask = os.umask(0)
+            os.umask(mask)
+            os.chmod(temporary, 0o666 & ~mask)
+            os.replace(temporary, path)
+        except OSError as error:
+            if temporary is not None and os.path.exists(temporary):
+                os.unlink(temporary)
+            raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> UncertainLTI:
+        """Read a model file.
+
+        Raises
+        ------
+        ModelError
+            The file is missing, is not JSON, has an unknown format, wrong shapes, numbers that are not finite,
+            negative half-widths or scales that are not positive; names file and field.
+        """
+        try:
+            if os.path.getsize(path) > MAX_FILE_BYTES:
+                raise ModelError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, so not a model file; check the path")
+            with open(path, encoding="utf-8") as stream:
+                data = json.load(stream)
+        except FileNotFoundError:
+            raise ModelError(f"{path}: there is no such model file; write one with `uncertain-lti fit`") from None
+        except OSError as error:
+            raise ModelError(f"{path}: cannot be read: {error.strerror}; check the path") from None
+        except (ValueError, RecursionError) as error:
+            detail = str(error).split("\n")[0][:120]
+            raise ModelError(f"{path}: is not JSON ({detail}); write one with `uncertain-lti fit`") from None
+        return cls.from_dict(data, source=os.fspath(path))
+
+    @classmethod
+    def from_dict(cls, data: Any, source: str = "model") -> UncertainLTI:
+        """From the structure of a model file; raises ModelError naming source and field."""
+        try:
+            return cls._from_dict(data, source)
+        except ModelError as error:
+            text = str(error)
+            raise ModelError(text if text.startswith(source) else f"{source}: {text}") from None
+        except SignalError as error:
+            raise ModelError(str(error)) from None
+
+    @classmethod
+    def _from_dict(cls, data: Any, source: str) -> UncertainLTI:
+        if not isinstance(data, dict) or "format" not in data:
+            raise ModelError(f"no field 'format'; is this a model file written by `uncertain-lti fit` ({FORMAT})?")
+        if data["format"] != FORMAT:
+            raise ModelError(
+                f"format is {data['format']!r}, and this version reads {FORMAT!r}; fit the model again, "
+                f"or use the version that wrote it"
+            )
+        known = {
+            "format", "states", "controls", "sampling", "A", "B", "dA", "dB", "c", "dc", "v",
+            "domain", "alarm", "fit", "validation",
+        }  # fmt: skip
+        for name in ("states", "controls", "sampling", "A", "B", "dA", "dB"):
+            if name not in data:
+                raise ModelError(f"field '{name}' is missing; fit the model again")
+        for name in data:
+            if name not in known:
+                raise ModelError(f"unknown field '{name}'; known are {', '.join(sorted(known))}")
+        said = _object(data["sampling"], "sampling")
+        sampling = Sampling(
+            clock=_text(said.get("clock", ""), "sampling.clock"),
+            clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
+            time={
+                _text(k, "sampling.time"): _text(v, f"sampling.time[{k}]")
+                for k, v in _object(said.get("time", {}), "sampling.time").items()
+            },
+            min_step=_positive(said.get("min_step", 0.0), "sampling.min_step", zero=True) or 0.0,
+            **{
+                key: _positive(said.get(key), f"sampling.{key}")
+                for key in ("dt_median", "dt_min", "dt_max", "max_gap", "max_skew")
+            },
+        )
+        for topic, kind in sampling.time.items():
+            if kind not in ("header", "log"):
+                raise ModelError(f"sampling.time[{topic}] is {kind!r}; it must be header or log")
+        signals = replace(
+            SignalMap.from_dict(
+                {"states": data["states"], "controls": data["controls"]}, source=source, need_topics=False
+            ),
+            clock=sampling.clock or None,
+            max_gap=sampling.max_gap,
+            min_step=sampling.min_step,
+            max_skew=sampling.max_skew,
+            time={t: "log" if k == "log" else "header" for t, k in sampling.time.items()},
+        )
+        for signal in signals.signals:
+            for key in ("steady", "scale"):
+                if getattr(signal, key) == "auto":
+                    raise ModelError(f"{key} of '{signal.name}' is auto; a model file holds numbers")
+        n, m = len(signals.states), len(signals.controls)
+        domain = None
+        if "domain" in data:
+            box = _object(data["domain"], "domain")
+            sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
+            for name in sizes:
+                if name not in box:
+                    raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
+            domain = Domain(**{name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()})
+        alarm = _object(data.get("alarm", {}), "alarm")
+        for key in alarm:
+            if key not in ("violations", "window", "margin"):
+                raise ModelError(f"unknown field 'alarm.{key}'; known are violations, window, margin")
+        for key in ("violations", "window"):
+            if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
+                raise ModelError(f"alarm.{key} is {alarm[key]!r}; it must be a whole number")
+        if "margin" in alarm:
+            alarm["margin"] = _positive(alarm["margin"], "alarm.margin")
+        return cls(
+            *(data[name] for name in ("A", "B", "dA", "dB")),
+            *(data.get(name) for name in ("c", "dc", "v")),
+            signals=signals,
+            sampling=sampling,
+            domain=domain,
+            alarm=Alarm(**alarm),
+            fit=_object(data.get("fit", {}), "fit"),
+            validation=_object(data.get("validation", {}), "validation"),
+        )
+
+
+# --- reading and writing plain data -------------------------------------------------------------------------
+
+
+def _array(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_width: bool = False) -> Array:
+    try:
+        if isinstance(value, Sequence) and not _numbers_only(value):
+            raise TypeError
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ModelError(f"field '{name}' is not an array of numbers") from None
+    if shape is not None and array.shape != shape:
+        if array.size == 0 and 0 in shape:
+            return np.zeros(shape)
+        raise ModelError(f"field '{name}' has shape {array.shape}; it must be {shape}")
+    if not np.isfinite(array).all():
+        raise ModelError(f"field '{name}' holds a number that is not finite")
+    if half_width and (array < 0).any():
+        raise ModelError(f"field '{name}' holds a negative half-width")
+    return array
+
+
+def _numbers_only(value: Any) -> bool:
+    """No texts, truth values or nulls, which numpy would turn into numbers."""
+    if isinstance(value, (list, tuple)):
+        return all(_numbers_only(v) for v in value)
+    return not isinstance(value, (str, bool)) and value is not None
+
+
+def _object(value: Any, name: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ModelError(f"field '{name}' is not an object")
+    return dict(value)
+
+
+def _text(value: Any, name: str) -> str:
+    if not isinstance(value, str):
+        raise ModelError(f"field '{name}' is {value!r}; it must be a text")
+    return value
+
+
+def _positive(value: Any, name: str, zero: bool = False) -> float | None:
+    if value is None:
+        return None
+    fits = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if not fits or value < 0 or (value == 0 and not zero):
+        raise ModelError(f"field '{name}' is {value!r}; it must be a positive number")
+    return float(value)
+
+
+def _limits(value: Any, name: str, size: int) -> Array:
+    """A list of numbers; null stands for no limit."""
+    if not isinstance(value, list) or len(value) != size:
+        raise ModelError(f"field '{name}' must be a list of {size} numbers")
+    without = -math.inf if name.endswith("min") else math.inf
+    limits = _array([0.0 if v is None else v for v in value], name, (size,))
+    limits[[v is None for v in value]] = without
+    return limits
+
+
+def _plain(value: Any) -> Any:
+    """numpy and not finite numbers to what JSON has."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (np.integer, np.bool_)):
+        return value.item()
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def _layout(data: Mapping[str, Any]) -> str:
+    """JSON with one line per matrix row, signal and entry, so that a diff can be read."""
+
+    def flat(value: Any) -> str:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False)
+
+    lines = []
+    for key, value in data.items():
+        if isinstance(value, list) and value and isinstance(value[0], (list, dict)):
+            inner = ",\n    ".join(flat(row) for row in value)
+            lines.append(f"  {flat(key)}: [\n    {inner}\n  ]")
+        elif isinstance(value, dict) and value:
+            inner = ",\n    ".join(f"{flat(k)}: {flat(v)}" for k, v in value.items())
+            lines.append(f"  {flat(key)}: {{\n    {inner}\n  }}")
+        else:
+            lines.append(f"  {flat(key)}: {flat(value)}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"

@@ -1,0 +1,196 @@
+"""EnvelopeMonitor: samples in, verdicts and alarm out; the only place where either is made."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from uncertain_lti.errors import ModelError
+from uncertain_lti.model import Alarm, UncertainLTI
+from uncertain_lti.sampler import Status, Step
+from uncertain_lti.transient import Transient
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the monitor says of one clock message.
+
+    flags (n,): 0 contained, 1 violated, NaN no verdict. lower, upper, state (n,): the bounds that were judged and
+    the sample, in recorded units; NaN where there is none. utilisation (n,): (x_next - centre) / half with half
+    before the margin. outside_domain: z(t_k) lies outside the ranges seen in the fit. alarm: after this verdict.
+    """
+
+    t_ns: int
+    arrival_ns: int
+    status: Status
+    flags: Array
+    lower: Array
+    upper: Array
+    state: Array
+    utilisation: Array
+    outside_domain: bool
+    alarm: bool
+
+    @property
+    def judged(self) -> bool:
+        """There is a verdict: the message is neither dropped nor without a complete transition."""
+        return self.status is Status.OK
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """Verdicts over one transient, one row per sample k = 0..N; row k judges the arrival at t_k.
+
+    flags, lower, upper, utilisation (N+1, n) as in `Verdict`; judged, outside_domain, alarm (N+1,).
+    """
+
+    transient: Transient
+    flags: Array
+    lower: Array
+    upper: Array
+    utilisation: Array
+    judged: NDArray[np.bool_]
+    outside_domain: NDArray[np.bool_]
+    alarm: NDArray[np.bool_]
+
+    @property
+    def violated(self) -> NDArray[np.bool_]:
+        """(N+1,): some state left its bounds."""
+        left: NDArray[np.bool_] = (self.flags == 1.0).any(axis=1)
+        return left
+
+
+class EnvelopeMonitor:
+    """Judges one-step transitions by the bounds of a model, and raises the alarm when m of n are violations.
+
+    A sample is contained when lower <= x_next <= upper in the normalised quantities, nothing else (Leibov (2006),
+    eqs. (8)(9)). The alarm looks at the last `window` verdicts (messages without a verdict do not count) and
+    starts anew when time jumps back.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+    violations, window, margin : optional
+        In place of those in the model.
+
+    Raises
+    ------
+    ModelError
+        violations, window or margin are out of range.
+    """
+
+    def __init__(
+        self,
+        model: UncertainLTI,
+        violations: int | None = None,
+        window: int | None = None,
+        margin: float | None = None,
+    ) -> None:
+        said = model.alarm
+        self.model = model
+        self.rule = Alarm(
+            said.violations if violations is None else violations,
+            said.window if window is None else window,
+            said.margin if margin is None else margin,
+        )
+        self.alarm = False
+        self._recent: deque[bool] = deque(maxlen=self.rule.window)
+
+    def reset(self) -> None:
+        """Forget the recent verdicts and the alarm."""
+        self._recent.clear()
+        self.alarm = False
+
+    def predict(self, x: Array, u: Array, dt: float) -> tuple[Array, Array]:
+        """Bounds (lower, upper), each (n,), one step of dt s after x (n,), u (m,); all in recorded units."""
+        point = self.model.operating_point
+        lower, upper = self.model.bounds(
+            point.normalise_x(x), point.normalise_u(u), dt, margin=self.rule.margin
+        )
+        return point.recorded_x(lower), point.recorded_x(upper)
+
+    def judge(self, step: Step) -> Verdict:
+        """Verdict on one step of the sampler."""
+        if step.status is Status.RESET:
+            self.reset()
+        n = self.model.n
+        flags = np.full(n, np.nan)
+        lower, upper, utilisation = flags, flags, flags
+        outside = False
+        if step.status is Status.OK:
+            point = self.model.operating_point
+            x, u = point.normalise_x(step.x), point.normalise_u(step.u)
+            flags, lower, upper, utilisation = self._judge(x, u, np.float64(step.dt), point.normalise_x(step.x_next))
+            outside = bool(self.model.domain.outside(x, u))
+            self._recent.append(bool((flags == 1.0).any()))
+            self.alarm = sum(self._recent) >= self.rule.violations
+            lower, upper = point.recorded_x(lower), point.recorded_x(upper)
+        return Verdict(
+            step.t_ns,
+            step.arrival_ns,
+            step.status,
+            flags,
+            lower,
+            upper,
+            step.x_next,
+            utilisation,
+            outside,
+            self.alarm,
+        )
+
+    def check(self, transient: Transient) -> Verdicts:
+        """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.
+
+        Raises
+        ------
+        ModelError
+            The transient has other numbers of states or controls than the model.
+        """
+        model, point = self.model, self.model.operating_point
+        if transient.x.shape[1] != model.n or transient.u.shape[1] != model.m:
+            raise ModelError(
+                f"{transient.name}: {transient.x.shape[1]} states and {transient.u.shape[1]} controls, and the "
+                f"model has {model.n} and {model.m}"
+            )
+        steps = transient.transitions()
+        count, n = len(transient), model.n
+        arrival = steps.k + 1
+        flags, lower = np.full((count, n), np.nan), np.full((count, n), np.nan)
+        upper, utilisation = np.full((count, n), np.nan), np.full((count, n), np.nan)
+        judged, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+        x, u = point.normalise_x(steps.x), point.normalise_u(steps.u)
+        x_next = point.normalise_x(steps.x_next)
+        flags[arrival], low, high, utilisation[arrival] = self._judge(x, u, steps.dt, x_next)
+        lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
+        judged[arrival] = True
+        outside[arrival] = model.domain.outside(x, u)
+        violated = (flags == 1.0).any(axis=1)
+        alarm = np.zeros(count, dtype=bool)
+        resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
+        for start, stop in zip([0, *resets], [*resets, count], strict=True):
+            alarm[start:stop] = self._m_of_n(judged[start:stop], violated[start:stop])
+        return Verdicts(transient, flags, lower, upper, utilisation, judged, outside, alarm)
+
+    def _judge(self, x: Array, u: Array, dt: Array | np.float64, x_next: Array) -> tuple[Array, Array, Array, Array]:
+        """flags, lower, upper (normalised), utilisation of transitions (..., n), (..., m), (...), (..., n)."""
+        centre, half = self.model.centre_and_half(x, u, dt)
+        judged_half = half * self.rule.margin
+        lower, upper = centre - judged_half, centre + judged_half
+        inside = (lower <= x_next) & (x_next <= upper)
+        flags = np.where(inside, 0.0, 1.0)
+        difference = x_next - centre
+        with np.errstate(divide="ignore", invalid="ignore"):
+            utilisation = np.where(difference == 0.0, 0.0, difference / half)
+        return flags, lower, upper, utilisation
+
+    def _m_of_n(self, judged: NDArray[np.bool_], violated: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        total = np.concatenate([[0], np.cumsum(violated[judged])])
+        ends = np.arange(1, len(total))
+        recent = total[ends] - total[np.maximum(ends - self.rule.window, 0)]
+        raised = np.concatenate([[False], recent >= self.rule.violations])
+        held: NDArray[np.bool_] = raised[np.cumsum(judged)]  # without a verdict the last one stands
+        return held

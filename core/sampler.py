@@ -1,0 +1,362 @@
+"""Sampler: a stream of messages becomes samples (t, x, u), with one meaning offline and live."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from uncertain_lti.errors import SignalError
+from uncertain_lti.signals import FieldPath, SignalMap
+
+_TWO_PI = 2.0 * math.pi
+BUFFERED_MESSAGES = 10_000
+"""Messages kept per topic that wait for a later sample; older ones go first."""
+
+
+def to_ns(seconds: float) -> int:
+    """Seconds to whole nanoseconds; infinity becomes a step longer than any recording."""
+    return round(seconds * 1e9) if math.isfinite(seconds) else 2**62
+
+
+class Status(StrEnum):
+    """What became of one clock message."""
+
+    OK = "ok"  # the transition that ends in this sample can be judged
+    FIRST = "first"  # first sample of a recording
+    RESET = "reset"  # time stepped back by more than max_gap: first sample of a new segment
+    GAP = "gap"  # the step is longer than max_gap: first sample of a new segment
+    MISSING = "missing"  # a signal at either end is missing, stale, NaN or infinite
+    EQUAL = "equal stamp"  # dropped: the instant of the sample before
+    SHORT = "short step"  # dropped: less than min_step after the sample before
+    LATE = "late"  # dropped: at most max_gap before the sample before
+    UNSTAMPED = "no stamp"  # dropped: header time is wanted and the stamp is zero
+
+    @property
+    def dropped(self) -> bool:
+        """The message made no sample."""
+        return self in (Status.EQUAL, Status.SHORT, Status.LATE, Status.UNSTAMPED)
+
+    @property
+    def opens_segment(self) -> bool:
+        """The sample has no predecessor."""
+        return self in (Status.FIRST, Status.RESET, Status.GAP)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One decided clock message: the sample k+1 at t_ns and the transition that ends in it.
+
+    x (n,), u (m,) belong to sample k, x_next (n,) to sample k+1, all in recorded units, with NaN for what is
+    missing. dt is Δt_k in s. Without a sample k (first, reset) x and u are all NaN and dt is NaN; for a dropped
+    message x_next is NaN as well.
+    """
+
+    status: Status
+    t_ns: int
+    arrival_ns: int
+    dt: float
+    x: NDArray[np.float64]
+    u: NDArray[np.float64]
+    x_next: NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class _Message:
+    arrival: int
+    stamp: int | None
+    values: list[float]
+
+
+class _Topic:
+    """Messages of one topic that may still be chosen, and how far it got."""
+
+    __slots__ = ("header", "kept", "last_stamp", "chosen", "unwrap", "previous", "steady")
+
+    def __init__(self, header: bool, unwrap: list[int], steady: list[float]) -> None:
+        self.header = header
+        self.kept: deque[_Message] = deque(maxlen=BUFFERED_MESSAGES)
+        self.last_stamp: int | None = None
+        self.chosen: _Message | None = None
+        self.unwrap = unwrap
+        self.steady = steady
+        self.previous = list(steady)
+
+    def unwrapped(self, values: list[float]) -> list[float]:
+        for i in self.unwrap:
+            if math.isfinite(values[i]):
+                values[i] += _TWO_PI * round((self.previous[i] - values[i]) / _TWO_PI)
+                self.previous[i] = values[i]
+        return values
+
+
+def _behind(sample: _Message, message: _Message) -> int:
+    """Age of a message at a sample, in ns: between the stamps where both have one, else between arrivals."""
+    if sample.stamp is not None and message.stamp is not None:
+        return sample.stamp - message.stamp
+    return sample.arrival - message.arrival
+
+
+class Sampler:
+    """Messages in order of arrival in, one `Step` per clock message out, as soon as it is decided.
+
+    A clock message opens sample k at its instant; the next accepted clock message closes it, and only then are
+    u(t_k) and the states of other topics fixed: the message with the greatest stamp <= t_k among those arrived,
+    ties to the latest arrival. A step is decided when its second sample opens, or, where states come from more
+    than one topic, when that sample closes. Nothing is resampled.
+
+    Parameters
+    ----------
+    signals : SignalMap
+        With clock, max_gap and a time source for every topic resolved (`bag.read_transients` and the model
+        file do that).
+
+    Attributes
+    ----------
+    counters : Counter
+        samples, gaps, resets and missing; dropped messages by status value; `late <topic>` for messages that came
+        after the sample they belonged to was closed; `missing <signal>` and `stale <signal>` per sample.
+
+    Raises
+    ------
+    SignalError
+        Something in the map is not resolved.
+    """
+
+    def __init__(self, signals: SignalMap) -> None:
+        if signals.clock is None or signals.max_gap is None:
+            raise SignalError(f"{signals.source}: clock and max_gap must be resolved before sampling")
+        unsaid = [t for t in signals.topics if t not in signals.time]
+        if unsaid:
+            raise SignalError(f"{signals.source}: the time source of {', '.join(unsaid)} is not resolved")
+        self.signals = signals
+        self.clock = signals.clock
+        self.max_gap_ns = to_ns(signals.max_gap)
+        self.min_step_ns = to_ns(signals.min_step)
+        skew_ns = self.max_gap_ns if signals.max_skew is None else to_ns(signals.max_skew)
+        n = len(signals.states)
+        self._n, self._nm = n, len(signals.signals)
+        self._where = {topic: signals.on(topic) for topic in signals.topics}
+        self._max_age = [skew_ns] * n + [
+            2**62 if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls
+        ]
+        self._one_topic = all(s.topic == self.clock for s in signals.states)
+        self._delays = [(n + j, c.delay) for j, c in enumerate(signals.controls) if c.delay]
+        self._topics: dict[str, _Topic] = {}
+        for topic, where in self._where.items():
+            here = [signals.signals[i] for i in where]
+            unwrap = [i for i, s in enumerate(here) if FieldPath(s.field).unwrap]
+            steady = [0.0 if s.steady == "auto" else s.steady for s in here]
+            self._topics[topic] = _Topic(signals.time[topic] == "header", unwrap, steady)
+        self.counters: Counter[str] = Counter()
+        self._open: _Message | None = None  # sample k: the clock message that opened it
+        self._open_status = Status.FIRST
+        self._open_dt = math.nan
+        self._closed: _Message | None = None  # sample k-1, and what was fixed when it closed
+        self._before: NDArray[np.float64] | None = None
+        self._history: dict[int, deque[float]] = {}
+
+    def push(
+        self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]
+    ) -> list[Step]:
+        """Take one message; return the clock messages that it decided (none, one, or seldom two).
+
+        Parameters
+        ----------
+        topic : str
+            One of `signals.topics`.
+        arrival_ns : int
+            Log time, or live the node clock at receipt.
+        stamp_ns : int or None
+            Header stamp; None where there is none or it is zero. Ignored for topics that go by log time.
+        values : sequence of float
+            The topic's signals in the order of `signals.on(topic)`.
+        """
+        state = self._topics[topic]
+        message = _Message(arrival_ns, stamp_ns if state.header else None, list(values))
+        if topic == self.clock:
+            return self._push_clock(state, message)
+        if message.stamp is not None:
+            last = state.last_stamp
+            if last is not None and message.stamp < last - self.max_gap_ns:
+                state.kept.clear()  # a looped bag: what was kept belongs to the end of the last pass
+                state.chosen = None
+                state.previous = list(state.steady)
+            state.last_stamp = message.stamp
+            if self._closed is not None and self._came_late(state, message):
+                self.counters[f"late {topic}"] += 1
+        state.unwrapped(message.values)
+        state.kept.append(message)
+        return []
+
+    def _came_late(self, state: _Topic, message: _Message) -> bool:
+        closed = self._closed
+        assert closed is not None
+        if closed.stamp is None or message.stamp is None or message.stamp > closed.stamp:
+            return False
+        return state.chosen is None or _behind(closed, message) <= _behind(closed, state.chosen)
+
+    def _push_clock(self, state: _Topic, message: _Message) -> list[Step]:
+        instant = message.stamp if state.header else message.arrival
+        if instant is None:
+            return [self._dropped(Status.UNSTAMPED, message.arrival, message)]
+        steps: list[Step] = []
+        status, dt = Status.FIRST, math.nan
+        if self._open is not None:
+            step = instant - self._instant(self._open)
+            if step == 0:
+                return [self._dropped(Status.EQUAL, instant, message)]
+            if 0 < step < self.min_step_ns:
+                return [self._dropped(Status.SHORT, instant, message)]
+            if -self.max_gap_ns <= step < 0:
+                return [self._dropped(Status.LATE, instant, message)]
+            status = Status.OK if 0 < step <= self.max_gap_ns else Status.GAP if step > 0 else Status.RESET
+            dt = step * 1e-9 if step > 0 else math.nan
+        if status.opens_segment:
+            state.previous = list(state.steady)
+        state.unwrapped(message.values)
+        if self._open is not None:
+            closing = self._open
+            z = self._fix(closing, final=True)
+            if not self._one_topic:
+                steps.append(self._step(self._open_status, closing, self._open_dt, self._before, z[: self._n]))
+            self._closed, self._before = closing, z
+        if status.opens_segment:
+            self._history = {}
+        if self._one_topic:
+            x_next = np.full(self._n, math.nan)
+            for i, value in zip(self._where[self.clock], message.values, strict=True):
+                if i < self._n:
+                    x_next[i] = value
+            steps.append(self._step(status, message, dt, self._before, x_next))
+        self._open, self._open_status, self._open_dt = message, status, dt
+        self.counters["samples"] += 1
+        if status is Status.GAP:
+            self.counters["gaps"] += 1
+        elif status is Status.RESET:
+            self.counters["resets"] += 1
+        return steps
+
+    def _instant(self, sample: _Message) -> int:
+        return sample.arrival if sample.stamp is None else sample.stamp
+
+    def _dropped(self, status: Status, instant: int, message: _Message) -> Step:
+        self.counters[status.value] += 1
+        nothing = np.full(self._n, math.nan)
+        return Step(
+            status, instant, message.arrival, math.nan, nothing, np.full(self._nm - self._n, math.nan), nothing
+        )
+
+    def _step(
+        self,
+        status: Status,
+        message: _Message,
+        dt: float,
+        before: NDArray[np.float64] | None,
+        x_next: NDArray[np.float64],
+    ) -> Step:
+        if before is None or status in (Status.FIRST, Status.RESET):
+            before = np.full(self._nm, math.nan)
+        if status is Status.OK and not (np.isfinite(before).all() and np.isfinite(x_next).all()):
+            status = Status.MISSING
+            self.counters["missing"] += 1
+        return Step(
+            status, self._instant(message), message.arrival, dt, before[: self._n], before[self._n :], x_next
+        )
+
+    def _fix(self, sample: _Message, final: bool) -> NDArray[np.float64]:
+        """z = [x; u] of the open sample from what has arrived; final: the sample closes now."""
+        z = np.full(self._nm, math.nan)
+        for topic, where in self._where.items():
+            if topic == self.clock:
+                z[where] = sample.values
+                continue
+            state = self._topics[topic]
+            chosen, age = None, 2**63
+            for message in state.kept:
+                behind = _behind(sample, message)
+                if 0 <= behind <= age:
+                    chosen, age = message, behind
+            if final:
+                state.chosen = chosen
+                if chosen is not None:  # older ones can no longer be the greatest stamp
+                    state.kept = deque(
+                        (m for m in state.kept if m is chosen or _behind(sample, m) < 0), BUFFERED_MESSAGES
+                    )
+            for i, value in zip(where, chosen.values if chosen else (), strict=bool(chosen)):
+                if age <= self._max_age[i]:
+                    z[i] = value
+                elif final:
+                    self.counters[f"stale {self.signals.signals[i].name}"] += 1
+        for i, delay in self._delays:
+            line = self._history.setdefault(i, deque(maxlen=delay + 1))
+            line = line if final else line.copy()
+            line.append(z[i])
+            z[i] = line[0] if len(line) > delay else math.nan
+        if final:
+            for signal, finite in zip(self.signals.signals, np.isfinite(z), strict=True):
+                if not finite:
+                    self.counters[f"missing {signal.name}"] += 1
+        return z
+
+    def latest(self) -> tuple[int, NDArray[np.float64], NDArray[np.float64]] | None:
+        """(t_ns, x (n,), u (m,)) of the open sample with what is known so far; None before the first sample."""
+        if self._open is None:
+            return None
+        z = self._fix(self._open, final=False)
+        return self._instant(self._open), z[: self._n], z[self._n :]
+
+
+def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> int | None:
+    """Median of the forward steps of clock instants over all recordings, ns; None where there is no step.
+
+    Equal stamps and steps back do not count, nor do steps under min_step_ns.
+    """
+    forward = [steps[(steps > 0) & (steps >= min_step_ns)] for steps in map(np.diff, instants)]
+    pooled = np.concatenate(forward) if forward else np.empty(0, np.int64)
+    return int(np.median(pooled)) if pooled.size else None
+
+
+def resolve(
+    signals: SignalMap,
+    instants: Mapping[str, Sequence[NDArray[np.int64]]],
+    time: Mapping[str, str],
+) -> SignalMap:
+    """Fill in clock, max_gap and time sources by the stated rules.
+
+    Parameters
+    ----------
+    signals : SignalMap
+    instants : mapping
+        Per topic the instants of its messages in each recording, (messages,) ns, by that topic's time source.
+    time : mapping
+        Per topic `header` or `log`.
+
+    Raises
+    ------
+    SignalError
+        The clock has fewer than two distinct instants.
+    """
+    min_step_ns = to_ns(signals.min_step)
+    medians = {
+        t: median_step_ns(instants[t], min_step_ns) for t in dict.fromkeys(s.topic for s in signals.states)
+    }
+    clock = signals.clock or max(medians, key=lambda t: (medians[t] or 0))
+    step = medians[clock]
+    if step is None:
+        count = sum(len(i) for i in instants[clock])
+        raise SignalError(
+            f"{clock}: {count} messages without a forward step in time, so no transition; "
+            f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
+        )
+    max_gap = signals.max_gap if signals.max_gap is not None else 2.5 * step * 1e-9
+    return replace(
+        signals,
+        clock=clock,
+        max_gap=max_gap,
+        time={t: "header" if time[t] == "header" else "log" for t in signals.topics},
+    )

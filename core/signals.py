@@ -1,0 +1,483 @@
+"""SignalMap: which topic and field is which state or control."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
+
+from uncertain_lti.errors import SignalError
+
+Number = float | Literal["auto"]
+TimeSource = Literal["header", "log"]
+
+
+# --- message types, described the same way offline (bag definitions) and live (rclpy classes) ---------------
+
+
+@dataclass(frozen=True, slots=True)
+class FieldType:
+    """Type of one message field.
+
+    kind is what one element is; type_name the element's type; array is None for a single value, 0 for a
+    sequence of any length and n for n elements.
+    """
+
+    kind: Literal["number", "bool", "string", "message", "other"]
+    type_name: str
+    array: int | None = None
+
+
+TypeFields = Callable[[str], Mapping[str, FieldType]]
+"""Type name -> {field name: FieldType}; raises SignalError for an unknown type."""
+
+
+def numeric_paths(type_name: str, type_fields: TypeFields, depth: int = 6) -> Iterator[str]:
+    """Field paths of a type that can be signals; arrays end in `[]` (sequence) or `[n]` (fixed length)."""
+    for name, kind in type_fields(type_name).items():
+        suffix = "" if kind.array is None else "[]" if kind.array == 0 else f"[{kind.array}]"
+        if kind.kind in ("number", "bool"):
+            yield name + suffix
+        elif kind.kind == "message" and depth > 1:
+            for inner in numeric_paths(kind.type_name, type_fields, depth - 1):
+                yield f"{name}{suffix}.{inner}"
+
+
+# --- field paths --------------------------------------------------------------------------------------------
+
+_FUNCTIONS = ("roll", "pitch", "yaw", "norm", "unwrap")
+_STEP = re.compile(r"""\.?([A-Za-z_]\w*)|\[\s*(\d+)\s*\]|\[\s*"([^"]+)"\s*\]|\[\s*([^\[\]"]+?)\s*\]""")
+_NAN = math.nan
+
+
+def _roll(q: Any) -> float:
+    x, y, z, w = q.x, q.y, q.z, q.w
+    norm2 = x * x + y * y + z * z + w * w
+    return math.atan2(2.0 * (w * x + y * z), norm2 - 2.0 * (x * x + y * y)) if norm2 > 0.0 else _NAN
+
+
+def _pitch(q: Any) -> float:
+    x, y, z, w = q.x, q.y, q.z, q.w
+    norm2 = x * x + y * y + z * z + w * w
+    return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x) / norm2))) if norm2 > 0.0 else _NAN
+
+
+def _yaw(q: Any) -> float:
+    x, y, z, w = q.x, q.y, q.z, q.w
+    norm2 = x * x + y * y + z * z + w * w
+    return math.atan2(2.0 * (w * z + x * y), norm2 - 2.0 * (y * y + z * z)) if norm2 > 0.0 else _NAN
+
+
+def _norm(value: Any) -> float:
+    if hasattr(value, "x"):
+        return math.hypot(*(float(getattr(value, c)) for c in "xyzw" if hasattr(value, c)))
+    return math.hypot(*(float(v) for v in value))
+
+
+_ANGLES: Mapping[str, Callable[[Any], float]] = {"roll": _roll, "pitch": _pitch, "yaw": _yaw, "norm": _norm}
+
+
+class FieldPath:
+    """One scalar of a message: `a.b[3]`, `position[fan]`, `yaw(pose.orientation)`, `unwrap(...)`.
+
+    Dotted attributes; `[3]` is an index, `[fan]` the position of `fan` in the `name` array of the message that
+    holds the array (as in sensor_msgs/JointState), `["3"]` a name that looks like an index. Derived: roll,
+    pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle
+    in rad (the sampler does the unwrapping, as it knows where a stream starts anew).
+
+    Raises
+    ------
+    SignalError
+        The text is not a field path.
+    """
+
+    __slots__ = ("text", "unwrap", "_function", "_steps", "_name_index")
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.unwrap = False
+        self._function: Callable[[Any], float] | None = None
+        self._name_index = 0
+        inner = text.strip()
+        functions: list[str] = []
+        while match := re.fullmatch(r"([A-Za-z_]\w*)\s*\((.*)\)", inner, re.DOTALL):
+            if match[1] not in _FUNCTIONS:
+                raise SignalError(
+                    f"field '{text}': there is no function '{match[1]}'; there are {', '.join(_FUNCTIONS)}"
+                )
+            functions.append(match[1])
+            inner = match[2].strip()
+        if functions[:1] == ["unwrap"]:
+            self.unwrap = True
+            functions = functions[1:]
+        if len(functions) > 1 or "unwrap" in functions:
+            raise SignalError(f"field '{text}': functions nest only as unwrap(roll|pitch|yaw(...))")
+        if functions:
+            self._function = _ANGLES[functions[0]]
+        self._steps = self._parse(inner)
+
+    def _parse(self, inner: str) -> tuple[tuple[str, str | int], ...]:
+        steps: list[tuple[str, str | int]] = []
+        position = 0
+        while position < len(inner):
+            match = _STEP.match(inner, position)
+            dotted = inner[position] == "."
+            if not match or (match[1] is not None and dotted != bool(steps)) or (match[1] is None and not steps):
+                raise SignalError(
+                    f"field '{self.text}' is not a field path; write for example twist.linear.x, data[0], "
+                    f"position[fan] or yaw(pose.orientation)"
+                )
+            if match[1] is not None:
+                steps.append(("attribute", match[1]))
+            elif match[2] is not None:
+                steps.append(("index", int(match[2])))
+            else:
+                steps.append(("name", match[3] or match[4]))
+            position = match.end()
+        if not steps:
+            raise SignalError(f"field '{self.text}' is empty; name a field of the message")
+        return tuple(steps)
+
+    def __repr__(self) -> str:
+        return f"FieldPath({self.text!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FieldPath) and other.text == self.text
+
+    def __hash__(self) -> int:
+        return hash(self.text)
+
+    def read(self, message: Any) -> float:
+        """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero."""
+        value, parent = message, message
+        for kind, key in self._steps:
+            if kind == "attribute":
+                parent, value = value, getattr(value, key)  # type: ignore[arg-type]
+            elif kind == "index":
+                if key >= len(value):  # type: ignore[operator]
+                    return _NAN
+                value = value[key]
+            else:
+                index = self._find_name(parent.name, key)  # type: ignore[arg-type]
+                if index < 0 or index >= len(value):
+                    return _NAN
+                value = value[index]
+        return self._function(value) if self._function else float(value)
+
+    def _find_name(self, names: Sequence[str], wanted: str) -> int:
+        index = self._name_index  # names seldom move between messages
+        if index < len(names) and names[index] == wanted:
+            return index
+        for index, name in enumerate(names):
+            if name == wanted:
+                self._name_index = index
+                return index
+        return -1
+
+    def missing_name(self, message: Any) -> tuple[str, list[str]] | None:
+        """(name, names there) where this path looks up a name that the message's `name` array lacks."""
+        value, parent = message, message
+        for kind, key in self._steps:
+            if kind == "attribute":
+                parent, value = value, getattr(value, key)  # type: ignore[arg-type]
+            elif kind == "name":
+                names = [str(name) for name in parent.name]
+                if key not in names:
+                    return str(key), names
+                value = value[names.index(str(key))] if names.index(str(key)) < len(value) else None
+            else:
+                value = value[key] if key < len(value) else None  # type: ignore[operator]
+            if value is None:
+                return None
+        return None
+
+    def check(self, topic: str, type_name: str, type_fields: TypeFields) -> None:
+        """Hold the path against a message type.
+
+        Raises
+        ------
+        SignalError
+            The path is not in the type, or is not one number; the sentence names what is there.
+        """
+        here = f"field '{self.text}' of {topic} ({type_name})"
+        current: FieldType = FieldType("message", type_name)
+        parent: Mapping[str, FieldType] = {}
+        for kind, key in self._steps:
+            if kind == "attribute":
+                if current.array is not None:
+                    raise SignalError(f"{here}: give an index before '.{key}', for example [0]")
+                if current.kind != "message":
+                    raise SignalError(f"{here}: a {current.type_name} has no fields, so no '{key}'")
+                parent = type_fields(current.type_name)
+                if key not in parent:
+                    raise SignalError(
+                        f"{here}: there is no '{key}' in {current.type_name}; fields there: "
+                        f"{', '.join(parent) or 'none'}; numeric field paths of {topic}: "
+                        f"{_some(numeric_paths(type_name, type_fields))}"
+                    )
+                current = parent[str(key)]
+                continue
+            if current.array is None:
+                raise SignalError(f"{here}: '[{key}]' follows something that is not an array; leave it out")
+            if kind == "index" and current.array and int(key) >= current.array:
+                raise SignalError(f"{here}: index {key} is past the end of an array of {current.array}")
+            if kind == "name":
+                names = parent.get("name")
+                if names is None or names.kind != "string" or names.array is None:
+                    raise SignalError(
+                        f"{here}: '[{key}]' needs an array of strings called 'name' beside it; "
+                        f"give an index instead, for example [0]"
+                    )
+            current = replace(current, array=None)
+        self._check_leaf(here, current, type_name, topic, type_fields)
+
+    def _check_leaf(
+        self, here: str, leaf: FieldType, type_name: str, topic: str, type_fields: TypeFields
+    ) -> None:
+        if self._function is not None:
+            number = leaf.kind == "number"
+            inner = type_fields(leaf.type_name) if leaf.kind == "message" and leaf.array is None else {}
+            if self._function is _norm:
+                fits = (number and leaf.array is not None) or ("x" in inner and inner["x"].kind == "number")
+                wants = "a vector with x, y, z or an array of numbers"
+            else:
+                fits = all(c in inner and inner[c].kind == "number" for c in "xyzw")
+                wants = "a quaternion with x, y, z, w"
+            if not fits:
+                raise SignalError(f"{here}: wants {wants}, and {leaf.type_name} is none")
+        elif leaf.kind not in ("number", "bool") or leaf.array is not None:
+            what = "an array; give an index, for example [0]" if leaf.array is not None else f"a {leaf.type_name}"
+            raise SignalError(
+                f"{here} is not one number but {what}; numeric field paths of {topic}: "
+                f"{_some(numeric_paths(type_name, type_fields))}"
+            )
+
+
+def _some(paths: Iterator[str], limit: int = 24) -> str:
+    found = list(paths)
+    more = f", and {len(found) - limit} more" if len(found) > limit else ""
+    return (", ".join(found[:limit]) or "none") + more
+
+
+# --- the map ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """One state or control: where it is read, and the operating point it is measured from.
+
+    steady and scale are in recorded units; `auto` asks for the rule in `operating_point`. max_hold (s, controls
+    only; None = no limit) is the greatest age at which a held control still counts; delay (samples, controls
+    only) shifts the control: sample k takes u(t_{k - delay}).
+    """
+
+    name: str
+    topic: str
+    field: str
+    steady: Number = 0.0
+    scale: Number = 1.0
+    unit: str = ""
+    type: str = ""
+    max_hold: float | None = None
+    delay: int = 0
+
+
+@dataclass(frozen=True)
+class SignalMap:
+    """Which topic and field is which state or control, and how samples are cut from the messages.
+
+    clock is the topic whose messages define the sample instants (None: the slowest state topic); max_gap (s)
+    the longest step that is still a transition (None: 2.5 x the median step); min_step (s) the shortest;
+    max_skew (s) the greatest age of a state from another topic than the clock (None: max_gap); time says per
+    topic whether its instant is the header stamp or the log time (not said: header where the type has one
+    and stamps are not zero).
+
+    Raises
+    ------
+    SignalError
+        A name is used twice, a number is out of range, a field is not a field path, or nothing is a state.
+    """
+
+    states: tuple[Signal, ...]
+    controls: tuple[Signal, ...] = ()
+    clock: str | None = None
+    max_gap: float | None = None
+    min_step: float = 0.0
+    max_skew: float | None = None
+    time: Mapping[str, TimeSource] = field(default_factory=dict)
+    source: str = "signals"
+
+    def __post_init__(self) -> None:
+        if not self.states:
+            raise SignalError(f"{self.source}: 'states' is empty; list at least one state")
+        seen: set[str] = set()
+        for signal in (*self.states, *self.controls):
+            where = f"{self.source}: signal '{signal.name}'"
+            if signal.name in seen:
+                raise SignalError(f"{where} is listed twice; give each state and control its own name")
+            seen.add(signal.name)
+            FieldPath(signal.field)
+            if signal.scale != "auto" and not (math.isfinite(signal.scale) and signal.scale > 0):
+                raise SignalError(f"{where}: scale is {signal.scale}; it must be a positive number or auto")
+            if signal.steady != "auto" and not math.isfinite(signal.steady):
+                raise SignalError(f"{where}: steady is {signal.steady}; it must be a finite number or auto")
+            if signal.max_hold is not None and not signal.max_hold >= 0:
+                raise SignalError(f"{where}: max_hold is {signal.max_hold}; it must be 0 s or more")
+            if signal.delay < 0:
+                raise SignalError(f"{where}: delay is {signal.delay}; it must be 0 samples or more")
+        for signal in self.states:
+            if signal.max_hold is not None or signal.delay:
+                raise SignalError(
+                    f"{self.source}: state '{signal.name}' has max_hold or delay; both are for controls "
+                    f"(the age of a state is limited by max_skew)"
+                )
+        if self.clock is not None and self.clock not in {s.topic for s in self.states}:
+            raise SignalError(
+                f"{self.source}: clock is {self.clock}, which carries no state; choose one of "
+                f"{', '.join(dict.fromkeys(s.topic for s in self.states))}"
+            )
+        for topic in self.time:
+            if topic not in self.topics:
+                raise SignalError(
+                    f"{self.source}: 'topics' names {topic}, which carries no signal; "
+                    f"signals come from {', '.join(self.topics)}"
+                )
+        for name in ("max_gap", "max_skew"):
+            value = getattr(self, name)
+            if value is not None and not (value > 0):
+                raise SignalError(f"{self.source}: {name} is {value}; it must be a positive number of seconds")
+        if not (math.isfinite(self.min_step) and self.min_step >= 0):
+            raise SignalError(f"{self.source}: min_step is {self.min_step}; it must be 0 s or more")
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """States, then controls: the order of z = [x; u]."""
+        return self.states + self.controls
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Topics that carry a signal, states first, each once."""
+        return tuple(dict.fromkeys(s.topic for s in self.signals))
+
+    def on(self, topic: str) -> list[int]:
+        """Positions in `signals` of what this topic carries."""
+        return [i for i, s in enumerate(self.signals) if s.topic == topic]
+
+    def check(self, topic: str, type_name: str, type_fields: TypeFields) -> None:
+        """Hold every field path of one topic against its message type; raises SignalError."""
+        for i in self.on(topic):
+            FieldPath(self.signals[i].field).check(topic, type_name, type_fields)
+
+    def with_types(self, types: Mapping[str, str]) -> SignalMap:
+        """The same map with the message type of each topic filled in."""
+        return replace(
+            self,
+            states=tuple(replace(s, type=types.get(s.topic, s.type)) for s in self.states),
+            controls=tuple(replace(s, type=types.get(s.topic, s.type)) for s in self.controls),
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SignalMap:
+        """Read a signals file (YAML).
+
+        Raises
+        ------
+        SignalError
+            The file is missing, is not YAML, or a key or value in it is wrong; the sentence names it.
+        """
+        import yaml  # the live node reads signals from the model file and needs no YAML
+
+        try:
+            with open(path, encoding="utf-8") as stream:
+                data = yaml.safe_load(stream)
+        except FileNotFoundError:
+            raise SignalError(f"{path}: there is no such signals file; check the path") from None
+        except OSError as error:
+            raise SignalError(f"{path}: cannot be read: {error.strerror}; check the path") from None
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            mark = getattr(error, "problem_mark", None)
+            line = f" at line {mark.line + 1}" if mark else ""
+            raise SignalError(f"{path}: is not YAML{line}: {getattr(error, 'problem', error)}; mend it") from None
+        return cls.from_dict(data, source=os.fspath(path))
+
+    @classmethod
+    def from_dict(cls, data: Any, source: str = "signals", need_topics: bool = True) -> SignalMap:
+        """Build from the structure of a signals file (see `load`); raises SignalError.
+
+        need_topics: every signal must name its topic; a model fitted to arrays has none.
+        """
+        top = _keys(
+            data, source, {"clock", "max_gap", "min_step", "max_skew", "topics", "states", "controls"}
+        )
+        time: dict[str, TimeSource] = {}
+        for topic, options in _keys(top.get("topics") or {}, f"{source}: topics", None).items():
+            said = _keys(options, f"{source}: topics: {topic}", {"time"}).get("time")
+            if said not in ("header", "log"):
+                raise SignalError(f"{source}: topics: {topic}: time is {said!r}; write header or log")
+            time[topic] = said
+        clock = top.get("clock")
+        if clock is not None and not isinstance(clock, str):
+            raise SignalError(f"{source}: clock is {clock!r}; write the name of a state topic")
+        return cls(
+            states=_signals(top.get("states"), f"{source}: states", need_topics),
+            controls=_signals(top.get("controls"), f"{source}: controls", need_topics),
+            clock=clock,
+            max_gap=_number(top.get("max_gap"), f"{source}: max_gap"),
+            min_step=_number(top.get("min_step"), f"{source}: min_step") or 0.0,
+            max_skew=_number(top.get("max_skew"), f"{source}: max_skew"),
+            time=time,
+            source=source,
+        )
+
+
+def _keys(data: Any, where: str, known: set[str] | None) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise SignalError(f"{where}: a mapping is wanted here, not {type(data).__name__}; see config/signals/")
+    for key in data:
+        if known is not None and key not in known:
+            raise SignalError(f"{where}: unknown key '{key}'; known are {', '.join(sorted(known))}")
+    return data
+
+
+def _number(value: Any, where: str) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, str):  # YAML 1.1 reads 1e-3 as text
+        try:
+            value = float(value)
+        except ValueError:
+            pass
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        raise SignalError(f"{where} is {value!r}; write a number")
+    return float(value)
+
+
+def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
+    if data is None:
+        return ()
+    if not isinstance(data, list):
+        raise SignalError(f"{where}: a list is wanted here, not {type(data).__name__}; see config/signals/")
+    known = {f.name for f in fields(Signal)}
+    signals = []
+    for position, entry in enumerate(data):
+        here = f"{where}[{position}]"
+        entry = dict(_keys(entry, here, known))
+        for key in ("name", "topic", "field"):
+            if not isinstance(entry.get(key), str) or not (entry[key] or (key == "topic" and not need_topics)):
+                raise SignalError(f"{here}: '{key}' is {entry.get(key)!r}; write a text")
+        for key in ("steady", "scale"):
+            if key in entry and entry[key] != "auto":
+                number = _number(entry[key], f"{here}: {key}")
+                entry[key] = number if number is not None else {"steady": 0.0, "scale": 1.0}[key]
+        if "max_hold" in entry:
+            entry["max_hold"] = _number(entry["max_hold"], f"{here}: max_hold")
+        delay = entry.get("delay", 0)
+        if isinstance(delay, bool) or not isinstance(delay, int):
+            raise SignalError(f"{here}: delay is {delay!r}; write a whole number of samples")
+        for key in ("unit", "type"):
+            entry[key] = str(entry.get(key) or "")
+        signals.append(Signal(**entry))
+    return tuple(signals)

@@ -1,0 +1,334 @@
+"""Transient: one recorded run as arrays, cut into segments at gaps."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from uncertain_lti.errors import TransientError
+from uncertain_lti.sampler import Status, median_step_ns, to_ns
+from uncertain_lti.signals import SignalMap
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """The usable transitions k -> k+1 of one transient, in recorded units.
+
+    k (N,) is the position of sample k in the transient; dt (N,) s; x, x_next (N, n); u (N, m); all finite.
+    """
+
+    k: NDArray[np.intp]
+    dt: Array
+    x: Array
+    u: Array
+    x_next: Array
+
+
+class Transient:
+    """One recorded run: samples (t, x, u), the steps between them, and where they may not be joined.
+
+    Parameters
+    ----------
+    t : array (N+1,)
+        Instants: s where the numbers are floating point, ns where they are integers. Kept as integer ns.
+    x : array (N+1, n)
+        States in recorded units; NaN where a sample has none.
+    u : array (N+1, m)
+        Controls in recorded units, u[k] acting from t[k] to t[k+1]; the last row is never used.
+    name : str
+        What messages call this run (the bag or file).
+    signals : SignalMap, optional
+        Where the arrays came from; gives names, units and the operating point to a fit.
+    state_names, control_names : sequence of str, optional
+        Where there is no SignalMap; default x1.., u1...
+    max_gap : float, optional
+        s; a longer step starts a new segment. Default 2.5 x the median step; math.inf for no limit.
+    min_step : float
+        s; a sample less than this after the one before is dropped, one with an equal stamp always.
+
+    A sample at most max_gap earlier than the one before is dropped as late; one earlier than that starts a new
+    segment. `dropped` counts by reason.
+
+    Raises
+    ------
+    TransientError
+        Shapes do not fit, times are not finite, steps are below a nanosecond, or nothing is left.
+    """
+
+    t_ns: NDArray[np.int64]
+    x: Array
+    u: Array
+    segment: NDArray[np.int32]
+    dropped: Counter[str]
+
+    def __init__(
+        self,
+        t: ArrayLike,
+        x: ArrayLike,
+        u: ArrayLike,
+        *,
+        name: str = "transient",
+        signals: SignalMap | None = None,
+        state_names: Sequence[str] | None = None,
+        control_names: Sequence[str] | None = None,
+        max_gap: float | None = None,
+        min_step: float = 0.0,
+        dropped: Mapping[str, int] | None = None,
+    ) -> None:
+        self.name = name
+        self.signals = signals
+        t_ns = _nanoseconds(t, name)
+        self.x = _matrix(x, len(t_ns), "x", name)
+        self.u = _matrix(u, len(t_ns), "u", name)
+        if self.x.shape[1] == 0:
+            raise TransientError(f"{name}: x has no column; give at least one state")
+        self.state_names = _names(state_names, signals.states if signals else None, "x", self.x, name)
+        self.control_names = _names(control_names, signals.controls if signals else None, "u", self.u, name)
+        self.dropped = Counter(dropped or {})
+        min_step_ns = to_ns(min_step)
+        median = median_step_ns([t_ns], min_step_ns)
+        if max_gap is None:
+            max_gap = 2.5 * median * 1e-9 if median else math.inf
+        self.max_gap, self.min_step = float(max_gap), float(min_step)
+        kept, self.segment = _segments(t_ns, to_ns(self.max_gap), min_step_ns, self.dropped)
+        self.t_ns = t_ns
+        if len(kept) < len(t_ns):
+            self.t_ns, self.x, self.u = t_ns[kept], self.x[kept], self.u[kept]
+        for array in (self.t_ns, self.x, self.u, self.segment):
+            array.flags.writeable = False
+
+    @property
+    def t(self) -> Array:
+        """Instants in s since the first sample, (N+1,)."""
+        return (self.t_ns - self.t_ns[0]) * 1e-9 if len(self.t_ns) else np.empty(0)
+
+    @property
+    def dt(self) -> Array:
+        """Δt_k = (t_{k+1} - t_k) * 1e-9 s, (N,); also across segments."""
+        return np.diff(self.t_ns) * 1e-9
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(N,): the transition k -> k+1 lies in one segment and is finite at both ends."""
+        if len(self.t_ns) < 2:
+            return np.zeros(0, dtype=bool)
+        finite_x: NDArray[np.bool_] = np.isfinite(self.x).all(axis=1)
+        finite_u: NDArray[np.bool_] = np.isfinite(self.u).all(axis=1)
+        same = self.segment[1:] == self.segment[:-1]
+        usable: NDArray[np.bool_] = same & finite_x[:-1] & finite_u[:-1] & finite_x[1:]
+        return usable
+
+    def transitions(self) -> Transitions:
+        """The usable transitions, as arrays in recorded units."""
+        usable = self.usable
+        if usable.all():  # the usual clean case: views, no copies
+            k = np.arange(len(usable))
+            return Transitions(k, self.dt, self.x[:-1], self.u[:-1], self.x[1:])
+        k = np.flatnonzero(usable)
+        return Transitions(k, self.dt[k], self.x[k], self.u[k], self.x[k + 1])
+
+    @property
+    def segments(self) -> int:
+        """Number of segments."""
+        return len(np.unique(self.segment))
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def __repr__(self) -> str:
+        n, m, usable = self.x.shape[1], self.u.shape[1], int(self.usable.sum())
+        span = float(self.t[-1]) if len(self) else 0.0
+        return (
+            f"Transient({self.name!r}: {len(self)} samples over {span:g} s, {n} states, {m} controls, "
+            f"{usable} usable transitions in {self.segments} segments)"
+        )
+
+    @classmethod
+    def from_dataframe(
+        cls, frame: Any, *, time: str | None = None, states: Sequence[str], controls: Sequence[str], **options: Any
+    ) -> Transient:
+        """From a pandas DataFrame.
+
+        Parameters
+        ----------
+        frame : pandas.DataFrame
+        time : str, optional
+            Column with the instants: numbers in s, or time stamps. Default: the index.
+        states, controls : sequence of str
+            Columns. A name that stands twice is taken once if both columns are equal.
+        **options
+            As in Transient.
+
+        Raises
+        ------
+        TransientError
+            A column is missing or not numeric.
+        """
+        name = options.setdefault("name", "data frame")
+        columns = [str(c) for c in frame.columns]
+        chosen = [frame.iloc[:, _column(columns, c, name, lambda i: frame.iloc[:, i])] for c in (*states, *controls)]
+        t = frame.index if time is None else frame.iloc[:, _column(columns, time, name, lambda i: frame.iloc[:, i])]
+        t = np.asarray(t)
+        if t.dtype.kind in "mM":
+            t = t.astype(f"{t.dtype.kind}8[ns]").astype(np.int64)
+        else:
+            t = _numeric(t, time or "index", name)
+        values = [_numeric(np.asarray(c), n, name) for c, n in zip(chosen, (*states, *controls), strict=True)]
+        z = np.column_stack(values) if values else np.empty((len(t), 0))
+        return cls(
+            t, z[:, : len(states)], z[:, len(states) :], state_names=states, control_names=controls, **options
+        )
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        time: str,
+        states: Sequence[str],
+        controls: Sequence[str],
+        delimiter: str = ",",
+        **options: Any,
+    ) -> Transient:
+        """From a CSV file with one header line; columns by name, empty cells are NaN, time in s.
+
+        Raises
+        ------
+        TransientError
+            The file is missing or a column is missing or not numeric.
+        """
+        name = options.setdefault("name", os.fspath(path))
+        try:
+            with open(path, encoding="utf-8-sig") as stream:
+                columns = [c.strip().strip('"') for c in stream.readline().split(delimiter)]
+                wanted = (time, *states, *controls)
+                raw = np.genfromtxt(stream, delimiter=delimiter, dtype=np.float64, ndmin=2, invalid_raise=True)
+        except FileNotFoundError:
+            raise TransientError(f"{path}: there is no such file; check the path") from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise TransientError(f"{path}: cannot be read as text: {error}; check the file") from None
+        except ValueError as error:
+            first = str(error).strip().splitlines()[-1].strip()
+            raise TransientError(f"{path}: rows differ in length ({first}); mend the file") from None
+        if raw.shape[1] != len(columns):
+            raise TransientError(
+                f"{path}: the header names {len(columns)} columns, the rows have {raw.shape[1]}; "
+                f"is the delimiter {delimiter!r}?"
+            )
+        z = raw[:, [_column(columns, c, name, lambda i: raw[:, i]) for c in wanted]]
+        for column, values in zip(wanted, z.T, strict=True):
+            if len(values) and np.isnan(values).all():
+                raise TransientError(f"{path}: column '{column}' holds no number; choose another")
+        split = 1 + len(states)
+        return cls(
+            z[:, 0], z[:, 1:split], z[:, split:], state_names=states, control_names=controls, **options
+        )
+
+
+def _column(columns: Sequence[str], wanted: str, name: str, values: Any) -> int:
+    found = [i for i, c in enumerate(columns) if c == wanted]
+    if not found:
+        raise TransientError(f"{name}: there is no column '{wanted}'; columns are {', '.join(columns)}")
+    for other in found[1:]:
+        if not np.array_equal(np.asarray(values(found[0])), np.asarray(values(other))):
+            raise TransientError(f"{name}: column '{wanted}' stands twice with different values; rename one")
+    return found[0]
+
+
+def _numeric(values: NDArray[Any], column: str, name: str) -> Array:
+    try:
+        return values.astype(np.float64)
+    except (TypeError, ValueError):
+        raise TransientError(f"{name}: column '{column}' is not numeric; choose another or convert it") from None
+
+
+def _nanoseconds(t: ArrayLike, name: str) -> NDArray[np.int64]:
+    raw = np.array(t)
+    if raw.ndim != 1:
+        raise TransientError(f"{name}: t has shape {raw.shape}; it must be a vector (N+1,)")
+    if raw.dtype.kind in "iu":
+        return raw.astype(np.int64)
+    try:
+        seconds = raw.astype(np.float64)
+    except (TypeError, ValueError):
+        raise TransientError(f"{name}: t is not numeric; give seconds, or integer nanoseconds") from None
+    if not np.isfinite(seconds).all():
+        where = int(np.argmin(np.isfinite(seconds)))
+        raise TransientError(f"{name}: t[{where}] is {seconds[where]}; leave out samples without a time")
+    if seconds.size and np.abs(seconds).max() > 9.2e9:
+        raise TransientError(f"{name}: t reaches {np.abs(seconds).max():g} s; are these nanoseconds? Give integers")
+    t_ns = np.rint(seconds * 1e9).astype(np.int64)
+    steps = np.diff(seconds)
+    forward = steps[steps > 0]
+    if forward.size and np.median(forward) < 5e-9:
+        raise TransientError(
+            f"{name}: steps of {np.median(forward):g} s are too short for a nanosecond clock; "
+            f"give time in a larger unit"
+        )
+    return t_ns
+
+
+def _matrix(values: ArrayLike, rows: int, what: str, name: str) -> Array:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise TransientError(f"{name}: {what} is not numeric; give numbers, NaN where there is none") from None
+    if array.ndim == 1 and what == "u" and array.size == 0:
+        array = array.reshape(rows, 0)
+    elif array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2 or array.shape[0] != rows:
+        raise TransientError(
+            f"{name}: {what} has shape {array.shape}, and t has {rows} instants; give one row of {what} per instant"
+        )
+    return array
+
+
+def _names(
+    given: Sequence[str] | None, signals: Sequence[Any] | None, letter: str, values: Array, name: str
+) -> tuple[str, ...]:
+    count = values.shape[1]
+    names = tuple(given) if given is not None else tuple(s.name for s in signals) if signals is not None else None
+    if names is None:
+        return tuple(f"{letter}{i + 1}" for i in range(count))
+    if len(names) != count:
+        raise TransientError(f"{name}: {len(names)} names for {count} columns of {letter}")
+    return names
+
+
+def _segments(
+    t_ns: NDArray[np.int64], max_gap_ns: int, min_step_ns: int, dropped: Counter[str]
+) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """Positions of the samples that stay, and the segment of each: the rules of `Sampler`."""
+    steps = np.diff(t_ns)
+    opens = (steps > max_gap_ns) | (steps < -max_gap_ns)
+    if (opens | (steps >= max(min_step_ns, 1))).all():
+        kept = np.arange(len(t_ns))
+    else:  # dropping a sample changes the step of the next one, so one after the other
+        positions: list[int] = [0]
+        last = int(t_ns[0])
+        for position, instant in enumerate(t_ns.tolist()[1:], start=1):
+            step = instant - last
+            if step == 0:
+                dropped[Status.EQUAL.value] += 1
+            elif 0 < step < min_step_ns:
+                dropped[Status.SHORT.value] += 1
+            elif -max_gap_ns <= step < 0:
+                dropped[Status.LATE.value] += 1
+            else:
+                positions.append(position)
+                last = instant
+        kept = np.array(positions, dtype=np.intp)
+        steps = np.diff(t_ns[kept])
+        opens = (steps > max_gap_ns) | (steps < 0)
+    segment = np.zeros(len(kept), dtype=np.int32)
+    segment[1:] = np.cumsum(opens)
+    return kept, segment
