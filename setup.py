@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = "uncertain_lti_ros"
+CORE = {"uncertain_lti": "core"} | {f"uncertain_lti.{p}": f"core/{p.replace('.', '/')}" for p in find_packages("core")}
 ROOT = Path(__file__).resolve().parent
 
 
@@ -39,12 +40,8 @@ setup(
     maintainer_email="maintainers@uncertain-lti.example",
     license="Apache-2.0",
     python_requires=">=3.11",
-    packages=["uncertain_lti", "uncertain_lti.identification", "uncertain_lti.plants", NAME],
-    package_dir={
-        "uncertain_lti": "core",
-        "uncertain_lti.identification": "core/identification",
-        "uncertain_lti.plants": "core/plants",
-    },
+    packages=[*CORE, NAME],
+    package_dir=CORE,
     package_data={"uncertain_lti": ["py.typed"], "uncertain_lti.plants": ["*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
