@@ -1,0 +1,473 @@
+"""Bag: one MCAP recording as decoded messages in order of log time."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import os
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any, Literal, NamedTuple
+
+from mcap.records import Schema
+from uncertain_lti.bag_files import listed_parts, natural, os_error, parts_of, stem_and_index
+from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.mcap_records import Block, Contents, count, messages, read_block, scan
+from uncertain_lti.message_types import Definition, define, header_stamp_ns, normal_name, undefined
+from uncertain_lti.signal_paths import signal_paths
+from uncertain_lti.signals import FieldType, TypeFields
+
+__all__ = [
+    "Bag",
+    "RawMessage",
+    "RecordedChannel",
+    "TopicFacts",
+    "TopicInfo",
+    "describe",
+    "group_recordings",
+    "header_stamp_ns",
+]
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """What a recording holds of one topic: messages that count, first and last log time (ns; None without any).
+
+    reason says why a topic is not readable, or which of its messages are left out.
+    """
+
+    topic: str
+    type: str
+    count: int
+    encoding: str
+    readable: bool
+    reason: str
+    first: int | None
+    last: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedChannel:
+    """A channel as the file describes it: everything needed to write its messages again.
+
+    counted says whether its messages are those of its topic (see `Bag` on topics with several types).
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    schema: Schema | None
+    metadata: Mapping[str, str]
+    definition: Definition
+    counted: bool = False
+
+
+class RawMessage(NamedTuple):
+    """One message as recorded; times in ns."""
+
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+    channel: RecordedChannel
+
+    @property
+    def topic(self) -> str:
+        """Topic it was published on."""
+        return self.channel.topic
+
+    @property
+    def type(self) -> str:
+        """Message type, `pkg/msg/Type`."""
+        return self.channel.type
+
+    @property
+    def encoding(self) -> str:
+        """Encoding of `data`; `cdr` is what can be decoded."""
+        return self.channel.encoding
+
+
+class Bag:
+    """One recording: an MCAP file, a folder, or the parts of a split bag given as `parts`.
+
+    A folder's metadata.yaml says which files in which order; without one its files must be the parts
+    `<stem>_<i>.mcap` of one split bag (see `group_recordings`), taken in natural order. The file is walked once
+    on opening; messages are read and decoded while they are iterated. Of messages that are out of order only
+    what overlaps is held, as raw bytes.
+
+    Messages of one topic that has several types: the type with the most messages counts, the others are left
+    out with a warning. Messages that do not fit their definition are left out with a warning as they are met.
+
+    Raises
+    ------
+    BagError
+        There is no recording, or no message of it can be read.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], parts: Sequence[str | os.PathLike[str] | Contents] = ()) -> None:
+        self.path = Path(path)
+        self._warnings: list[str] = []
+        self._undecoded: dict[str, str] = {}
+        contents = [part if isinstance(part, Contents) else scan(Path(part)) for part in parts]
+        self._contents = contents or self._open()
+        self._warnings += [warning for part in self._contents for warning in part.warnings]
+        if self._warnings and not any(part.count for part in self._contents):
+            raise BagError(f"{self.path}: no message can be read ({self._warnings[0]}); record or copy it anew")
+        self._channels = [_channels(part) for part in self._contents]
+        self.topics: Mapping[str, TopicInfo] = self._topics()
+
+    @property
+    def parts(self) -> tuple[Path, ...]:
+        """Files of the recording in order."""
+        return tuple(part.path for part in self._contents)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is missing or left out, each one sentence that begins with the file; grows while messages are read."""
+        return [*self._warnings, *self._undecoded.values()]
+
+    def fields(self, type_name: str) -> Mapping[str, FieldType]:
+        """Field name -> FieldType of a type that a readable topic has or uses; raises SignalError for others."""
+        for channel in self._every_channel():
+            if channel.counted and type_name in channel.definition.types:
+                return channel.definition.fields(type_name)
+        raise SignalError(f"{type_name}: not defined in {self.path}; check the type")
+
+    def type_fields(self, topic: str) -> TypeFields:
+        """`fields` as one topic's own schema defines them; raises BagError as `messages` does."""
+        self._require(topic)
+        channels = (channel for channel in self._every_channel() if channel.topic == topic and channel.counted)
+        return next(channels).definition.fields
+
+    def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
+        """(topic, log time in ns, message) in order of log time, ties in file order, over all parts.
+
+        Raises
+        ------
+        BagError
+            A topic is not there (the sentence names those that are) or cannot be decoded (it says why).
+        """
+        wanted = set(topics)
+        for topic in sorted(wanted):
+            self._require(topic)
+        return self._decoded([_of(channels, wanted, counted=True) for channels in self._channels])
+
+    def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
+        """Messages as recorded, of these topics or of all, also those that cannot be decoded; same order.
+
+        Raises
+        ------
+        BagError
+            A topic is not there; the sentence names those that are.
+        """
+        wanted = set(self.topics if topics is None else topics)
+        for topic in sorted(wanted):
+            self._require(topic, readable=False)
+        return self._sorted([_of(channels, wanted) for channels in self._channels])
+
+    def _open(self) -> list[Contents]:
+        try:
+            if self.path.is_dir():
+                return self._folder()
+            if self.path.exists() and not self.path.is_file():
+                raise BagError(f"{self.path}: neither a file nor a folder; check the path")
+            return [scan(self.path)]
+        except OSError as error:
+            raise os_error(self.path, error) from None
+
+    def _folder(self) -> list[Contents]:
+        paths, listed, self._warnings = parts_of(self.path)
+        contents = []
+        for path in paths:
+            if len(paths) > 1 and not path.stat().st_size:  # the part that was open when the power went
+                self._warnings.append(f"{path}: the file is empty; it is left out")
+            else:
+                contents.append(scan(path))
+        if not listed and (why := _not_one_recording(contents)):
+            raise BagError(
+                f"{self.path}: without a metadata.yaml its files do not look like one recording ({why}); name them "
+                f"one by one: {', '.join(path.name for path in paths)}"
+            )
+        return contents
+
+    def _topics(self) -> dict[str, TopicInfo]:
+        groups: dict[str, dict[tuple[str, str, str], list[tuple[int, int]]]] = {}
+        for part, channels in enumerate(self._channels):
+            for key, channel in channels.items():
+                kind = (channel.type, channel.encoding, channel.definition.reason)
+                groups.setdefault(channel.topic, {}).setdefault(kind, []).append((part, key))
+        return {topic: self._topic(topic, kinds) for topic, kinds in sorted(groups.items())}
+
+    def _topic(self, topic: str, kinds: dict[tuple[str, str, str], list[tuple[int, int]]]) -> TopicInfo:
+        """Choose the channels of a topic that count."""
+        tallies = {
+            kind: [self._contents[part].tally[key] for part, key in keys if key in self._contents[part].tally]
+            for kind, keys in kinds.items()
+        }
+        counts = {kind: sum(tally.count for tally in of_kind) for kind, of_kind in tallies.items()}
+        chosen = max(counts, key=lambda kind: counts[kind])
+        type_name, encoding, reason = chosen
+        others = [
+            f"{count(number, 'message')} of {kind[0] or 'no type'} ({kind[2] or kind[1]})"
+            for kind, number in counts.items()
+            if kind != chosen and number
+        ]
+        if others:
+            left_out = f"besides {type_name} it carries {' and '.join(others)}, which are left out"
+            reason = f"{reason}; {left_out}" if reason else left_out
+            self._warnings.append(f"{self.path}: {topic}: {left_out}")
+        notes = set()
+        for part, key in kinds[chosen]:
+            channel = self._channels[part][key]
+            notes.add(channel.definition.note)
+            self._channels[part][key] = replace(channel, counted=True)
+        self._warnings += [f"{self.path}: {topic}: {note}" for note in sorted(notes) if note]
+        of_kind = tallies[chosen]
+        first = min((tally.first for tally in of_kind), default=None)
+        last = max((tally.last for tally in of_kind), default=None)
+        return TopicInfo(topic, type_name, counts[chosen], encoding, not chosen[2], reason, first, last)
+
+    def _every_channel(self) -> Iterator[RecordedChannel]:
+        return itertools.chain.from_iterable(channels.values() for channels in self._channels)
+
+    def _require(self, topic: str, readable: bool = True) -> None:
+        info = self.topics.get(topic)
+        if info is None:
+            there = ", ".join(self.topics) or "none"
+            raise BagError(f"{self.path}: there is no topic {topic}; topics there: {there}")
+        if readable and not info.readable:
+            raise BagError(f"{self.path}: topic {topic} cannot be decoded: {info.reason}; choose another topic")
+
+    def _decoded(self, channels: list[dict[int, RecordedChannel]]) -> Iterator[tuple[str, int, Any]]:
+        failed: dict[str, int] = {}
+        for raw in self._sorted(channels):
+            channel = raw.channel
+            try:
+                message = channel.definition.decode(raw.data)
+            except BagError as error:
+                topic = channel.topic
+                failed[topic] = failed.get(topic, 0) + 1
+                self._undecoded[topic] = (
+                    f"{self.path}: {topic}: {count(failed[topic], 'message')} left out that cannot be decoded ({error})"
+                )
+                continue
+            yield channel.topic, raw.log_time_ns, message
+
+    def _sorted(self, channels: list[dict[int, RecordedChannel]]) -> Iterator[RawMessage]:
+        """Messages of these channels (by part and channel id) in order of log time, ties in file order.
+
+        Blocks are read in order of their smallest log time; what is earlier than every block still to be read
+        is final.
+        """
+        blocks: list[tuple[int, int, int, Block]] = []
+        for part, wanted in enumerate(channels):
+            for number, block in enumerate(self._contents[part].blocks):
+                if not block.channels.isdisjoint(wanted):
+                    blocks.append((block.start, part, number, block))
+        blocks.sort(key=lambda entry: entry[:3])
+        pending: list[tuple[int, int, int, int, RawMessage]] = []
+        for position, (_, part, number, block) in enumerate(blocks):
+            wanted = channels[part]
+            records = read_block(self._contents[part].path, block)
+            for key, log_time, publish_time, begin, end in messages(records):
+                if channel := wanted.get(key):
+                    raw = RawMessage(log_time, publish_time, records[begin:end], channel)
+                    pending.append((log_time, part, number, begin, raw))
+            pending.sort()  # never compares messages: no two have the same place
+            following = blocks[position + 1][0] if position + 1 < len(blocks) else None
+            final = len(pending) if following is None else bisect.bisect_left(pending, (following,))
+            for entry in pending[:final]:
+                yield entry[4]
+            del pending[:final]
+
+
+def _of(channels: Mapping[int, RecordedChannel], topics: set[str], counted: bool = False) -> dict[int, RecordedChannel]:
+    return {
+        key: channel
+        for key, channel in channels.items()
+        if channel.topic in topics and (channel.counted or not counted)
+    }
+
+
+def _channels(contents: Contents) -> dict[int, RecordedChannel]:
+    """Channels of one file with their definitions, or the reason why there is none."""
+    channels = {}
+    for key, channel in contents.channels.items():
+        schema = contents.schemas.get(channel.schema_id) if channel.schema_id else None
+        type_name = normal_name(schema.name) if schema else ""
+        if channel.message_encoding != "cdr":
+            encoding = channel.message_encoding or "no stated encoding"
+            definition = undefined(type_name, f"its messages are in {encoding}, and cdr is what can be decoded")
+        elif schema is None:
+            definition = undefined(type_name, "the file does not say what type it has")
+        else:
+            definition = define(schema.name, schema.encoding, schema.data)
+        channels[key] = RecordedChannel(
+            channel.topic, type_name, channel.message_encoding, schema, channel.metadata, definition
+        )
+    return channels
+
+
+# --- which files are one recording --------------------------------------------------------------------------
+
+
+def group_recordings(paths: Iterable[str | os.PathLike[str]]) -> list[Bag]:
+    """Recordings that these paths name, in the order of their first mention.
+
+    A folder is one recording. Files are one recording each, except the parts of a split bag: files
+    `<stem>_<i>.mcap` of one stem in one folder that either
+
+    - are listed together in the metadata.yaml beside them, or
+    - are numbered 0, 1, 2, ... without a hole, carry the same topics, and follow each other in log time
+      without a break: each begins at most 1 s, or the longest pause inside one of them, after the one
+      before ends, and overlaps it by no more than 10 % of the shorter (messages at a seam may be out of order).
+
+    In doubt files stay apart: that loses the one transition at a seam, while joining two runs would invent one.
+
+    Raises
+    ------
+    BagError
+        A file cannot be read, or is named twice.
+    """
+    order: list[tuple[Path, str]] = []
+    files: dict[tuple[Path, str], list[Path]] = {}
+    for path in map(Path, paths):
+        pair = None if path.is_dir() else stem_and_index(path)
+        group = (path.parent, f"{pair[0]}_*.mcap" if pair else path.name)
+        if group not in files or path.is_dir():
+            order.append(group)
+        files.setdefault(group, []).append(path)
+    bags = []
+    for group in order:
+        bags += _group(files[group])
+    seen: set[Path] = set()
+    for part in itertools.chain.from_iterable(bag.parts for bag in bags):
+        if part.resolve() in seen:
+            raise BagError(f"{part}: named twice; name each recording once")
+        seen.add(part.resolve())
+    return bags
+
+
+def _group(paths: list[Path]) -> list[Bag]:
+    if len(paths) == 1 or len(set(paths)) < len(paths):
+        return [Bag(path) for path in paths]
+    try:
+        listed = {part.resolve(): i for i, part in enumerate(listed_parts(paths[0].parent) or [])}
+    except BagError:  # about other files in the folder
+        listed = {}
+    if all(path.resolve() in listed for path in paths):
+        paths = sorted(paths, key=lambda path: listed[path.resolve()])
+        return [Bag(paths[0], paths)]
+    contents = {path: scan(path) for path in paths}
+    ordered = [contents[path] for path in sorted(paths, key=natural)]
+    numbers = [pair[1] for part in ordered if (pair := stem_and_index(part.path))]
+    if numbers[0] == 0 and not _not_one_recording(ordered):
+        return [Bag(ordered[0].path, ordered)]
+    return [Bag(path, [contents[path]]) for path in paths]
+
+
+def _not_one_recording(parts: Sequence[Contents]) -> str:
+    """Why files are not the consecutive parts of one recording; "" where they may be."""
+    pause = max((_longest_pause(part) for part in parts), default=0)
+    for before, after in itertools.pairwise(parts):
+        names = f"{before.path.name} and {after.path.name}"
+        pair = stem_and_index(before.path), stem_and_index(after.path)
+        if not pair[0] or not pair[1] or pair[1][1] != pair[0][1] + 1:
+            return f"{names} are not numbered one after the other"
+        if not before.tally or not after.tally:
+            continue  # nothing in it that could contradict
+        kinds = [{(c.topic, c.type) for c in _channels(part).values()} for part in (before, after)]
+        if not (kinds[0] <= kinds[1] or kinds[1] <= kinds[0]):
+            return f"{names} do not carry the same topics"
+        (begin, end), (next_begin, next_end) = _span(before), _span(after)
+        if next_begin - end > max(10**9, pause):
+            return f"{(next_begin - end) / 1e9:.1f} s lie between {names}"
+        if next_begin < begin or (end - next_begin) * 10 > min(end - begin, next_end - next_begin):
+            return f"{names} overlap in time"
+    return ""
+
+
+def _span(contents: Contents) -> tuple[int, int]:
+    return min(block.start for block in contents.blocks), max(block.end for block in contents.blocks)
+
+
+def _longest_pause(contents: Contents) -> int:
+    """Longest time without any message, ns."""
+    times: list[int] = []
+    for block in contents.blocks:
+        times += (message[1] for message in messages(read_block(contents.path, block)))
+    return max((b - a for a, b in itertools.pairwise(sorted(times))), default=0)
+
+
+# --- what could be a signal ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TopicFacts:
+    """One topic as `uncertain-lti topics` shows it.
+
+    rate (1/s) is that of the median log-time step, None where there is none or it is 0; largest_gap in s;
+    fields are the paths that can be signals, where `data[0..99]` stands for `data[0]` to `data[99]`; stamps
+    says whether header stamps can be used; stamp_offset (s) is the median of log time - header stamp.
+    """
+
+    info: TopicInfo
+    rate: float | None
+    largest_gap: float | None
+    fields: tuple[str, ...]
+    stamps: Literal["none", "usable", "zero", "mixed"]
+    stamp_offset: float | None
+
+
+def describe(bag: Bag) -> list[TopicFacts]:
+    """Facts about every topic of a recording; reads it once, and decodes one message of each topic.
+
+    Field paths are taken from the longest message of a topic, so that its arrays have their lengths.
+    """
+    times: dict[str, array[int]] = {topic: array("Q") for topic in bag.topics}
+    offsets: dict[str, array[float]] = {topic: array("d") for topic in bag.topics}
+    zeros = dict.fromkeys(bag.topics, 0)
+    longest: dict[str, RawMessage] = {}
+    for raw in bag.raw_messages():
+        channel, topic = raw.channel, raw.channel.topic
+        if not channel.counted:
+            continue
+        times[topic].append(raw.log_time_ns)
+        if channel.definition.reason:
+            continue
+        if topic not in longest or len(raw.data) > len(longest[topic].data):
+            longest[topic] = raw
+        if channel.definition.has_header:
+            if stamp := channel.definition.stamp_ns(raw.data):
+                offsets[topic].append((raw.log_time_ns - stamp) * 1e-9)
+            else:
+                zeros[topic] += 1
+    return [
+        _facts(info, times[topic], offsets[topic], zeros[topic], longest.get(topic))
+        for topic, info in bag.topics.items()
+    ]
+
+
+def _facts(
+    info: TopicInfo, times: array[int], offsets: array[float], zeros: int, longest: RawMessage | None
+) -> TopicFacts:
+    steps = [b - a for a, b in itertools.pairwise(times)]
+    step = median(steps) if steps else 0
+    fields: tuple[str, ...] = ()
+    if longest:
+        definition = longest.channel.definition
+        try:
+            message = definition.decode(longest.data)
+            fields = tuple(signal_paths(definition.fields, definition.type_name, message))
+        except BagError:
+            pass  # `messages` tells it
+    return TopicFacts(
+        info,
+        rate=1e9 / step if step else None,
+        largest_gap=max(steps) * 1e-9 if steps else None,
+        fields=fields,
+        stamps="mixed" if zeros and offsets else "usable" if offsets else "zero" if zeros else "none",
+        stamp_offset=median(offsets) if offsets else None,
+    )

@@ -1,0 +1,466 @@
+"""MCAP container: a file as blocks of raw messages, whatever is missing from it or damaged.
+
+A file is walked once from its beginning (`scan`), without need of summary, index or footer, and then read
+block by block (`read_block`, `messages`). A block is a chunk, or a stretch of records outside chunks.
+
+What counts when a file is not whole:
+
+- Cut (no footer): everything before the cut counts, also what can be decompressed of a chunk that the cut
+  goes through.
+- A chunk whose checksum or sizes are wrong, or that cannot be decompressed, is left out altogether: a number
+  with a flipped bit does more harm than a gap.
+- A record whose length cannot be: reading goes on at the next chunk that the summary knows, if it does.
+- Sizes stated in the file never decide how much memory is taken. A record is held against the size of the
+  file before it is read, a chunk is decompressed piece by piece up to the size it states, at most 256 MiB.
+
+Each of these is told in `Contents.warnings`.
+"""
+
+from __future__ import annotations
+
+import bisect
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics
+from uncertain_lti.bag_files import MAGIC, not_mcap, os_error
+from uncertain_lti.errors import BagError
+
+LARGEST_CHUNK = 1 << 28  # bytes, decompressed; recorders write chunks of 1 to 10 MB
+_BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
+_PIECE = 1 << 24
+_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
+_FOOTER_SIZE = _RECORD.size + 20
+_FIRST_CHUNK_WARNINGS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A stretch of a file that is read at once: bytes `offset` to `offset + size`.
+
+    compression is "" where the bytes are records as they stand; length is the size of the records; start and
+    end are the smallest and largest log time (ns); channels those that have a message here.
+    """
+
+    offset: int
+    size: int
+    compression: str
+    length: int
+    start: int
+    end: int
+    channels: frozenset[int]
+
+
+@dataclass(slots=True)
+class Tally:
+    """Messages of one channel: how many, and their first and last log time (ns)."""
+
+    count: int
+    first: int
+    last: int
+
+
+@dataclass(slots=True)
+class Contents:
+    """What `scan` found in a file. Blocks are in file order; warnings are sentences that begin with the path."""
+
+    path: Path
+    size: int
+    blocks: list[Block] = field(default_factory=list)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    tally: dict[int, Tally] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        """Messages that can be read."""
+        return sum(entry.count for entry in self.tally.values())
+
+
+def scan(path: Path) -> Contents:
+    """Walk a file once and note where its messages are.
+
+    Raises
+    ------
+    BagError
+        The file is not MCAP, or the operating system does not let it be read.
+    """
+    try:
+        with open(path, "rb", buffering=1 << 18) as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            head = stream.read(4096)
+            if not head.startswith(MAGIC):
+                raise not_mcap(path, head)
+            return _Scanner(path, stream, size).run()
+    except OSError as error:
+        raise os_error(path, error) from None
+
+
+def read_block(path: Path, block: Block) -> bytes:
+    """Records of a block that `scan` found; raises BagError where the file is not what it was."""
+    try:
+        with open(path, "rb", buffering=0) as stream:
+            stream.seek(block.offset)
+            data = stream.read(block.size)
+    except OSError as error:
+        raise os_error(path, error) from None
+    records, _ = _inflate(block.compression, memoryview(data), block.length)
+    if len(records) < block.length:
+        raise BagError(f"{path}: the file changed while it was read; read it again when it is written")
+    return bytes(records[: block.length])
+
+
+def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:
+    """(channel, log time, publish time, begin, end) of each message; its data is `records[begin:end]`."""
+    for opcode, begin, end in _walk(records):
+        if opcode == Opcode.MESSAGE and end - begin >= _MESSAGE.size:
+            channel, _, log_time, publish_time = _MESSAGE.unpack_from(records, begin)
+            yield channel, log_time, publish_time, begin + _MESSAGE.size, end
+
+
+def _walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
+    """(opcode, begin, end) of each whole record."""
+    position, size, header, unpack = 0, len(records), _RECORD.size, _RECORD.unpack_from
+    while position + header <= size:
+        opcode, length = unpack(records, position)
+        begin = position + header
+        position = begin + length
+        if position > size or opcode == 0:
+            return
+        yield opcode, begin, position
+
+
+def _inflate(compression: str, data: memoryview, limit: int) -> tuple[bytes | memoryview, str]:
+    """Decompress at most `limit` + 1 bytes; returns them, and what went wrong on the way (or "")."""
+    if not compression:
+        return data[: limit + 1], ""
+    if compression == "zstd":
+        read: Callable[[int], bytes] = zstandard.ZstdDecompressor().stream_reader(data).read
+    elif compression == "lz4":
+        frame = lz4.frame.LZ4FrameDecompressor()
+        feed = iter((data,))
+
+        def read(size: int) -> bytes:
+            if frame.eof or (frame.needs_input and (part := next(feed, None)) is None):
+                return b""
+            piece: bytes = frame.decompress(part if frame.needs_input else b"", max_length=size)
+            return piece
+    else:
+        return b"", f"its compression '{compression}' is not known (zstd, lz4 and none are)"
+    pieces, total = [], 0
+    try:
+        while total <= limit and (piece := read(min(_PIECE, limit + 1 - total))):
+            pieces.append(piece)
+            total += len(piece)
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+        return b"".join(pieces), f"it cannot be decompressed ({error})"
+    return b"".join(pieces), ""
+
+
+class _Exact(ReadDataStream):
+    """Stream over one record that never hands out fewer bytes than asked for."""
+
+    def read(self, length: int) -> bytes:
+        data: bytes = super().read(length)
+        if len(data) < length:
+            raise EndOfFile
+        return data
+
+
+def _parse(kind: type[Any], content: bytes) -> Any:
+    """One record, or None where it contradicts itself."""
+    try:
+        return kind.read(_Exact(BytesIO(content)))
+    except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
+        return None
+
+
+class _Scanner:
+    bare_begin: int
+    bare_end: int
+    bare: dict[int, Tally]  # of the block outside chunks that is being walked
+
+    def __init__(self, path: Path, stream: BinaryIO, size: int) -> None:
+        self.stream = stream
+        self.found = Contents(path, size)
+        self.sums = 0  # checksum of everything before the current record
+        self.statistics: Statistics | None = None
+        self.summary_schemas: dict[int, Schema] = {}
+        self.summary_channels: dict[int, Channel] = {}
+        self.known: list[ChunkIndex] = []  # chunks that the summary knows, by offset
+        self.chunk_warnings: list[str] = []
+        self.damaged = False
+        self.odd_records = 0
+        self._forget_bare()
+
+    def run(self) -> Contents:
+        found, path = self.found, self.found.path
+        self.closed = self._at(found.size - len(MAGIC), len(MAGIC)) == MAGIC and found.size >= 2 * len(MAGIC)
+        if self.closed:
+            self._summary()
+        ended = self._data_section()
+        self._end_bare()
+        found.schemas = self.summary_schemas | found.schemas
+        found.channels = self.summary_channels | found.channels
+        self._orphans()
+        if ended and not self.closed:
+            found.warnings.append(
+                f"{path}: no footer at its end; all its {count(found.count, 'message')} could be read"
+            )
+        elif not self.closed:
+            found.warnings.append(f"{path}: cut after {count(found.count, 'message')} (no footer); read up to the cut")
+        found.warnings += self.chunk_warnings[:_FIRST_CHUNK_WARNINGS]
+        if (more := len(self.chunk_warnings) - _FIRST_CHUNK_WARNINGS) > 0:
+            found.warnings.append(f"{path}: {count(more, 'more chunk')} left out for reasons like these")
+        if self.odd_records:
+            found.warnings.append(
+                f"{path}: {count(self.odd_records, 'record')} that cannot be read left out; "
+                f"the recorder or the disk damaged the file"
+            )
+        stated = self.statistics.message_count if self.statistics else 0
+        if stated > found.count:
+            found.warnings.append(f"{path}: its summary counts {count(stated, 'message')}, {found.count} could be read")
+        return found
+
+    # --- the data section -----------------------------------------------------------------------------------
+
+    def _data_section(self) -> bool:
+        """Walk all records up to the end of the data section; False where the file ends before."""
+        size, offsets = self.found.size, [index.chunk_start_offset for index in self.known]
+        position = len(MAGIC)
+        self.sums = zlib.crc32(MAGIC)
+        self.stream.seek(position)
+        while True:
+            header = self.stream.read(_RECORD.size)
+            if len(header) < _RECORD.size:
+                return False
+            opcode, length = _RECORD.unpack(header)
+            begin, end = position + _RECORD.size, position + _RECORD.size + length
+            later = bisect.bisect_right(offsets, position)
+            following = offsets[later] if later < len(offsets) else size
+            if opcode == 0 or end > following:
+                if self.closed or opcode == 0:
+                    self._damage(position, following)
+                elif opcode == Opcode.CHUNK:
+                    self._chunk(position, begin, self.stream.read(size - begin), cut=True)
+                if following == size:
+                    return False
+                position = following
+                self.stream.seek(position)
+                continue
+            if opcode == Opcode.DATA_END or opcode == Opcode.FOOTER:
+                self._data_end(_parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None)
+                return True
+            self.sums = zlib.crc32(header, self.sums)
+            if opcode == Opcode.MESSAGE or opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
+                content = self.stream.read(length)
+                self.sums = zlib.crc32(content, self.sums)
+                self._bare(position, opcode, content)
+            elif opcode == Opcode.CHUNK:
+                content = self.stream.read(length)
+                self.sums = zlib.crc32(content, self.sums)
+                self._chunk(position, begin, content)
+            else:  # attachments, metadata, indexes, private records: only their bytes count
+                left = length
+                while left and (piece := self.stream.read(min(left, _PIECE))):
+                    self.sums = zlib.crc32(piece, self.sums)
+                    left -= len(piece)
+            position = end
+
+    def _data_end(self, record: DataEnd | None) -> None:
+        if record and record.data_section_crc not in (0, self.sums) and not self.damaged:
+            self.found.warnings.append(
+                f"{self.found.path}: the checksum of the file is wrong, so a number in it may be; "
+                f"copy it anew if you can"
+            )
+
+    def _damage(self, position: int, following: int) -> None:
+        self.damaged = True
+        rest = "the rest is" if following == self.found.size else f"{count(following - position, 'byte')} are"
+        self.found.warnings.append(f"{self.found.path}: damaged at byte {position}; {rest} left out")
+
+    def _bare(self, position: int, opcode: int, content: bytes) -> None:
+        """A record outside chunks: continues the current block or begins one."""
+        end = position + _RECORD.size + len(content)
+        if self.bare_end != position or end - self.bare_begin > _BARE_BLOCK:
+            self._end_bare()
+            self.bare_begin = position
+        self.bare_end = end
+        if opcode == Opcode.MESSAGE:
+            self._message(content, 0, len(content), self.bare)
+        else:
+            self._definition(opcode, content)
+
+    def _end_bare(self) -> None:
+        if self.bare:
+            size = self.bare_end - self.bare_begin
+            self._block(self.bare_begin, size, "", size, self.bare)
+        self._forget_bare()
+
+    def _forget_bare(self) -> None:
+        self.bare_begin, self.bare_end = -1, -1
+        self.bare = {}
+
+    def _chunk(self, position: int, begin: int, content: bytes, cut: bool = False) -> None:
+        if len(content) < _CHUNK.size:
+            self._leave_out(position, "its record is too short", cut)
+            return
+        first, last, stated, checksum, name_length = _CHUNK.unpack_from(content)
+        where = f"{position} (log time {seconds(first)} to {seconds(last)} s)"
+        data_begin = _CHUNK.size + name_length + 8
+        if len(content) < data_begin:
+            self._leave_out(where, "its sizes contradict each other", cut)
+            return
+        compression = content[_CHUNK.size : _CHUNK.size + name_length].decode(errors="replace")
+        (length,) = struct.unpack_from("<Q", content, data_begin - 8)
+        data = memoryview(content)[data_begin : data_begin + length]
+        if not cut and (data_begin + length != len(content) or (not compression and length != stated)):
+            self._leave_out(where, "its sizes contradict each other")
+            return
+        if compression and stated > LARGEST_CHUNK and not cut:
+            self._leave_out(
+                where,
+                f"it states {count(stated, 'byte')} decompressed, and at most {LARGEST_CHUNK >> 20} MiB are taken",
+            )
+            return
+        stated = min(stated, max(LARGEST_CHUNK, len(data)))
+        records, trouble = _inflate(compression, data, stated)
+        if cut:
+            records = records[:stated]
+        else:
+            if not trouble and len(records) != stated:
+                trouble = f"it holds {'more' if len(records) > stated else 'less'} than it states"
+            if not trouble and checksum not in (0, zlib.crc32(records)):
+                trouble = "its checksum is wrong"
+            if trouble:
+                self._leave_out(where, trouble)
+                return
+        tally: dict[int, Tally] = {}
+        end = 0
+        for opcode, start, end in _walk(records):
+            if opcode == Opcode.MESSAGE:
+                self._message(records, start, end, tally)
+            elif opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
+                self._definition(opcode, bytes(records[start:end]))
+        self.odd_records += end < len(records) and not cut
+        if tally:
+            self._block(begin + data_begin, len(data), compression, len(records), tally)
+
+    def _leave_out(self, where: object, why: str, cut: bool = False) -> None:
+        if not cut:  # what little a cut leaves of a chunk's beginning is told with the cut
+            self.damaged = True
+            path = self.found.path
+            self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
+
+    def _message(self, records: bytes | memoryview, begin: int, end: int, tally: dict[int, Tally]) -> None:
+        if end - begin < _MESSAGE.size:
+            self.odd_records += 1
+            return
+        channel, _, time, _ = _MESSAGE.unpack_from(records, begin)
+        if entry := tally.get(channel):
+            entry.count += 1
+            if time > entry.last:
+                entry.last = time
+            elif time < entry.first:
+                entry.first = time
+        else:
+            tally[channel] = Tally(1, time, time)
+
+    def _block(self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally]) -> None:
+        self.found.blocks.append(
+            Block(
+                offset,
+                size,
+                compression,
+                length,
+                start=min(entry.first for entry in tally.values()),
+                end=max(entry.last for entry in tally.values()),
+                channels=frozenset(tally),
+            )
+        )
+        for channel, entry in tally.items():
+            if total := self.found.tally.get(channel):
+                total.count += entry.count
+                total.first, total.last = min(total.first, entry.first), max(total.last, entry.last)
+            else:
+                self.found.tally[channel] = entry
+
+    def _definition(self, opcode: int, content: bytes) -> None:
+        record = _parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
+        if record is None:
+            self.odd_records += 1
+            return
+        table: dict[int, Any] = self.found.schemas if isinstance(record, Schema) else self.found.channels
+        if table.setdefault(record.id, record) != record and not self.damaged:
+            what = "schema" if isinstance(record, Schema) else f"channel ({record.topic})"
+            self.found.warnings.append(
+                f"{self.found.path}: {what} {record.id} is defined twice, differently; the first one counts"
+            )
+
+    def _orphans(self) -> None:
+        """Messages whose channel has no record, for example because its chunk is damaged, are no topic's."""
+        lost = [channel for channel in self.found.tally if channel not in self.found.channels]
+        number = sum(self.found.tally.pop(channel).count for channel in lost)
+        if number:
+            self.found.warnings.append(
+                f"{self.found.path}: {count(number, 'message')} of channels that are nowhere described left out"
+            )
+
+    # --- the summary ----------------------------------------------------------------------------------------
+
+    def _summary(self) -> None:
+        """Definitions, statistics and places of chunks, where the file states them and their checksum holds."""
+        footer_at = self.found.size - len(MAGIC) - _FOOTER_SIZE
+        tail = self._at(footer_at, _FOOTER_SIZE)
+        if len(tail) < _FOOTER_SIZE or tail[:9] != _RECORD.pack(Opcode.FOOTER, 20):
+            return
+        footer = _parse(Footer, tail[_RECORD.size :])
+        if not footer or not len(MAGIC) <= footer.summary_start < footer_at:
+            return
+        records = self._at(footer.summary_start, footer_at - footer.summary_start)
+        if footer.summary_crc not in (0, zlib.crc32(tail[:-4], zlib.crc32(records))):
+            self.found.warnings.append(f"{self.found.path}: the checksum of its summary is wrong; read without it")
+            return
+        for opcode, begin, end in _walk(records):
+            if opcode == Opcode.SCHEMA and (schema := _parse(Schema, records[begin:end])):
+                self.summary_schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL and (channel := _parse(Channel, records[begin:end])):
+                self.summary_channels[channel.id] = channel
+            elif opcode == Opcode.STATISTICS:
+                self.statistics = _parse(Statistics, records[begin:end])
+            elif opcode == Opcode.CHUNK_INDEX:
+                index = _parse(ChunkIndex, records[begin:end])
+                offset = index.chunk_start_offset if index else 0
+                if offset > 0 and self._at(offset, 1) == bytes([Opcode.CHUNK]):
+                    self.known.append(index)
+        self.known.sort(key=lambda index: index.chunk_start_offset)
+
+    def _at(self, offset: int, size: int) -> bytes:
+        if offset < 0 or offset >= self.found.size:
+            return b""
+        self.stream.seek(offset)
+        return self.stream.read(min(size, self.found.size - offset))
+
+
+def count(number: int, what: str) -> str:
+    """`1 message`, `61 340 messages`."""
+    return f"{number:,}".replace(",", " ") + f" {what}{'' if number == 1 else 's'}"
+
+
+def seconds(time_ns: int) -> str:
+    """Nanoseconds written as seconds, exact to the millisecond."""
+    return f"{time_ns // 10**9}.{time_ns % 10**9 // 10**6:03d}"

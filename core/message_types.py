@@ -1,0 +1,218 @@
+"""Message definitions of a recording: from the schema in the file to decoded messages.
+
+Each schema gets a type store of its own, so that one which cannot be parsed, or which contradicts another,
+disturbs no other topic.
+"""
+
+from __future__ import annotations
+
+import functools
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import zstandard
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.base import normalize_fieldname
+from rosbags.typesys.store import Typestore
+from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.signals import FieldType
+
+_LARGEST_SCHEMA = 1 << 20  # bytes
+_LARGEST_MESSAGE = 1 << 26  # bytes, decompressed
+_ZSTD = b"\x28\xb5\x2f\xfd"
+_LONGEST_UNROLLED = 4096  # rosbags writes a line of code per element of a fixed array of strings or messages
+_NUMBERS = {
+    "char", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64",
+}  # fmt: skip
+_KINDS: Mapping[str, Any] = {"bool": "bool", "string": "string", "byte": "other"} | dict.fromkeys(
+    _NUMBERS, "number"
+)  # rclpy hands out a byte as bytes, so it is no number live either
+
+
+@dataclass(frozen=True, eq=False)
+class Definition:
+    """How messages of one schema are decoded.
+
+    reason says why they cannot be ("" where they can); note what the reader had to add.
+    """
+
+    type_name: str
+    types: Mapping[str, Any]
+    store: Typestore
+    reason: str = ""
+    note: str = ""
+
+    def decode(self, data: bytes) -> Any:
+        """Decode one CDR message; raises BagError where it does not fit the definition."""
+        try:
+            return self.store.deserialize_cdr(_plain(data), self.type_name)
+        except Exception as error:  # the generated decoders raise whatever the bytes lead them to
+            raise BagError(_one_line(error)) from None
+
+    @functools.cached_property
+    def has_header(self) -> bool:
+        """Whether the type has a field `header` with a time stamp."""
+        return "stamp" in self._header_fields()
+
+    @functools.cached_property
+    def _header_first(self) -> bool:
+        first = next(iter(self.fields(self.type_name)), "")
+        return first == "header" and next(iter(self._header_fields())) == "stamp"
+
+    def _header_fields(self) -> Mapping[str, FieldType]:
+        header = self.fields(self.type_name).get("header")
+        if header is None or header.kind != "message" or header.array is not None:
+            return {}
+        fields = self.fields(header.type_name)
+        return fields if "stamp" in fields and fields["stamp"].type_name == "builtin_interfaces/msg/Time" else {}
+
+    def stamp_ns(self, data: bytes) -> int | None:
+        """`header_stamp_ns` of an encoded message, read from its first bytes where the header stands there."""
+        if not self.has_header:
+            return None
+        if not self._header_first:
+            try:
+                return header_stamp_ns(self.decode(data))
+            except BagError:
+                return None
+        try:
+            data = _plain(data)
+        except zstandard.ZstdError:
+            return None
+        if len(data) < 12:
+            return None
+        sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+        return sec * 1_000_000_000 + nanosec or None
+
+    def fields(self, type_name: str) -> Mapping[str, FieldType]:
+        """Field name -> FieldType of a type in this schema; raises SignalError for one that is not in it."""
+        if type_name not in self.types:
+            raise SignalError(f"{type_name}: not defined with {self.type_name}; check the type")
+        return {
+            normalize_fieldname(name): _field_type(description)
+            for name, description in self.types[type_name][1]
+            if name != "structure_needs_at_least_one_member"
+        }
+
+
+def _plain(data: bytes) -> bytes:
+    """Bytes of a message that the recorder may have compressed on its own (rosbag2's compression mode MESSAGE)."""
+    if data[:4] != _ZSTD:  # no CDR begins like this
+        return data
+    return zstandard.ZstdDecompressor().stream_reader(data).read(_LARGEST_MESSAGE)
+
+
+def header_stamp_ns(message: Any) -> int | None:
+    """Header stamp of a message (rosbags or rclpy) in ns; None where it has no header or the stamp is zero."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if stamp is None:
+        return None
+    time: int = stamp.sec * 1_000_000_000 + stamp.nanosec
+    return time or None
+
+
+def normal_name(name: str) -> str:
+    """`pkg/msg/Type` also for `pkg/Type`."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+
+
+@functools.lru_cache(maxsize=1024)
+def define(name: str, encoding: str, text: bytes) -> Definition:
+    """Definition from a schema's name, encoding (`ros2msg`, `ros2idl`) and text; its reason says what failed.
+
+    Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it; likewise
+    for types that a text uses and does not define.
+    """
+    type_name = normal_name(name)
+    types: dict[str, Any] = {}
+    reason = note = ""
+    try:
+        if len(text) > _LARGEST_SCHEMA:
+            raise TypesysError(f"its definition is {len(text)} bytes long")
+        if text.strip():
+            types = _parse(type_name, encoding, text.decode())
+        elif type_name in _jazzy().fielddefs:
+            note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
+        else:
+            raise TypesysError(f"the file holds no definition of {type_name}, and ROS 2 Jazzy has none")
+        _complete(type_name, types, (), set())
+    except Exception as error:  # a schema may hold anything, and parsers raise whatever it leads them to
+        types, note = {}, ""
+        reason = _one_line(error)
+        if text.strip():
+            reason = f"its definition of {type_name} cannot be used: {reason}"
+    store = get_typestore(Stores.EMPTY)
+    if not reason:
+        store.register(types)
+    return Definition(type_name, types, store, reason, note)
+
+
+def undefined(type_name: str, reason: str) -> Definition:
+    """Definition of something that is not decoded, for the reason given."""
+    return Definition(type_name, {}, get_typestore(Stores.EMPTY), reason)
+
+
+@functools.cache
+def _jazzy() -> Typestore:
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def _parse(type_name: str, encoding: str, text: str) -> dict[str, Any]:
+    if encoding == "ros2msg":
+        return dict(get_types_from_msg(text, type_name))
+    if encoding != "ros2idl":
+        raise TypesysError(f"its schema is written in '{encoding}' (ros2msg and ros2idl are read)")
+    separator = "=" * 80 + "\n"
+    types: dict[str, Any] = {}
+    if not text.startswith(f"{separator}IDL: "):
+        return dict(get_types_from_idl(text))
+    for part in text.split(separator)[1:]:
+        types |= get_types_from_idl(part.partition("\n")[2])
+    return types
+
+
+def _complete(type_name: str, types: dict[str, Any], above: tuple[str, ...], done: set[str]) -> None:
+    """Add what is missing and is part of Jazzy; refuse what the decoder cannot take."""
+    if type_name in above:
+        raise TypesysError(f"{type_name} contains itself")
+    if type_name in done:
+        return
+    if type_name not in types:
+        if type_name not in _jazzy().fielddefs:
+            raise TypesysError(f"{type_name} is used and not defined")
+        types[type_name] = _jazzy().fielddefs[type_name]
+    for name, (node, what) in types[type_name][1]:
+        count = 0
+        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            count = what[1] if node == Nodetype.ARRAY else 0
+            node, what = what[0]
+        if node == Nodetype.NAME:
+            _complete(what, types, (*above, type_name), done)
+        elif what[0] not in _KINDS:
+            raise TypesysError(f"{type_name}.{name} is a {what[0]}, which the decoder does not know")
+        if count > _LONGEST_UNROLLED and (node == Nodetype.NAME or what[0] == "string"):
+            raise TypesysError(f"{type_name}.{name} is a fixed array of {count}, too long to decode")
+    done.add(type_name)
+
+
+def _field_type(description: Any) -> FieldType:
+    node, what = description
+    array = None
+    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        array = what[1] if node == Nodetype.ARRAY else 0
+        node, what = what[0]
+    if node == Nodetype.NAME:
+        return FieldType("message", what, array)
+    return FieldType(_KINDS[what[0]], what[0], array)
+
+
+def _one_line(error: Exception, limit: int = 160) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    if len(lines) > 3 and lines[0] == "Could not parse:":  # then the text, the position, and what stands there
+        return f"it cannot be parsed from '{lines[3][:40]}' on"
+    text = " ".join(lines) or type(error).__name__
+    return text if len(text) <= limit else text[:limit] + " ..."

@@ -1,0 +1,58 @@
+"""Paths of the numbers in a message, as they are written in a signals file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from uncertain_lti.signals import FieldType, TypeFields
+
+_NO_SIGNALS = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+_DEPTH = 8
+_MOST_NAMES = 100
+
+
+def signal_paths(
+    type_fields: TypeFields, type_name: str, message: Any, before: str = "", depth: int = _DEPTH
+) -> Iterator[str]:
+    """Paths in a decoded message that can be signals, as `FieldPath` reads them; header stamps are left out.
+
+    The entries of an array stand as one path, `data[0..99]` for `data[0]` to `data[99]`, or as
+    `position[fan]` each where the message names them; a quaternion is also offered as roll, pitch and yaw.
+    """
+    fields = type_fields(type_name)
+    for name, field in fields.items():
+        if field.type_name in _NO_SIGNALS or depth == 0:
+            continue
+        value, path = getattr(message, name), before + name
+        if field.array is not None:
+            if not len(value):
+                continue
+            every = f"{path}[0..{len(value) - 1}]" if len(value) > 1 else f"{path}[0]"
+            if field.kind == "message":
+                yield from _inside(type_fields, field, value[0], every, depth)
+            elif field.kind in ("number", "bool"):
+                names = _names(fields, message) if field.kind == "number" else []
+                yield from [f"{path}[{n}]" for n in names] if len(names) == len(value) else [every]
+        elif field.kind == "message":
+            yield from _inside(type_fields, field, value, path, depth)
+        elif field.kind in ("number", "bool"):
+            yield path
+
+
+def _inside(type_fields: TypeFields, field: FieldType, value: Any, path: str, depth: int) -> Iterator[str]:
+    inner = type_fields(field.type_name)
+    if set(inner) == set("xyzw") and all(part.kind == "number" for part in inner.values()):
+        yield from (f"{angle}({path})" for angle in ("roll", "pitch", "yaw"))
+    yield from signal_paths(type_fields, field.type_name, value, f"{path}.", depth - 1)
+
+
+def _names(fields: Mapping[str, FieldType], message: Any) -> list[str]:
+    """Entries of a message's own `name` array, quoted where they would read as an index; [] without a usable one."""
+    field = fields.get("name")
+    if field is None or field.kind != "string" or field.array is None:
+        return []
+    names = [str(name) for name in message.name]
+    if len(set(names)) < len(names) or len(names) > _MOST_NAMES or any('"' in n or not n.strip() for n in names):
+        return []
+    return [f'"{n}"' if n.strip().isdigit() or n != n.strip() or "[" in n or "]" in n else n for n in names]

@@ -1,0 +1,167 @@
+"""MCAP files for tests, written with the `mcap` library and damaged on purpose afterwards."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A channel to write; `schema` is the text of the definition, by default that of ROS 2 Jazzy."""
+
+    name: str
+    type: str = "std_msgs/msg/Float64"
+    encoding: str = "cdr"
+    schema: str | None = None
+    schema_encoding: str = "ros2msg"
+    schema_name: str | None = None
+
+    def schema_text(self) -> str:
+        if self.schema is not None:
+            return self.schema
+        return JAZZY.generate_msgdef(self.type, ros_version=2)[0]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a file is laid out."""
+
+    compression: str = "none"
+    chunked: bool = True
+    chunk_size: int = 1024
+    summary: bool = True
+    indexes: bool = True
+    checksums: bool = True
+
+
+@dataclass(frozen=True)
+class Message:
+    topic: str
+    log_time: int
+    data: bytes
+    publish_time: int = 0
+
+
+@dataclass
+class File:
+    """Bytes of an MCAP file, and its messages in file order."""
+
+    data: bytes
+    messages: list[Message] = field(default_factory=list)
+
+    def save(self, path: str | os.PathLike[str], cut: int | None = None) -> Path:
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(self.data[:cut])
+        return path
+
+
+def float64(value: float) -> bytes:
+    """CDR of a std_msgs/msg/Float64."""
+    return b"\x00\x01\x00\x00" + struct.pack("<d", value)
+
+
+def cdr(type_name: str, little_endian: bool = True, **fields: Any) -> bytes:
+    """CDR of a message of ROS 2 Jazzy, from all its fields; see `message`."""
+    return bytes(JAZZY.serialize_cdr(message(type_name, **fields), type_name, little_endian=little_endian))
+
+
+def message(type_name: str, **fields: Any) -> Any:
+    return JAZZY.types[type_name](**fields)
+
+
+def header(stamp_ns: int, frame: str = "") -> Any:
+    stamp = message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def write(topics: Iterable[Topic], messages: Iterable[Message], layout: Layout = Layout()) -> File:  # noqa: B008
+    """An MCAP file of these messages in this order; several topics of one name become several channels.
+
+    A message goes to the channel of its topic; where there are several, in turn.
+    """
+    stream = io.BytesIO()
+    writer = Writer(
+        stream,
+        chunk_size=layout.chunk_size,
+        compression=COMPRESSIONS[layout.compression],
+        index_types=IndexType.ALL if layout.indexes else IndexType.NONE,
+        repeat_channels=layout.summary,
+        repeat_schemas=layout.summary,
+        use_chunking=layout.chunked,
+        use_statistics=layout.summary,
+        use_summary_offsets=layout.summary,
+        enable_crcs=layout.checksums,
+        enable_data_crcs=layout.checksums,
+    )
+    writer.start(profile="ros2", library="uncertain-lti tests")
+    channels: dict[str, list[int]] = {}
+    for topic in topics:
+        name = topic.type if topic.schema_name is None else topic.schema_name
+        schema = writer.register_schema(name, topic.schema_encoding, topic.schema_text().encode())
+        channels.setdefault(topic.name, []).append(writer.register_channel(topic.name, topic.encoding, schema))
+    written = list(messages)
+    turn = dict.fromkeys(channels, 0)
+    for sequence, entry in enumerate(written):
+        of_topic = channels[entry.topic]
+        channel = of_topic[turn[entry.topic] % len(of_topic)]
+        turn[entry.topic] += 1
+        writer.add_message(channel, entry.log_time, entry.data, entry.publish_time, sequence)
+    writer.finish()
+    return File(stream.getvalue(), written)
+
+
+def ramp(topic: str, times: Iterable[int]) -> list[Message]:
+    """Float64 messages 0.0, 1.0, ... at these log times (ns)."""
+    return [Message(topic, time, float64(i), time) for i, time in enumerate(times)]
+
+
+def write_folder(folder: Path, parts: Mapping[str, File], metadata: str | None = None) -> Path:
+    """A folder of MCAP files, with this text as metadata.yaml if there is one."""
+    for name, part in parts.items():
+        part.save(folder / name)
+    if metadata is not None:
+        (folder / "metadata.yaml").write_text(metadata)
+    return folder
+
+
+def metadata_yaml(names: Iterable[str], storage: str = "mcap") -> str:
+    """What of a rosbag2 metadata.yaml says which files a recording has."""
+    lines = [
+        "rosbag2_bagfile_information:",
+        "  version: 9",
+        f"  storage_identifier: {storage}",
+        "  relative_file_paths:",
+    ]
+    return "\n".join([*lines, *(f"    - {name}" for name in names)]) + "\n"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a record stands in a file: from `begin` (its opcode) to `end`."""
+
+    opcode: int
+    begin: int
+    end: int
+
+
+def places(data: bytes) -> list[Place]:
+    """All top-level records of a whole file."""
+    found, position = [], 8
+    while position < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, position)
+        found.append(Place(opcode, position, position + 9 + length))
+        position = found[-1].end
+    return found
