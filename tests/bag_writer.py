@@ -52,6 +52,7 @@ class Message:
     log_time: int
     data: bytes
     publish_time: int = 0
+    channel: int = 0  # which of the topic's channels
 
 
 @dataclass
@@ -87,10 +88,10 @@ def header(stamp_ns: int, frame: str = "") -> Any:
     return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
-def write(topics: Iterable[Topic], messages: Iterable[Message], layout: Layout = Layout()) -> File:  # noqa: B008
+def write(topics: Iterable[Topic], messages: Iterable[Message], layout: Layout = Layout()) -> File:
     """An MCAP file of these messages in this order; several topics of one name become several channels.
 
-    A message goes to the channel of its topic; where there are several, in turn.
+    A topic of schema encoding "" has no schema at all.
     """
     stream = io.BytesIO()
     writer = Writer(
@@ -110,14 +111,13 @@ def write(topics: Iterable[Topic], messages: Iterable[Message], layout: Layout =
     channels: dict[str, list[int]] = {}
     for topic in topics:
         name = topic.type if topic.schema_name is None else topic.schema_name
-        schema = writer.register_schema(name, topic.schema_encoding, topic.schema_text().encode())
+        schema = 0
+        if topic.schema_encoding:
+            schema = writer.register_schema(name, topic.schema_encoding, topic.schema_text().encode())
         channels.setdefault(topic.name, []).append(writer.register_channel(topic.name, topic.encoding, schema))
     written = list(messages)
-    turn = dict.fromkeys(channels, 0)
     for sequence, entry in enumerate(written):
-        of_topic = channels[entry.topic]
-        channel = of_topic[turn[entry.topic] % len(of_topic)]
-        turn[entry.topic] += 1
+        channel = channels[entry.topic][entry.channel]
         writer.add_message(channel, entry.log_time, entry.data, entry.publish_time, sequence)
     writer.finish()
     return File(stream.getvalue(), written)
@@ -139,13 +139,10 @@ def write_folder(folder: Path, parts: Mapping[str, File], metadata: str | None =
 
 def metadata_yaml(names: Iterable[str], storage: str = "mcap") -> str:
     """What of a rosbag2 metadata.yaml says which files a recording has."""
-    lines = [
-        "rosbag2_bagfile_information:",
-        "  version: 9",
-        f"  storage_identifier: {storage}",
-        "  relative_file_paths:",
-    ]
-    return "\n".join([*lines, *(f"    - {name}" for name in names)]) + "\n"
+    listed = "".join(f"    - {name}\n" for name in names)
+    return (
+        f"rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: {storage}\n  relative_file_paths:\n{listed}"
+    )
 
 
 @dataclass(frozen=True)
