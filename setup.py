@@ -5,7 +5,8 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "uncertain_lti_ros"
-CORE = {"uncertain_lti": "core"} | {f"uncertain_lti.{p}": f"core/{p.replace('.', '/')}" for p in find_packages("core")}
+CORE = {"uncertain_lti": "core"}
+CORE |= {f"uncertain_lti.{name}": f"core/{name.replace('.', '/')}" for name in find_packages("core")}
 ROOT = Path(__file__).resolve().parent
 
 
@@ -26,14 +27,15 @@ extras = {
     "plots": ["matplotlib"],
     # Real rclpy where no ROS 2 is installed: wheels for x86_64 Linux.
     "ros": ["ros-jazzy-common-interfaces==5.3.6", "ros-rclpy[fastrtps]==7.1.6"],
-    "test": ["hypothesis", "pytest", "pytest-timeout"],  # colcon test looks for pytest here
+    # colcon test looks for pytest here; setuptools lets the tests read this file.
+    "test": ["hypothesis", "packaging", "pytest", "pytest-timeout", "setuptools"],
     "dev": ["mypy", "ruff", "types-PyYAML"],
 }
 
 setup(
     name=NAME,
     version="0.1.0",
-    description="Linear models with bounded uncertainty, fitted to recorded transients and watched live in ROS 2",
+    description="Linear models with bounded uncertainty, fitted to recordings and watched live in ROS 2",
     long_description=(ROOT / "README.md").read_text() if (ROOT / "README.md").exists() else "",
     long_description_content_type="text/markdown",
     maintainer="uncertain-lti maintainers",
@@ -50,7 +52,7 @@ setup(
         *share("config", "*"),
     ],
     zip_safe=False,
-    install_requires=["mcap", "numpy>=1.26", "PyYAML", "rosbags", "tqdm"],
+    install_requires=["lz4", "mcap", "numpy>=1.26", "PyYAML", "rosbags", "tqdm", "zstandard"],
     extras_require=extras,
     entry_points={
         "console_scripts": [

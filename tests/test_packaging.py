@@ -1,0 +1,189 @@
+"""The package that pip and colcon install is whole, says what it needs, and is light to import."""
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterable
+from distutils.core import run_setup  # setuptools brings it where Python no longer does
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import uncertain_lti
+
+ROOT = Path(__file__).resolve().parent.parent
+LIVE = ["errors", "signals", "sampler", "transient", "operating_point", "model", "monitor"]
+
+# Where the name to import is not the name to install.
+PIP_NAME = {"yaml": "pyyaml"}
+ROSDEP_KEY = {
+    "cvxpy": "python3-cvxpy-pip",
+    "highspy": "python3-cvxpy-pip",
+    "lz4": "mcap-ros2-support",
+    "matplotlib": "python3-matplotlib",
+    "mcap": "mcap-ros2-support",
+    "numpy": "python3-numpy",
+    "osqp": "python3-cvxpy-pip",
+    "rosbags": "python3-rosbags-pip",
+    "scipy": "python3-scipy",
+    "tqdm": "python3-tqdm",
+    "yaml": "python3-yaml",
+    "zstandard": "mcap-ros2-support",
+}
+WITHOUT_ROSDEP_KEY = {"daqp", "piqp"}
+
+
+@pytest.fixture(scope="module")
+def package():
+    return ElementTree.parse(ROOT / "package.xml").getroot()
+
+
+@pytest.fixture(scope="module")
+def distribution():
+    patch = pytest.MonkeyPatch()
+    patch.chdir(ROOT)
+    yield run_setup("setup.py", stop_after="init")
+    patch.undo()
+
+
+def imported(*folders: str) -> dict[str, str]:
+    """Top-level names that the Python files import from elsewhere, each with one file that does."""
+    names: dict[str, str] = {}
+    for path in (path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))):
+        for node in ast.walk(ast.parse(path.read_text())):
+            modules = []
+            if isinstance(node, ast.Import):
+                modules = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                modules = [node.module]
+            names |= {module.partition(".")[0]: str(path.relative_to(ROOT)) for module in modules}
+    own = {"uncertain_lti", "uncertain_lti_ros"}
+    return {name: path for name, path in names.items() if name not in own | sys.stdlib_module_names}
+
+
+def run_python(code: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    return subprocess.run(command, cwd="/", capture_output=True, text=True)
+
+
+def import_in_fresh_process(module: str, *, allowed: set[str] | None = None, refused: Iterable[str] = ()):
+    """Import `module` where the refused packages, or all third-party ones but the allowed, fail to import."""
+    result = run_python(f"""
+        import sys
+
+        class Blocker:
+            def find_spec(self, name, path=None, target=None):
+                top = name.partition(".")[0]
+                allowed = {allowed!r}
+                outside = allowed is not None and top not in sys.stdlib_module_names and top not in allowed
+                if outside or top in {set(refused)!r}:
+                    raise ModuleNotFoundError(f"{{name}} must not be needed here", name=name)
+
+        sys.meta_path.insert(0, Blocker())
+        import {module}
+        """)
+    assert result.returncode == 0, result.stderr
+
+
+def test_importing_the_package_costs_nothing():
+    result = run_python("""
+        import sys
+        import uncertain_lti
+        loaded = [name for name in sys.modules if name == "numpy" or name.startswith("uncertain_lti.")]
+        assert not loaded, loaded
+        """)
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("module", LIVE)
+def test_what_the_live_node_uses_imports_with_numpy_alone(module):
+    import_in_fresh_process(f"uncertain_lti.{module}", allowed={"uncertain_lti", "numpy"})
+
+
+def test_the_node_imports_without_solvers_plots_and_bag_readers():
+    pytest.importorskip("rclpy", reason="neither a ROS 2 installation nor the rclpy wheels are here")
+    heavy = "cvxpy daqp highspy matplotlib mcap osqp pandas piqp rosbags scipy tqdm".split()
+    import_in_fresh_process("uncertain_lti_ros.envelope_monitor", refused=heavy)
+
+
+def test_public_names_resolve_and_others_do_not():
+    for name in uncertain_lti.__all__:
+        assert getattr(uncertain_lti, name).__module__.startswith("uncertain_lti."), name
+        assert name in dir(uncertain_lti)
+    with pytest.raises(AttributeError, match="no attribute 'Transients'"):
+        _ = uncertain_lti.Transients
+
+
+def test_core_never_imports_ros():
+    ros = re.compile(r"(rcl|ros2|rosidl|launch).*|.*_(msgs|srvs|interfaces)")
+    assert not {name: path for name, path in imported("core").items() if ros.fullmatch(name)}
+
+
+def test_version_is_the_same_everywhere(package, distribution):
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1]
+    assert package.findtext("version") == distribution.get_version() == uncertain_lti.__version__ == newest
+
+
+def test_package_xml_is_what_colcon_accepts(package, distribution):
+    assert package.get("format") == "3"
+    assert package.findtext("name") == distribution.get_name()
+    assert package.findtext("export/build_type") == "ament_python"
+    assert package.findtext("license") == distribution.get_license() == "Apache-2.0"
+    # catkin_pkg's own pattern; with an address that fails it colcon no longer sees an ament package.
+    address = r"[-a-zA-Z0-9_%+]+(\.[-a-zA-Z0-9_%+]+)*@[-a-zA-Z0-9%]+(\.[-a-zA-Z0-9%]+)*\.[a-zA-Z]{2,}"
+    assert re.fullmatch(address, package.find("maintainer").get("email"))
+    assert package.find("maintainer").get("email") == distribution.get_maintainer_email()
+
+
+def test_every_executable_has_its_function(distribution):
+    for script in distribution.entry_points["console_scripts"]:
+        module, function = script.split("=")[1].strip().split(":")
+        assert callable(getattr(importlib.import_module(module), function)), script
+
+
+def test_every_package_and_file_of_the_source_is_installed(distribution):
+    homes = {distribution.package_dir.get(name, name): name for name in distribution.packages}
+    for top in ("core", "uncertain_lti_ros"):
+        for path in (ROOT / top).rglob("*"):
+            if path.is_dir() or "__pycache__" in path.parts or path.name.startswith("."):
+                continue
+            home = str(path.parent.relative_to(ROOT))
+            assert home in homes, f"{home} holds {path.name} and is no package"
+            patterns = distribution.package_data.get(homes[home], [])
+            assert path.suffix == ".py" or any(path.match(pattern) for pattern in patterns), path
+
+    installed = {file for _, files in distribution.data_files for file in files}
+    wanted = {p for folder in ("launch", "config") for p in (ROOT / folder).rglob("*") if p.is_file()}
+    wanted = {str(p.relative_to(ROOT)) for p in wanted if "__pycache__" not in p.parts}
+    assert wanted | {"package.xml", "resource/uncertain_lti_ros"} == installed
+    assert all((ROOT / file).is_file() for file in installed)
+
+
+def test_what_pip_installs_covers_what_is_imported(distribution):
+    requirements = [*distribution.install_requires, *sum(distribution.extras_require.values(), [])]
+    names = {canonicalize_name(Requirement(text).name) for text in requirements}
+    missing = {name: path for name, path in imported("core").items() if PIP_NAME.get(name, name) not in names}
+    assert not missing
+
+
+def test_package_xml_covers_what_is_imported(package):
+    keys = {element.text for element in package.iter("exec_depend")}
+    outside = imported("core", "uncertain_lti_ros", "launch")
+    optional = WITHOUT_ROSDEP_KEY | {"pandas"}  # data frames are handed in by who has pandas
+    missing = {n: p for n, p in outside.items() if n not in optional and ROSDEP_KEY.get(n, n) not in keys}
+    assert not missing
+
+
+def test_constraints_pin_every_requirement_to_a_version_it_allows(distribution):
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    pins = {canonicalize_name(name): version for name, version in pins.items()}
+    for text in [*distribution.install_requires, *sum(distribution.extras_require.values(), [])]:
+        requirement = Requirement(text)
+        assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), text

@@ -1,0 +1,116 @@
+"""`./run` says in one sentence, with the remedy, what keeps it from starting; status 2."""
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+VERSION = "{}.{}".format(*sys.version_info)
+
+pytestmark = pytest.mark.skipif(
+    (platform.system(), platform.machine()) != ("Linux", "x86_64"),
+    reason="the rclpy wheels are for x86_64 Linux",
+)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Call `./run` in a fresh folder, on a machine with nothing but the shell's own tools and `programs`."""
+    checkout = tmp_path / "a checkout"
+    checkout.mkdir()
+    for name in ("run", "setup.py", "pyproject.toml", "constraints.txt"):
+        shutil.copy(ROOT / name, checkout)
+    bin = tmp_path / "bin"
+    bin.mkdir()
+    for tool in "bash cat cksum dirname env grep rm sed tail uname".split():
+        (bin / tool).symlink_to(shutil.which(tool))
+
+    def call(*arguments: str, programs: dict[str, str] | None = None, **environment: str):
+        for name, text in (programs or {}).items():
+            (bin / name).write_text(f"#!{bin}/bash\n{text}\n")
+            (bin / name).chmod(0o755)
+        return subprocess.run(
+            [checkout / "run", *arguments],
+            env={"PATH": str(bin), "HOME": str(tmp_path), "PIP_CONFIG_FILE": os.devnull, **environment},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+        )
+
+    return call
+
+
+def this_python(setting: str = "") -> str:
+    """Shell text that is the interpreter running this test, with an environment setting before it."""
+    return f'{setting} exec "{Path(sys.executable).resolve()}" "$@"'
+
+
+def python_of_version(version: str) -> str:
+    """Shell text that answers like an interpreter of that version; asked for more, it fails."""
+    return f'[[ $2 == *version_info* ]] && echo {version}'
+
+
+def refusal(result: subprocess.CompletedProcess) -> str:
+    """The one sentence with which `./run` stopped."""
+    assert result.returncode == 2, result
+    sentence = result.stderr.strip()
+    assert sentence.startswith("./run: ") and "\n" not in sentence, sentence
+    return sentence
+
+
+@pytest.mark.parametrize("argument", [[], ["--help"], ["help"]])
+def test_help_lists_the_commands(run, argument):
+    result = run(*argument)
+    assert result.returncode == 0
+    for command in ("demo", "test", "lint", "setup"):
+        assert f"\n  {command}" in result.stdout
+
+
+def test_unknown_command(run):
+    assert "no command 'tset'" in refusal(run("tset"))
+
+
+def test_no_python(run):
+    assert "apt-get install python3 python3-venv" in refusal(run("setup"))
+
+
+def test_every_python_of_a_wrong_version_is_named(run):
+    programs = {"python3": python_of_version("3.13"), "python3.12": "exit 127"}
+    sentence = refusal(run("setup", programs=programs))
+    assert "Python 3.11 or 3.12 is needed" in sentence and "python3 is 3.13" in sentence
+    assert "python3.12 is" not in sentence
+
+
+@pytest.fixture
+def without_venv(tmp_path):
+    """Shell text that is this interpreter as Debian ships it without python3-venv."""
+    (tmp_path / "ensurepip.py").write_text("raise ModuleNotFoundError\n")
+    return this_python(f'PYTHONPATH="{tmp_path}"')
+
+
+def test_python_without_venv_module(run, without_venv):
+    sentence = refusal(run("setup", programs={"python3": without_venv}))
+    assert sentence.endswith(f"apt-get install python{VERSION}-venv")
+
+
+def test_a_suitable_python_is_found_under_its_own_name(run, without_venv):
+    programs = {"python3": python_of_version("3.13"), f"python{VERSION}": without_venv}
+    assert f"Python {VERSION} has no venv module" in refusal(run("setup", programs=programs))
+
+
+def test_sourced_ros_on_another_python(run):
+    programs = {"python3": "[[ $2 == 'import rclpy' ]] || echo 3.10", "python3.11": this_python()}
+    sentence = refusal(run("setup", programs=programs, ROS_DISTRO="humble"))
+    assert "ROS 2 humble runs on Python 3.10" in sentence
+
+
+def test_no_network(run):
+    pytest.importorskip("ensurepip", reason="this Python cannot make virtual environments")
+    nowhere = {"PIP_INDEX_URL": "http://127.0.0.1:9", "PIP_RETRIES": "1"}
+    sentence = refusal(run("setup", programs={"python3": this_python()}, **nowhere))
+    assert "no package index can be reached" in sentence and "connect this machine" in sentence
