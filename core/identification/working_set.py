@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.errors import FitError
-from uncertain_lti.identification.problem import Moments, Problem
+from uncertain_lti.identification.problem import BLOCK, Moments, Problem
 from uncertain_lti.identification.solvers import Simplex, solve_qp
 
 Array = NDArray[np.float64]
@@ -27,6 +27,10 @@ TIE_BREAK = 1e-8
 the optimum of the sum is within TIE_BREAK / 4 (relative) of the optimum of (10) alone, with the centre that the
 stated tie-break asks for.
 """
+WIDTH_SLACK = 1e-9
+"""Relative room above δ of (11) in which its ties are broken; a solver needs some."""
+BOUNDED_TIE_BREAK = 1e-5
+"""The same among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
 MAX_ROUNDS = 200
 
 
@@ -72,7 +76,7 @@ class WorkingSet:
         self.r, self.q = len(self.free_phi), len(self.free_psi)
         n = problem.n
         self.coupled = moments.coupled is not None
-        self.groups: list[tuple[int, ...]] = [tuple(range(n))] if self.coupled else [(i,) for i in range(n)]
+        self.groups: list[tuple[int, ...]] = [(i,) for i in range(n)]
         self.pools: list[Index] = [np.empty(0, dtype=np.intp) for _ in range(n)]
         self.solution = Solution(
             np.zeros((len(moments.phi_scale), n)),
@@ -95,6 +99,8 @@ class WorkingSet:
 
     def quadratic(self) -> Solution:
         """Criterion (10)."""
+        if self.coupled:
+            self.groups = [tuple(range(self.problem.n))]
         self._start()
         self._iterate(self._solve_quadratic)
         return self.solution
@@ -107,7 +113,7 @@ class WorkingSet:
         self._iterate(self._solve_linear)
         delta = self._limit.copy()
         self.solution.delta = delta
-        self._limit = delta * (1.0 + 1e-10)
+        self._limit = delta * (1.0 + WIDTH_SLACK)
         self._iterate(self._solve_bounded)
         self.solution.objective = delta
         return self.solution
@@ -144,7 +150,7 @@ class WorkingSet:
         self.solution.theta[self.free_phi, i] = theta * self.phi_unit * scale
         self.solution.d[self.free_psi, i] = np.maximum(d, 0.0) * self.psi_unit * scale
 
-    def _hessian(self, group: tuple[int, ...], gram: Array) -> tuple[Array, Array]:
+    def _hessian(self, group: tuple[int, ...], gram: Array, tie_break: float) -> tuple[Array, Array]:
         """Squared widths, plus the tie-break on the centre; variables [θ d] row after row."""
         block = self.r + self.q
         H = np.zeros((block * len(group), block * len(group)))
@@ -156,7 +162,7 @@ class WorkingSet:
                 d_b = slice(other * block + self.r, (other + 1) * block)
                 H[d_a, d_b] = gram[position * self.q : (position + 1) * self.q, other * self.q : (other + 1) * self.q]
             diagonal = np.diagonal(gram)[position * self.q : (position + 1) * self.q]
-            weight = TIE_BREAK * float(diagonal.min(initial=1.0))
+            weight = tie_break * float(diagonal.min(initial=1.0))
             H[theta, theta] = weight * (self._centre + 1e-10 * np.eye(self.r))
             f[theta] = -weight * self._target[:, i]
         ridge = np.zeros(len(f))
@@ -181,7 +187,7 @@ class WorkingSet:
             gram /= np.diagonal(gram).max(initial=1e-300)
         else:
             gram = self._gram[group[0] if len(self._gram) > 1 else 0]
-        H, f = self._hessian(group, gram)
+        H, f = self._hessian(group, gram, TIE_BREAK)
         block = self.r + self.q
         parts = [self._containment(i, self.pools[i]) for i in group]
         G = np.zeros((sum(len(h) for _, h in parts), block * len(group)))
@@ -224,7 +230,7 @@ class WorkingSet:
     def _solve_bounded(self, group: tuple[int, ...]) -> None:
         (i,) = group
         assert self._limit is not None
-        H, f = self._hessian(group, self._plain)
+        H, f = self._hessian(group, self._plain, BOUNDED_TIE_BREAK)
         G, h = self._containment(i, self.pools[i])
         limit = self._limit[i] / self.moments.rate_scale[i]
         widths = self._width_rows(i, self.pools[i])
@@ -244,7 +250,8 @@ class WorkingSet:
         theta = np.linalg.lstsq(self._centre + ridge, self._target, rcond=None)[0]
         for i in range(self.problem.n):
             self._store(i, theta[:, i], np.zeros(self.q))
-        for i, found in enumerate(self._violators(None, 4 * (self.r + self.q))[0]):
+        blocks = -(-self.problem.N // BLOCK)
+        for i, found in enumerate(self._violators(None, max(2, 4 * (self.r + self.q) // blocks))[0]):
             self.pools[i] = found
 
     def _iterate(self, solve: Callable[[tuple[int, ...]], None]) -> None:
