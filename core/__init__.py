@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from uncertain_lti.bag import read_transients as read_transients
+    from uncertain_lti.reading import read_transients as read_transients
     from uncertain_lti.identification import fit as fit
     from uncertain_lti.model import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
@@ -25,7 +25,7 @@ _HOME = {
     "Transient": "transient",
     "UncertainLTI": "model",
     "fit": "identification",
-    "read_transients": "bag",
+    "read_transients": "reading",
 }
 
 __all__ = sorted(_HOME)

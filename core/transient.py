@@ -53,9 +53,15 @@ class Transient:
         s; a longer step starts a new segment. Default 2.5 x the median step; math.inf for no limit.
     min_step : float
         s; a sample less than this after the one before is dropped, one with an equal stamp always.
+    counters : mapping, optional
+        Counts of a `Sampler` to start from.
+    sources : sequence of paths, optional
+        Files that the run was read from.
+    warnings : sequence of str, optional
+        What the reader of the files had to say.
 
     A sample at most max_gap earlier than the one before is dropped as late; one earlier than that starts a new
-    segment. `dropped` counts by reason.
+    segment. `counters` counts what was dropped by reason, beside what the sampler counted.
 
     Raises
     ------
@@ -67,7 +73,7 @@ class Transient:
     x: Array
     u: Array
     segment: NDArray[np.int32]
-    dropped: Counter[str]
+    counters: Counter[str]
 
     def __init__(
         self,
@@ -81,7 +87,9 @@ class Transient:
         control_names: Sequence[str] | None = None,
         max_gap: float | None = None,
         min_step: float = 0.0,
-        dropped: Mapping[str, int] | None = None,
+        counters: Mapping[str, int] | None = None,
+        sources: Sequence[str | os.PathLike[str]] = (),
+        warnings: Sequence[str] = (),
     ) -> None:
         self.name = name
         self.signals = signals
@@ -92,13 +100,15 @@ class Transient:
             raise TransientError(f"{name}: x has no column; give at least one state")
         self.state_names = _names(state_names, signals.states if signals else None, "x", self.x, name)
         self.control_names = _names(control_names, signals.controls if signals else None, "u", self.u, name)
-        self.dropped = Counter(dropped or {})
+        self.counters = Counter(counters or {})
+        self.sources = tuple(os.fspath(s) for s in sources)
+        self.warnings = tuple(warnings)
         min_step_ns = to_ns(min_step)
         median = median_step_ns([t_ns], min_step_ns)
         if max_gap is None:
             max_gap = 2.5 * median * 1e-9 if median else math.inf
         self.max_gap, self.min_step = float(max_gap), float(min_step)
-        kept, self.segment = _segments(t_ns, to_ns(self.max_gap), min_step_ns, self.dropped)
+        kept, self.segment = _segments(t_ns, to_ns(self.max_gap), min_step_ns, self.counters)
         self.t_ns = t_ns
         if len(kept) < len(t_ns):
             self.t_ns, self.x, self.u = t_ns[kept], self.x[kept], self.u[kept]
@@ -120,8 +130,8 @@ class Transient:
         """(N,): the transition k -> k+1 lies in one segment and is finite at both ends."""
         if len(self.t_ns) < 2:
             return np.zeros(0, dtype=bool)
-        finite_x: NDArray[np.bool_] = np.isfinite(self.x).all(axis=1)
-        finite_u: NDArray[np.bool_] = np.isfinite(self.u).all(axis=1)
+        finite_x = np.asarray(np.isfinite(self.x).all(axis=1))
+        finite_u = np.asarray(np.isfinite(self.u).all(axis=1))
         same = self.segment[1:] == self.segment[:-1]
         usable: NDArray[np.bool_] = same & finite_x[:-1] & finite_u[:-1] & finite_x[1:]
         return usable
@@ -135,10 +145,19 @@ class Transient:
         k = np.flatnonzero(usable)
         return Transitions(k, self.dt[k], self.x[k], self.u[k], self.x[k + 1])
 
+    def statuses(self) -> list[Status]:
+        """What the `Sampler` says of each sample, (N+1,)."""
+        if not len(self):
+            return []
+        back = np.diff(self.t_ns) < 0
+        cut = np.diff(self.segment) > 0
+        kinds = np.select([back, cut, ~self.usable], [Status.RESET, Status.GAP, Status.MISSING], Status.OK)
+        return [Status.FIRST, *(Status(kind) for kind in kinds)]
+
     @property
     def segments(self) -> int:
         """Number of segments."""
-        return len(np.unique(self.segment))
+        return int(self.segment[-1]) + 1 if len(self) else 0
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -305,7 +324,7 @@ def _names(
 
 
 def _segments(
-    t_ns: NDArray[np.int64], max_gap_ns: int, min_step_ns: int, dropped: Counter[str]
+    t_ns: NDArray[np.int64], max_gap_ns: int, min_step_ns: int, counters: Counter[str]
 ) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
     """Positions of the samples that stay, and the segment of each: the rules of `Sampler`."""
     steps = np.diff(t_ns)
@@ -318,11 +337,11 @@ def _segments(
         for position, instant in enumerate(t_ns.tolist()[1:], start=1):
             step = instant - last
             if step == 0:
-                dropped[Status.EQUAL.value] += 1
+                counters[Status.EQUAL.value] += 1
             elif 0 < step < min_step_ns:
-                dropped[Status.SHORT.value] += 1
+                counters[Status.SHORT.value] += 1
             elif -max_gap_ns <= step < 0:
-                dropped[Status.LATE.value] += 1
+                counters[Status.LATE.value] += 1
             else:
                 positions.append(position)
                 last = instant

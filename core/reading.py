@@ -1,0 +1,276 @@
+"""Bags into transients: field values through the Sampler, with what a signals file leaves open resolved."""
+
+from __future__ import annotations
+
+import math
+import os
+from array import array
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.bag import Bag, group_recordings
+from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.message_types import header_stamp_ns
+from uncertain_lti.model import UncertainLTI
+from uncertain_lti.operating_point import resolve_auto
+from uncertain_lti.sampler import Sampler, Status, resolve
+from uncertain_lti.signals import FieldPath, SignalMap
+from uncertain_lti.transient import Transient
+
+Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+Progress = Callable[[Iterable[object], int], Iterable[object]]
+
+
+@dataclass
+class Stream:
+    """The wanted field values of one recording in order of arrival.
+
+    topic (messages,) positions in `signals.topics`; arrival, stamp (messages,) ns, with -1 for no stamp; values,
+    one array per topic, message after message in the order of `signals.on(topic)`.
+    """
+
+    bag: Bag
+    topic: NDArray[np.int64]
+    arrival: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    values: list[NDArray[np.float64]]
+
+
+def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
+    """Read the fields of a signals file from one recording.
+
+    Raises
+    ------
+    BagError
+        A topic is not there or cannot be read.
+    SignalError
+        A field is not in the message type, is not one number, or names what no message has.
+    """
+    topics = signals.topics
+    for name in topics:  # every problem of the map is found before the long read
+        if name in bag.topics and bag.topics[name].readable:
+            signals.check(name, bag.topics[name].type, bag.type_fields(name))
+    messages: Iterable[tuple[str, int, object]] = bag.messages(topics)
+    if progress is not None:
+        total = sum(bag.topics[t].count for t in topics if t in bag.topics)
+        messages = progress(messages, total)  # type: ignore[assignment]
+    paths = [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in topics]
+    position = {name: i for i, name in enumerate(topics)}
+    order, arrival, stamp = array("q"), array("q"), array("q")
+    values = [array("d") for _ in topics]
+    absent: dict[str, tuple[str, list[str]]] = {}
+    for name, log_time, message in messages:
+        where = position[name]
+        if not values[where]:
+            for path in paths[where]:
+                if missing := path.missing_name(message):
+                    absent[path.text] = missing
+        order.append(where)
+        arrival.append(log_time)
+        stamp.append(header_stamp_ns(message) or -1)
+        values[where].extend([path.read(message) for path in paths[where]])
+    arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
+    for name, columns, read in zip(topics, paths, arrays, strict=True):
+        for path, column in zip(columns, read.T, strict=True):
+            if path.text in absent and np.isnan(column).all():
+                wanted, there = absent[path.text]
+                raise SignalError(
+                    f"field '{path.text}' of {name} in {bag.path}: there is no '{wanted}' in the message's names; "
+                    f"names there: {', '.join(there) or 'none'}"
+                )
+    return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
+
+
+def time_sources(streams: Sequence[Stream], signals: SignalMap) -> dict[str, str]:
+    """Per topic `header` or `log`: as said, else header where most messages of all recordings carry a stamp."""
+    sources = {}
+    for position, name in enumerate(signals.topics):
+        stamps = np.concatenate([s.stamp[s.topic == position] for s in streams])
+        stamped = stamps.size > 0 and 2 * np.count_nonzero(stamps >= 0) > stamps.size
+        said = signals.time.get(name)
+        if said == "header" and not (stamps >= 0).any():
+            raise SignalError(
+                f"{signals.source}: topics: {name}: time is header, and no message has a stamp; write log, or leave it out"
+            )
+        sources[name] = said or ("header" if stamped else "log")
+    return sources
+
+
+def sample(stream: Stream, signals: SignalMap) -> Transient:
+    """One recording through the `Sampler`; signals must be resolved."""
+    sampler = Sampler(signals)
+    topics = signals.topics
+    rows = [iter(v.tolist()) for v in stream.values]
+    t: list[int] = []
+    x: list[NDArray[np.float64]] = []
+    u: list[NDArray[np.float64]] = []
+    m = len(signals.controls)
+    for position, arrival, stamp in zip(
+        stream.topic.tolist(), stream.arrival.tolist(), stream.stamp.tolist(), strict=True
+    ):
+        for step in sampler.push(topics[position], arrival, stamp if stamp >= 0 else None, next(rows[position])):
+            if step.status.dropped:
+                continue
+            if u:
+                u[-1] = step.u  # fixed only now that the next sample has arrived
+            t.append(step.t_ns)
+            x.append(step.x_next)
+            u.append(np.full(m, math.nan))
+    assert signals.max_gap is not None
+    return Transient(
+        np.array(t, dtype=np.int64),
+        np.array(x).reshape(len(t), len(signals.states)),
+        np.array(u).reshape(len(t), m),
+        name=os.fspath(stream.bag.path),
+        signals=signals,
+        max_gap=signals.max_gap,
+        min_step=signals.min_step,
+        counters=sampler.counters,
+        sources=stream.bag.parts,
+        warnings=stream.bag.warnings,
+    )
+
+
+def read_transients(
+    paths: Paths,
+    signals: SignalMap | str | os.PathLike[str],
+    progress: Progress | None = None,
+) -> list[Transient]:
+    """Read recordings as transients, all cut by one resolved signal map.
+
+    What the map leaves open is resolved over all recordings together: time sources, clock, max_gap, message types,
+    and `auto` steady states and scales (rules: `SignalMap`, `operating_point.resolve_auto`). The resolved map is
+    `transient.signals`.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        MCAP files and folders; parts of one split bag are one recording (see `bag.group_recordings`).
+    signals : SignalMap or path
+        A map, or the signals file.
+    progress : callable, optional
+        Wraps the message iterator, given the number of messages: (iterable, total) -> iterable.
+
+    Returns
+    -------
+    list of Transient
+        One per recording.
+
+    Raises
+    ------
+    BagError
+        A recording cannot be read, or lacks a topic.
+    SignalError
+        The map does not fit the recordings.
+    """
+    if not isinstance(signals, SignalMap):
+        signals = SignalMap.load(signals)
+    bags = group_recordings([paths] if isinstance(paths, (str, os.PathLike)) else list(paths))
+    if not bags:
+        raise BagError("no recording is named; give at least one MCAP file or folder")
+    signals = signals.with_types(_types(bags, signals))
+    streams = [read_stream(bag, signals, progress) for bag in bags]
+    for stream in streams:
+        for position, topic in enumerate(signals.topics):
+            if not (stream.topic == position).any():
+                raise BagError(f"{stream.bag.path}: {topic} has no message; record it, or choose another topic")
+    sources = time_sources(streams, signals)
+    instants: dict[str, list[NDArray[np.int64]]] = {}
+    for position, topic in enumerate(signals.topics):
+        instants[topic] = []
+        for s in streams:
+            chosen = s.topic == position
+            times = s.stamp[chosen] if sources[topic] == "header" else s.arrival[chosen]
+            instants[topic].append(times[times >= 0])
+    resolved = resolve(signals, instants, sources)
+    transients = [sample(stream, resolved) for stream in streams]
+    asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
+    if not asked:
+        return transients
+    resolved, words = _resolve_operating_point(resolved, transients)
+    if any(FieldPath(s.field).unwrap for s in asked):  # the branch of an angle starts nearest to steady
+        return [sample(stream, resolved) for stream in streams]
+    note = f"operating point: auto resolved from {words}"
+    return [_with_signals(t, resolved, note) for t in transients]
+
+
+def read_for_model(path: str | os.PathLike[str], model: UncertainLTI, progress: Progress | None = None) -> Transient:
+    """Read one recording with the signals and sampling that a model was fitted with.
+
+    Raises
+    ------
+    BagError
+        The recording cannot be read, lacks a topic, or a topic has another type than in the fit.
+    SignalError
+        The model names no topics (it was fitted to arrays).
+    """
+    signals = model.signals
+    if any(not s.topic for s in signals.signals):
+        raise SignalError(
+            "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
+        )
+    bag = Bag(path)
+    for topic, found in _types([bag], signals).items():
+        expected = next(s.type for s in signals.signals if s.topic == topic)
+        if expected and found != expected:
+            raise BagError(
+                f"{bag.path}: {topic} is {found}, and the model was fitted to {expected}; "
+                f"check a recording of the same topics"
+            )
+    return sample(read_stream(bag, signals, progress), signals)
+
+
+def _types(bags: Sequence[Bag], signals: SignalMap) -> Mapping[str, str]:
+    types: dict[str, str] = {}
+    for bag in bags:
+        for topic in signals.topics:
+            if topic not in bag.topics:
+                there = ", ".join(sorted(bag.topics)) or "none"
+                raise BagError(f"{bag.path}: there is no topic {topic}; topics there: {there}")
+            found = bag.topics[topic].type
+            if types.setdefault(topic, found) != found:
+                raise BagError(
+                    f"{bag.path}: {topic} is {found}, and {types[topic]} in {bags[0].path}; "
+                    f"fit recordings of the same types together"
+                )
+    return types
+
+
+def _resolve_operating_point(signals: SignalMap, transients: Sequence[Transient]) -> tuple[SignalMap, str]:
+    recordings = [np.hstack([t.x, t.u])[:-1] for t in transients]  # the last row has no control yet
+    steady, scale, words = resolve_auto(signals.signals, recordings)
+    filled = [replace(s, steady=a, scale=b) for s, a, b in zip(signals.signals, steady, scale, strict=True)]
+    n = len(signals.states)
+    return replace(signals, states=tuple(filled[:n]), controls=tuple(filled[n:])), words
+
+
+def _with_signals(transient: Transient, signals: SignalMap, note: str) -> Transient:
+    return Transient(
+        transient.t_ns,
+        transient.x,
+        transient.u,
+        name=transient.name,
+        signals=signals,
+        max_gap=transient.max_gap,
+        min_step=transient.min_step,
+        counters=transient.counters,
+        sources=transient.sources,
+        warnings=(*transient.warnings, note),
+    )
+
+
+def unused(transient: Transient) -> list[str]:
+    """In words, how many transitions of a recording are not used, and why."""
+    counts: dict[str, int] = {}
+    for status in transient.statuses()[1:]:
+        if status is not Status.OK:
+            counts[status.value] = counts.get(status.value, 0) + 1
+    parts = [f"{count} {kind}" for kind, count in counts.items()]
+    parts += [
+        f"{transient.counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and transient.counters[s.value]
+    ]
+    parts += [f"{count} {key}" for key, count in sorted(transient.counters.items()) if key.startswith(("late ", "stale "))]
+    return parts
