@@ -10,11 +10,11 @@ CORE |= {f"uncertain_lti.{name}": f"core/{name.replace('.', '/')}" for name in f
 ROOT = Path(__file__).resolve().parent
 
 
-def share(folder: str, pattern: str) -> list[tuple[str, list[str]]]:
-    """List the files under `folder` that match, to be installed to share/ with their folders."""
+def share(folder: str) -> list[tuple[str, list[str]]]:
+    """List the files of a folder, to be installed to share/ as they lie here."""
     by_folder: dict[str, list[str]] = {}
-    for path in sorted((ROOT / folder).rglob(pattern)):
-        if path.is_file():
+    for path in sorted((ROOT / folder).rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
             relative = path.relative_to(ROOT)
             by_folder.setdefault(f"share/{NAME}/{relative.parent}", []).append(str(relative))
     return list(by_folder.items())
@@ -48,8 +48,9 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        *share("launch", "*.launch.py"),
-        *share("config", "*"),
+        *share("bags"),
+        *share("config"),
+        *share("launch"),
     ],
     zip_safe=False,
     install_requires=["lz4", "mcap", "numpy>=1.26", "PyYAML", "rosbags", "tqdm", "zstandard"],

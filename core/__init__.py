@@ -8,11 +8,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from uncertain_lti.reading import read_transients as read_transients
     from uncertain_lti.identification import fit as fit
     from uncertain_lti.model import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
     from uncertain_lti.operating_point import OperatingPoint as OperatingPoint
+    from uncertain_lti.reading import read_transients as read_transients
     from uncertain_lti.signals import SignalMap as SignalMap
     from uncertain_lti.transient import Transient as Transient
 

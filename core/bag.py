@@ -13,6 +13,7 @@ from statistics import median
 from typing import Any, Literal, NamedTuple
 
 from mcap.records import Schema
+
 from uncertain_lti.bag_files import listed_parts, natural, os_error, parts_of, stem_and_index
 from uncertain_lti.errors import BagError, SignalError
 from uncertain_lti.mcap_records import Block, Contents, count, messages, read_block, scan
@@ -114,7 +115,8 @@ class Bag:
         self._contents = contents or self._open()
         self._warnings += [warning for part in self._contents for warning in part.warnings]
         if self._warnings and not any(part.count for part in self._contents):
-            raise BagError(f"{self.path}: no message can be read ({self._warnings[0]}); record or copy it anew")
+            why = self._warnings[0].removeprefix(f"{self.path}: ")
+            raise BagError(f"{self.path}: no message can be read ({why}); record or copy it anew")
         self._channels = [_channels(part) for part in self._contents]
         self.topics: Mapping[str, TopicInfo] = self._topics()
 

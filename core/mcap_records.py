@@ -33,6 +33,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics
+
 from uncertain_lti.bag_files import MAGIC, not_mcap, os_error
 from uncertain_lti.errors import BagError
 
@@ -216,7 +217,7 @@ class _Scanner:
         self._end_bare()
         found.schemas = self.summary_schemas | found.schemas
         found.channels = self.summary_channels | found.channels
-        self._orphans()
+        lost = self._orphans()
         if ended and not self.closed:
             found.warnings.append(
                 f"{path}: no footer at its end; all its {count(found.count, 'message')} could be read"
@@ -231,6 +232,8 @@ class _Scanner:
                 f"{path}: {count(self.odd_records, 'record')} that cannot be read left out; "
                 f"the recorder or the disk damaged the file"
             )
+        if lost:
+            found.warnings.append(f"{path}: {count(lost, 'message')} of channels that are nowhere described left out")
         stated = self.statistics.message_count if self.statistics else 0
         if stated > found.count:
             found.warnings.append(f"{path}: its summary counts {count(stated, 'message')}, {found.count} could be read")
@@ -411,14 +414,10 @@ class _Scanner:
                 f"{self.found.path}: {what} {record.id} is defined twice, differently; the first one counts"
             )
 
-    def _orphans(self) -> None:
+    def _orphans(self) -> int:
         """Messages whose channel has no record, for example because its chunk is damaged, are no topic's."""
         lost = [channel for channel in self.found.tally if channel not in self.found.channels]
-        number = sum(self.found.tally.pop(channel).count for channel in lost)
-        if number:
-            self.found.warnings.append(
-                f"{self.found.path}: {count(number, 'message')} of channels that are nowhere described left out"
-            )
+        return sum(self.found.tally.pop(channel).count for channel in lost)
 
     # --- the summary ----------------------------------------------------------------------------------------
 

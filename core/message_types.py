@@ -7,6 +7,7 @@ disturbs no other topic.
 from __future__ import annotations
 
 import functools
+import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
+
 from uncertain_lti.errors import BagError, SignalError
 from uncertain_lti.signals import FieldType
 
@@ -129,6 +131,7 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
     """
     type_name = normal_name(name)
     types: dict[str, Any] = {}
+    store = get_typestore(Stores.EMPTY)
     reason = note = ""
     try:
         if len(text) > _LARGEST_SCHEMA:
@@ -139,15 +142,15 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
             note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
         else:
             raise TypesysError(f"the file holds no definition of {type_name}, and ROS 2 Jazzy has none")
-        _complete(type_name, types, (), set())
+        used: set[str] = set()
+        _complete(type_name, types, (), used)
+        types = {name: types[name] for name in sorted(used)}
+        store.register(types)
     except Exception as error:  # a schema may hold anything, and parsers raise whatever it leads them to
         types, note = {}, ""
         reason = _one_line(error)
         if text.strip():
             reason = f"its definition of {type_name} cannot be used: {reason}"
-    store = get_typestore(Stores.EMPTY)
-    if not reason:
-        store.register(types)
     return Definition(type_name, types, store, reason, note)
 
 
@@ -166,6 +169,7 @@ def _parse(type_name: str, encoding: str, text: str) -> dict[str, Any]:
         return dict(get_types_from_msg(text, type_name))
     if encoding != "ros2idl":
         raise TypesysError(f"its schema is written in '{encoding}' (ros2msg and ros2idl are read)")
+    text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # the parser does not know #include, and the parts follow anyway
     separator = "=" * 80 + "\n"
     types: dict[str, Any] = {}
     if not text.startswith(f"{separator}IDL: "):
@@ -211,8 +215,8 @@ def _field_type(description: Any) -> FieldType:
 
 
 def _one_line(error: Exception, limit: int = 160) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    if len(lines) > 3 and lines[0] == "Could not parse:":  # then the text, the position, and what stands there
-        return f"it cannot be parsed from '{lines[3][:40]}' on"
-    text = " ".join(lines) or type(error).__name__
+    lines = str(error).splitlines()
+    if len(lines) > 3 and lines[0].startswith("Could not parse"):  # the text, the position, what stands there
+        return f"it cannot be parsed from '{lines[3].strip()[:40]}' on"
+    text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= limit else text[:limit] + " ..."

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from uncertain_lti.errors import ModelError
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.sampler import Status, Step
@@ -108,9 +109,7 @@ class EnvelopeMonitor:
     def predict(self, x: Array, u: Array, dt: float) -> tuple[Array, Array]:
         """Bounds (lower, upper), each (n,), one step of dt s after x (n,), u (m,); all in recorded units."""
         point = self.model.operating_point
-        lower, upper = self.model.bounds(
-            point.normalise_x(x), point.normalise_u(u), dt, margin=self.rule.margin
-        )
+        lower, upper = self.model.bounds(point.normalise_x(x), point.normalise_u(u), dt, margin=self.rule.margin)
         return point.recorded_x(lower), point.recorded_x(upper)
 
     def judge(self, step: Step) -> Verdict:

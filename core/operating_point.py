@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from uncertain_lti.errors import TransientError
 from uncertain_lti.signals import Signal
 
@@ -125,9 +126,7 @@ def still_stretches(values: Array, span: Array, band: float = STILL_BAND) -> lis
     return stretches
 
 
-def resolve_auto(
-    signals: Sequence[Signal], recordings: Sequence[Array]
-) -> tuple[list[float], list[float], str]:
+def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tuple[list[float], list[float], str]:
     """Numbers for steady and scale where a signal says auto, and the rule applied, in words.
 
     steady: median over the longest still stretch (see `still_stretches`; the band is doubled until a stretch

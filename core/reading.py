@@ -84,16 +84,17 @@ def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) 
     return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
 
 
-def time_sources(streams: Sequence[Stream], signals: SignalMap) -> dict[str, str]:
+def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, str]:
     """Per topic `header` or `log`: as said, else header where most messages of all recordings carry a stamp."""
-    sources = {}
+    sources: dict[str, str] = {}
     for position, name in enumerate(signals.topics):
         stamps = np.concatenate([s.stamp[s.topic == position] for s in streams])
         stamped = stamps.size > 0 and 2 * np.count_nonzero(stamps >= 0) > stamps.size
         said = signals.time.get(name)
         if said == "header" and not (stamps >= 0).any():
             raise SignalError(
-                f"{signals.source}: topics: {name}: time is header, and no message has a stamp; write log, or leave it out"
+                f"{signals.source}: topics: {name}: time is header, and no message has a stamp; "
+                f"write log, or leave it out"
             )
         sources[name] = said or ("header" if stamped else "log")
     return sources
@@ -269,8 +270,6 @@ def unused(transient: Transient) -> list[str]:
         if status is not Status.OK:
             counts[status.value] = counts.get(status.value, 0) + 1
     parts = [f"{count} {kind}" for kind, count in counts.items()]
-    parts += [
-        f"{transient.counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and transient.counters[s.value]
-    ]
-    parts += [f"{count} {key}" for key, count in sorted(transient.counters.items()) if key.startswith(("late ", "stale "))]
-    return parts
+    counters = transient.counters
+    parts += [f"{counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and counters[s.value]]
+    return parts + [f"{count} {key}" for key, count in sorted(counters.items()) if key.startswith(("late ", "stale "))]

@@ -10,6 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
+
 from uncertain_lti.errors import SignalError
 from uncertain_lti.signals import FieldPath, SignalMap
 
@@ -141,9 +142,7 @@ class Sampler:
         n = len(signals.states)
         self._n, self._nm = n, len(signals.signals)
         self._where = {topic: signals.on(topic) for topic in signals.topics}
-        self._max_age = [skew_ns] * n + [
-            2**62 if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls
-        ]
+        self._max_age = [skew_ns] * n + [2**62 if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls]
         self._one_topic = all(s.topic == self.clock for s in signals.states)
         self._delays = [(n + j, c.delay) for j, c in enumerate(signals.controls) if c.delay]
         self._topics: dict[str, _Topic] = {}
@@ -160,9 +159,7 @@ class Sampler:
         self._before: NDArray[np.float64] | None = None
         self._history: dict[int, deque[float]] = {}
 
-    def push(
-        self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]
-    ) -> list[Step]:
+    def push(self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]) -> list[Step]:
         """Take one message; return the clock messages that it decided (none, one, or seldom two).
 
         Parameters
@@ -247,9 +244,7 @@ class Sampler:
     def _dropped(self, status: Status, instant: int, message: _Message) -> Step:
         self.counters[status.value] += 1
         nothing = np.full(self._n, math.nan)
-        return Step(
-            status, instant, message.arrival, math.nan, nothing, np.full(self._nm - self._n, math.nan), nothing
-        )
+        return Step(status, instant, message.arrival, math.nan, nothing, np.full(self._nm - self._n, math.nan), nothing)
 
     def _step(
         self,
@@ -264,9 +259,7 @@ class Sampler:
         if status is Status.OK and not (np.isfinite(before).all() and np.isfinite(x_next).all()):
             status = Status.MISSING
             self.counters["missing"] += 1
-        return Step(
-            status, self._instant(message), message.arrival, dt, before[: self._n], before[self._n :], x_next
-        )
+        return Step(status, self._instant(message), message.arrival, dt, before[: self._n], before[self._n :], x_next)
 
     def _fix(self, sample: _Message, final: bool) -> NDArray[np.float64]:
         """z = [x; u] of the open sample from what has arrived; final: the sample closes now."""
@@ -342,10 +335,8 @@ def resolve(
         The clock has fewer than two distinct instants.
     """
     min_step_ns = to_ns(signals.min_step)
-    medians = {
-        t: median_step_ns(instants[t], min_step_ns) for t in dict.fromkeys(s.topic for s in signals.states)
-    }
-    clock = signals.clock or max(medians, key=lambda t: (medians[t] or 0))
+    medians = {t: median_step_ns(instants[t], min_step_ns) for t in dict.fromkeys(s.topic for s in signals.states)}
+    clock = signals.clock or max(medians, key=lambda t: medians[t] or 0)
     step = medians[clock]
     if step is None:
         count = sum(len(i) for i in instants[clock])

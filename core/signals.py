@@ -234,9 +234,7 @@ class FieldPath:
             current = replace(current, array=None)
         self._check_leaf(here, current, type_name, topic, type_fields)
 
-    def _check_leaf(
-        self, here: str, leaf: FieldType, type_name: str, topic: str, type_fields: TypeFields
-    ) -> None:
+    def _check_leaf(self, here: str, leaf: FieldType, type_name: str, topic: str, type_fields: TypeFields) -> None:
         if self._function is not None:
             number = leaf.kind == "number"
             inner = type_fields(leaf.type_name) if leaf.kind == "message" and leaf.array is None else {}
@@ -409,9 +407,7 @@ class SignalMap:
 
         need_topics: every signal must name its topic; a model fitted to arrays has none.
         """
-        top = _keys(
-            data, source, {"clock", "max_gap", "min_step", "max_skew", "topics", "states", "controls"}
-        )
+        top = _keys(data, source, {"clock", "max_gap", "min_step", "max_skew", "topics", "states", "controls"})
         time: dict[str, TimeSource] = {}
         for topic, options in _keys(top.get("topics") or {}, f"{source}: topics", None).items():
             said = _keys(options, f"{source}: topics: {topic}", {"time"}).get("time")

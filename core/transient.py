@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from uncertain_lti.errors import TransientError
 from uncertain_lti.sampler import Status, median_step_ns, to_ns
 from uncertain_lti.signals import SignalMap
@@ -202,9 +203,7 @@ class Transient:
             t = _numeric(t, time or "index", name)
         values = [_numeric(np.asarray(c), n, name) for c, n in zip(chosen, (*states, *controls), strict=True)]
         z = np.column_stack(values) if values else np.empty((len(t), 0))
-        return cls(
-            t, z[:, : len(states)], z[:, len(states) :], state_names=states, control_names=controls, **options
-        )
+        return cls(t, z[:, : len(states)], z[:, len(states) :], state_names=states, control_names=controls, **options)
 
     @classmethod
     def from_csv(
@@ -247,9 +246,7 @@ class Transient:
             if len(values) and np.isnan(values).all():
                 raise TransientError(f"{path}: column '{column}' holds no number; choose another")
         split = 1 + len(states)
-        return cls(
-            z[:, 0], z[:, 1:split], z[:, split:], state_names=states, control_names=controls, **options
-        )
+        return cls(z[:, 0], z[:, 1:split], z[:, split:], state_names=states, control_names=controls, **options)
 
 
 def _column(columns: Sequence[str], wanted: str, name: str, values: Any) -> int:

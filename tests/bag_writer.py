@@ -94,6 +94,7 @@ def write(topics: Iterable[Topic], messages: Iterable[Message], layout: Layout =
     A topic of schema encoding "" has no schema at all.
     """
     stream = io.BytesIO()
+    written = list(messages)
     writer = Writer(
         stream,
         chunk_size=layout.chunk_size,
@@ -105,7 +106,8 @@ def write(topics: Iterable[Topic], messages: Iterable[Message], layout: Layout =
         use_statistics=layout.summary,
         use_summary_offsets=layout.summary,
         enable_crcs=layout.checksums,
-        enable_data_crcs=layout.checksums,
+        # Of channels without any message outside chunks the library writes a wrong one.
+        enable_data_crcs=layout.checksums and (layout.chunked or bool(written)),
     )
     writer.start(profile="ros2", library="uncertain-lti tests")
     channels: dict[str, list[int]] = {}
@@ -115,7 +117,6 @@ def write(topics: Iterable[Topic], messages: Iterable[Message], layout: Layout =
         if topic.schema_encoding:
             schema = writer.register_schema(name, topic.schema_encoding, topic.schema_text().encode())
         channels.setdefault(topic.name, []).append(writer.register_channel(topic.name, topic.encoding, schema))
-    written = list(messages)
     for sequence, entry in enumerate(written):
         channel = channels[entry.topic][entry.channel]
         writer.add_message(channel, entry.log_time, entry.data, entry.publish_time, sequence)

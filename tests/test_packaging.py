@@ -159,7 +159,7 @@ def test_every_package_and_file_of_the_source_is_installed(distribution):
             assert path.suffix == ".py" or any(path.match(pattern) for pattern in patterns), path
 
     installed = {file for _, files in distribution.data_files for file in files}
-    wanted = {p for folder in ("launch", "config") for p in (ROOT / folder).rglob("*") if p.is_file()}
+    wanted = {p for folder in ("bags", "config", "launch") for p in (ROOT / folder).rglob("*") if p.is_file()}
     wanted = {str(p.relative_to(ROOT)) for p in wanted if "__pycache__" not in p.parts}
     assert wanted | {"package.xml", "resource/uncertain_lti_ros"} == installed
     assert all((ROOT / file).is_file() for file in installed)

@@ -33,7 +33,7 @@ def check_solvable(problem: Problem, transients: Sequence[Transient], names: Seq
         )
     if columns.disturbance or columns.noise:
         return
-    rest = ~problem.z.any(axis=1)
+    rest: NDArray[np.bool_] = np.asarray(~problem.z.any(axis=1))
     moving = rest[:, None] & (problem.x_next != problem.z[:, : problem.n])
     where = np.argwhere(moving)
     if len(where):
@@ -114,10 +114,10 @@ def describe(
         if blown:
             worst = max(blown, key=lambda i: float(mean_width[i] / box[i]))
             messages.append(
-                f"the envelope of {_list([states[i] for i in blown])} is absurdly wide: the mean width of {states[worst]} is "
-                f"{mean_width[worst] / box[worst]:.3g} times that of a constant band around least squares, because noise "
-                f"near rest ({rest:.0%} of the samples) inflates the half-widths; use an additive term: "
-                f"--additive noise, or --additive disturbance"
+                f"the envelope of {_list([states[i] for i in blown])} is absurdly wide: the mean width of "
+                f"{states[worst]} is {mean_width[worst] / box[worst]:.3g} times that of a constant band around least "
+                f"squares, because noise near rest ({rest:.0%} of the samples) inflates the half-widths; use an "
+                f"additive term: --additive noise, or --additive disturbance"
             )
     if columns.drift and columns.noise and not columns.disturbance:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")

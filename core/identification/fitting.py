@@ -179,7 +179,8 @@ def _at(signals: SignalMap, point: OperatingPoint) -> SignalMap:
     return replace(
         signals,
         states=tuple(
-            replace(s, steady=float(a), scale=float(b)) for s, a, b in zip(signals.states, point.x_s, point.X, strict=True)
+            replace(s, steady=float(a), scale=float(b))
+            for s, a, b in zip(signals.states, point.x_s, point.X, strict=True)
         ),
         controls=tuple(
             replace(s, steady=float(a), scale=float(b))

@@ -55,9 +55,7 @@ def solve(problem: Problem, criterion: str, solver: str | None = None, **options
         weights = problem.weights
         if weights.ndim == 3:
             chol = np.linalg.cholesky(weights * np.outer(unit_y, unit_y))  # W = L Lᵀ, so wᵀW w = |Lᵀ w|²
-            terms = [
-                cp.sum([cp.multiply(chol[:, j, i], width[:, j]) for j in range(i, n)]) for i in range(n)
-            ]
+            terms = [cp.sum([cp.multiply(chol[:, j, i], width[:, j]) for j in range(i, n)]) for i in range(n)]
             objective = cp.sum([cp.sum_squares(t) for t in terms])
         else:
             root = np.sqrt(problem.row_weights(everything)) * unit_y

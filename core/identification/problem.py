@@ -216,7 +216,8 @@ def _weights(
     if not np.isfinite(chosen).all():
         raise FitError("weights hold a number that is not finite")
     if chosen.ndim == 3:
-        symmetric = np.abs(chosen - chosen.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-12 * np.abs(chosen).max(axis=(1, 2))
+        largest = np.abs(chosen).max(axis=(1, 2))
+        symmetric = np.abs(chosen - chosen.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-12 * largest
         if not symmetric.all():
             raise FitError(f"weights: the matrix of step {int(np.argmin(symmetric))} is not symmetric")
         smallest = np.linalg.eigvalsh(chosen)[:, 0]

@@ -34,16 +34,16 @@ def solve_qp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array)
     """
     # a diagonal scaling makes a badly scaled Hessian harmless to every solver
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-    Hs, fs, Gs, ls, us = H * np.outer(s, s), f * s, G * s, lower / s, upper / s
-    norm = np.maximum(np.abs(Gs).max(axis=1, initial=0.0), 1e-300)
-    Gs, hs = Gs / norm[:, None], h / norm
+    H, f, G, lower, upper = H * np.outer(s, s), f * s, G * s, lower / s, upper / s
+    norm = np.maximum(np.abs(G).max(axis=1, initial=0.0), 1e-300)
+    G, h = G / norm[:, None], h / norm
     best: tuple[float, Array, str] | None = None
     for name, solver in (("DAQP", _daqp), ("PIQP", _piqp), ("OSQP", _osqp)):
-        answer = solver(Hs, fs, Gs, hs, ls, us)
+        answer = solver(H, f, G, h, lower, upper)
         if answer is None or not np.isfinite(answer).all():
             continue
-        answer = np.clip(answer, ls, us)
-        violation = float(np.max(hs - Gs @ answer, initial=0.0))
+        answer = np.clip(answer, lower, upper)
+        violation = float(np.max(h - G @ answer, initial=0.0))
         if best is None or violation < best[0]:
             best = (violation, answer * s, name)
         if violation <= FEASIBLE:

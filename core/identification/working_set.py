@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,9 +63,7 @@ class WorkingSet:
         Called with one line of text per full pass.
     """
 
-    def __init__(
-        self, problem: Problem, moments: Moments, progress: Callable[[str], None] | None = None
-    ) -> None:
+    def __init__(self, problem: Problem, moments: Moments, progress: Callable[[str], None] | None = None) -> None:
         self.problem, self.moments = problem, moments
         self.progress = progress or (lambda text: None)
         self.free_phi = np.flatnonzero(moments.phi_scale > 0)
@@ -86,9 +83,7 @@ class WorkingSet:
         )
         unit = self.phi_unit
         self._centre = moments.centre[np.ix_(self.free_phi, self.free_phi)] * np.outer(unit, unit) / problem.N
-        self._target = (
-            moments.target[self.free_phi] * unit[:, None] / (problem.N * moments.rate_scale)
-        )
+        self._target = moments.target[self.free_phi] * unit[:, None] / (problem.N * moments.rate_scale)
         unit = self.psi_unit
         within = np.ix_(self.free_psi, self.free_psi)
         self._plain = moments.plain_gram[within] * np.outer(unit, unit) / problem.N
@@ -247,7 +242,7 @@ class WorkingSet:
     def _start(self) -> None:
         """Pools of the samples farthest from the least-squares centre, relative to their size."""
         ridge = 1e-12 * np.eye(self.r)
-        theta = np.linalg.lstsq(self._centre + ridge, self._target, rcond=None)[0]
+        theta: Array = np.linalg.lstsq(self._centre + ridge, self._target, rcond=None)[0].astype(np.float64)
         for i in range(self.problem.n):
             self._store(i, theta[:, i], np.zeros(self.q))
         blocks = -(-self.problem.N // BLOCK)
@@ -272,7 +267,7 @@ class WorkingSet:
             self.solution.violation = worst
             if among is None:
                 left = sum(map(len, found))
-                self.progress(f"pass {self.solution.passes}: {left} samples outside, {self._sizes()} in the working set")
+                self.progress(f"pass {self.solution.passes}: {left} samples outside, working set {self._sizes()}")
             added = []
             for i, samples in enumerate(found):
                 fresh = np.setdiff1d(samples, self.pools[i])
