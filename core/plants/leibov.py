@@ -1,0 +1,101 @@
+"""The turbofan of Leibov (2006): the published uncertain matrices, and transients drawn from them."""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.model import UncertainLTI
+from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.transient import Transient
+
+Array = NDArray[np.float64]
+
+STATE_TOPIC = "/engine/state"
+CONTROL_TOPIC = "/engine/control"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+
+DT_NS = 25_000_000
+"""Step of the published model, ns."""
+PULSE, REST = 30, 6
+"""Steps of one pulse and of the rest after it: the states are still moving when the next pulse comes."""
+AMPLITUDE = (0.05, 0.15)
+"""Normalised height of a pulse, drawn once per pulse; within it every step is drawn within RIPPLE of that."""
+RIPPLE = 0.3
+FAULT_SPREAD = 1.25
+FAULT_A00 = -1.9263 - 2.0
+"""A fault: each element at an end of an interval FAULT_SPREAD times as wide, around a fan that is also more damped."""
+
+
+def leibov2006() -> UncertainLTI:
+    """The model printed in the paper: n = 5, m = 4, normalised quantities, 1/s.
+
+    Its signals name `position[<state>]` of the topics that the plant node publishes.
+    """
+    data = json.loads((files(__package__) / "leibov2006.json").read_text(encoding="utf-8"))
+    signals = SignalMap(
+        states=_signals(data["states"], STATE_TOPIC),
+        controls=_signals(data["controls"], CONTROL_TOPIC),
+        clock=STATE_TOPIC,
+        max_gap=2.5 * data["dt"],
+        time={STATE_TOPIC: "header", CONTROL_TOPIC: "header"},
+        source="leibov2006",
+    )
+    return UncertainLTI(data["A"], data["B"], data["dA"], data["dB"], signals=signals)
+
+
+def _signals(names: list[str], topic: str) -> tuple[Signal, ...]:
+    return tuple(Signal(name, topic, f"position[{name}]", type=JOINT_STATE) for name in names)
+
+
+def pulses(steps: int, controls: int, rng: np.random.Generator) -> Array:
+    """Pulses on each control in turn, first up and then down, separated by short rests; (steps, controls)."""
+    u = np.zeros((steps, controls))
+    for number, start in enumerate(range(REST, steps, PULSE + REST)):
+        stop = min(start + PULSE, steps)
+        sign = 1.0 if number % 2 == 0 else -1.0
+        height = rng.uniform(*AMPLITUDE)
+        u[start:stop, number // 2 % controls] = sign * height * rng.uniform(1 - RIPPLE, 1 + RIPPLE, stop - start)
+    return u
+
+
+def transient(steps: int, seed: int, fault_at: int | None = None, start_ns: int = 0) -> Transient:
+    """One run of the plant from rest, every matrix element drawn anew inside its interval at each step.
+
+    Leibov (2006), eq. (3): x_{k+1} = x_k + Δt (A_k x_k + B_k u_k) with A_k in A ± ΔA and B_k in B ± ΔB.
+
+    Parameters
+    ----------
+    steps : int
+        Number of samples, at least 2.
+    seed : int
+    fault_at : int, optional
+        From the step that leaves this sample on, the elements are drawn as a fault (see FAULT_SPREAD).
+    start_ns : int
+        Instant of sample 0, ns; the others follow exactly 0.025 s apart.
+    """
+    model = leibov2006()
+    rng = np.random.default_rng(seed)
+    u = pulses(steps, model.m, rng)
+    nominal, spread = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
+    faulty = nominal.copy()
+    faulty[0, 0] = FAULT_A00
+    x = np.zeros((steps, model.n))
+    for k in range(steps - 1):
+        draw = rng.uniform(-1.0, 1.0, nominal.shape)
+        if fault_at is not None and k >= fault_at:
+            elements = faulty + FAULT_SPREAD * np.sign(draw) * spread
+        else:
+            elements = nominal + draw * spread
+        x[k + 1] = x[k] + DT_NS * 1e-9 * (elements @ np.concatenate([x[k], u[k]]))
+    return Transient(
+        start_ns + DT_NS * np.arange(steps, dtype=np.int64),
+        x,
+        u,
+        name=f"leibov2006, seed {seed}",
+        signals=model.signals,
+        max_gap=model.signals.max_gap,
+    )

@@ -1,0 +1,73 @@
+"""How every process here lives: rclpy started, one executor, an end by signal with everything put away."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import rclpy
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+_PATIENCE = 0.1  # s that a signal waits at most
+
+
+class Life:
+    """One node on one executor; `alive` turns false on SIGINT and SIGTERM.
+
+    The events executor keeps messages in order of arrival; without a time limit its calls keep a core busy and
+    deliver nothing in some releases, so it is driven by timed calls. Where it is absent the default executor takes
+    its place, which delivers messages that arrive together in order of subscription. The multi-threaded one
+    loses messages and is not used.
+    """
+
+    def __init__(self, node: Node, stop: list[int]) -> None:
+        self.node = node
+        self._stop = stop
+        try:
+            from rclpy.experimental import EventsExecutor
+
+            self.executor: Executor = EventsExecutor()
+            self.executor_name = "events executor"
+        except ImportError:
+            self.executor = SingleThreadedExecutor()
+            self.executor_name = "default executor (messages that arrive together may swap)"
+        self.executor.add_node(node)
+
+    @property
+    def alive(self) -> bool:
+        """No signal has come and nobody has shut rclpy down."""
+        return not self._stop and rclpy.ok()
+
+    def spin_once(self, seconds: float = _PATIENCE) -> None:
+        """Wait for work at most this long, and do what is there."""
+        self.executor.spin_once(timeout_sec=min(seconds, _PATIENCE))
+
+    def spin(self) -> None:
+        """Work until the end."""
+        while self.alive:
+            self.spin_once()
+
+
+@contextmanager
+def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
+    """Start rclpy (on these arguments, or those of the process), make the node, and put all away at the end."""
+    stop: list[int] = []
+    before = {name: signal.signal(name, lambda number, _: stop.append(number)) for name in _SIGNALS}
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    node = None
+    try:
+        node = make_node()
+        yield Life(node, stop)
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+        for name, handler in before.items():
+            signal.signal(name, handler)
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -1,0 +1,153 @@
+"""Subscription that takes the quality of service its publishers offer, and follows them when they change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+
+from uncertain_lti_ros.messages import full_name
+
+DEPTH = 1000
+"""Messages kept until they are taken: the graph does not tell how deep the publishers' queues are."""
+RELIABILITY = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
+DURABILITY = {"volatile": DurabilityPolicy.VOLATILE, "transient_local": DurabilityPolicy.TRANSIENT_LOCAL}
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a user asks of subscriptions; None: what the publishers offer."""
+
+    depth: int = DEPTH
+    reliability: ReliabilityPolicy | None = None
+    durability: DurabilityPolicy | None = None
+
+
+def choose_qos(offers: Iterable[QoSProfile], wish: Wish, received: bool = False) -> QoSProfile:
+    """Reliable only if every publisher is, transient local only if every publisher is; without any, reliable, volatile.
+
+    received: messages have come through already; then history is no longer asked for, it would repeat them.
+    """
+    offers = list(offers)
+    reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+    lasting = bool(offers) and all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=wish.depth,
+        reliability=wish.reliability or (ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
+        durability=wish.durability
+        or (DurabilityPolicy.TRANSIENT_LOCAL if lasting and not received else DurabilityPolicy.VOLATILE),
+    )
+
+
+def incompatible(asked: QoSProfile, offered: QoSProfile) -> list[str]:
+    """What a publisher does not offer of what is asked, in words."""
+    found = []
+    if asked.reliability == ReliabilityPolicy.RELIABLE != offered.reliability:
+        found.append("reliability: best effort is offered, reliable asked")
+    if asked.durability == DurabilityPolicy.TRANSIENT_LOCAL != offered.durability:
+        found.append("durability: volatile is offered, transient local asked")
+    return found
+
+
+class MatchedSubscription:
+    """Subscription to one topic whose QoS is held against the graph by `look`.
+
+    Parameters
+    ----------
+    node : Node
+    topic : str
+        As in the model or on the command line; expanded and remapped by the node.
+    type_name : str
+        `pkg/msg/Type`.
+    message_class : type
+    callback : callable
+        Takes the message, or its bytes when raw.
+    wish : Wish
+    raw : bool
+
+    Attributes
+    ----------
+    received, lost : int
+        Messages that came, and those that the middleware says were lost.
+    publishers : int
+        Publishers of this type that the graph knows.
+    problems : list of str
+        Publishers that cannot be heard and why, one sentence each.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        type_name: str,
+        message_class: Any,
+        callback: Callable[[Any], None],
+        wish: Wish = Wish(),
+        raw: bool = False,
+    ) -> None:
+        self._node, self._asked_topic, self.type_name = node, topic, full_name(type_name)
+        self._class, self._callback, self._wish, self._raw = message_class, callback, wish, raw
+        self.topic: str = node.resolve_topic_name(topic)
+        self.received = self.lost = self.publishers = 0
+        self.problems: list[str] = []
+        self.look_soon = False
+        self._subscription: Subscription | None = None
+        self.look()
+
+    @property
+    def qos(self) -> QoSProfile:
+        """What is asked of publishers now."""
+        return self._qos
+
+    def look(self) -> None:
+        """Hold the subscription against what publishers offer now, and make it anew where it must change."""
+        self.look_soon = False
+        infos = self._node.get_publishers_info_by_topic(self._asked_topic)
+        offers = [i.qos_profile for i in infos if i.topic_type == self.type_name]
+        self.publishers = len(offers)
+        if self._subscription is None:
+            self._subscribe(choose_qos(offers, self._wish))
+        elif offers:  # when the last publisher leaves, the next one is likely to offer the same
+            qos = choose_qos(offers, self._wish, received=self.received > 0)
+            if (qos.reliability, qos.durability) != (self._qos.reliability, self._qos.durability):
+                self._node.destroy_subscription(self._subscription)
+                self._subscribe(qos)
+        self.problems = sorted(
+            {f"{self.topic}: a publisher cannot be heard, {p}" for o in offers for p in incompatible(self._qos, o)}
+            | {
+                f"{self.topic}: a publisher sends {i.topic_type}, and {self.type_name} is wanted"
+                for i in infos
+                if i.topic_type != self.type_name
+            }
+        )
+
+    def destroy(self) -> None:
+        """Stop receiving."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    def _subscribe(self, qos: QoSProfile) -> None:
+        self._qos = qos
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=self._changed, matched=self._changed, message_lost=self._lost
+        )
+        self._subscription = self._node.create_subscription(
+            self._class, self._asked_topic, self._take, qos, event_callbacks=events, raw=self._raw
+        )
+
+    def _take(self, message: Any) -> None:
+        self.received += 1
+        self._callback(message)
+
+    def _changed(self, _: Any) -> None:
+        self.look_soon = True  # the owner looks from a timer: a subscription is not destroyed in its own callback
+
+    def _lost(self, event: Any) -> None:
+        self.lost += event.total_count_change
