@@ -113,8 +113,9 @@ class Bag:
         self._undecoded: dict[str, str] = {}
         contents = [part if isinstance(part, Contents) else scan(Path(part)) for part in parts]
         self._contents = contents or self._open()
-        self._warnings += [warning for part in self._contents for warning in part.warnings]
-        if self._warnings and not any(part.count for part in self._contents):
+        damage = [warning for part in self._contents for warning in part.warnings]
+        self._warnings += damage
+        if (damage or not self._contents) and not any(part.count for part in self._contents):
             why = self._warnings[0].removeprefix(f"{self.path}: ")
             raise BagError(f"{self.path}: no message can be read ({why}); record or copy it anew")
         self._channels = [_channels(part) for part in self._contents]

@@ -1,0 +1,1111 @@
+"""Bag: every way a recording is written, split, cut or damaged gives a reading or one clear sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import shlex
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import tracemalloc
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from bag_writer import (
+    COMPRESSIONS,
+    JAZZY,
+    File,
+    Layout,
+    Message,
+    Topic,
+    cdr,
+    float64,
+    header,
+    message,
+    metadata_yaml,
+    places,
+    ramp,
+    write,
+    write_folder,
+)
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from uncertain_lti.bag import Bag, RawMessage, describe, group_recordings, header_stamp_ns
+from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.signals import FieldPath, FieldType
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real recordings (../shared/data) are not here")
+SECOND = 10**9
+TWO = (Topic("/a"), Topic("/b"))
+LAYOUTS = st.builds(
+    Layout,
+    compression=st.sampled_from(sorted(COMPRESSIONS)),
+    chunked=st.booleans(),
+    chunk_size=st.sampled_from([1, 200, 1000, 100_000]),
+    summary=st.booleans(),
+    indexes=st.booleans(),
+    checksums=st.booleans(),
+)
+# Few log times, so that ties and disorder are the rule; now and then one of today's or the largest.
+MESSAGES = st.lists(
+    st.tuples(
+        st.sampled_from(["/a", "/b"]),
+        st.one_of(st.integers(0, 20), st.sampled_from([1_700_000_000 * SECOND, 2**64 - 1])),
+    ),
+    max_size=60,
+).map(lambda entries: [Message(topic, t, float64(i), t) for i, (topic, t) in enumerate(entries)])
+
+
+def examples(number: int) -> settings:
+    unimportant = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    return settings(max_examples=number, deadline=None, suppress_health_check=unimportant)
+
+
+def facts(raw: RawMessage) -> tuple[str, int, bytes]:
+    return raw.topic, raw.log_time_ns, raw.data
+
+
+def in_order(messages: list[Message]) -> list[tuple[str, int, bytes]]:
+    """What a reader has to give: by log time, ties in file order."""
+    return [(m.topic, m.log_time, m.data) for m in sorted(messages, key=lambda m: m.log_time)]
+
+
+def read_all(bag: Bag) -> list[tuple[str, int, bytes]]:
+    return [facts(raw) for raw in bag.raw_messages()]
+
+
+def read(file: File, folder: Path, name: str = "x.mcap") -> Bag:
+    return Bag(file.save(folder / name))
+
+
+def error_of(path: Path) -> str:
+    """The one sentence that this path gives."""
+    with pytest.raises(BagError) as caught:
+        bag = Bag(path)
+        list(bag.messages(bag.topics))
+    text = str(caught.value)
+    assert "\n" not in text and str(path) in text
+    return text
+
+
+# --- whole files --------------------------------------------------------------------------------------------
+
+
+@examples(150)
+@given(messages=MESSAGES, layout=LAYOUTS)
+def test_any_file_reads_as_the_stable_sort_of_what_was_written(
+    messages: list[Message], layout: Layout, tmp_path: Path
+) -> None:
+    bag = read(write(TWO, messages, layout), tmp_path)
+    assert read_all(bag) == in_order(messages)
+    decoded = [(topic, t, float64(m.data)) for topic, t, m in bag.messages(bag.topics)]
+    assert decoded == in_order(messages)
+    only_a = [m for m in messages if m.topic == "/a"]
+    if "/a" in bag.topics:
+        assert [t for _, t, _ in bag.messages(["/a"])] == sorted(m.log_time for m in only_a)
+        assert bag.topics["/a"].count == len(only_a)
+        assert bag.topics["/a"].first == min((m.log_time for m in only_a), default=None)
+        assert bag.topics["/a"].last == max((m.log_time for m in only_a), default=None)
+    assert bag.warnings == []
+
+
+@examples(60)
+@given(messages=MESSAGES, cuts=st.lists(st.integers(0, 60), max_size=3), layout=LAYOUTS)
+def test_parts_read_as_one_in_the_order_of_metadata_yaml(
+    messages: list[Message], cuts: list[int], layout: Layout, tmp_path: Path
+) -> None:
+    edges = [0, *sorted(min(cut, len(messages)) for cut in cuts), len(messages)]
+    names = [f"p_{i}.mcap" for i in range(len(edges) - 1)][::-1]
+    folder = Path(tempfile.mkdtemp(dir=tmp_path))
+    parts = {name: write(TWO, messages[a:b], layout) for name, a, b in zip(names, edges, edges[1:], strict=False)}
+    bag = Bag(write_folder(folder, parts, metadata_yaml(names)))
+    assert read_all(bag) == in_order(messages)
+    assert [part.name for part in bag.parts] == names
+
+
+def test_messages_keep_publish_time_type_and_schema(tmp_path: Path) -> None:
+    bag = read(write([Topic("/a")], [Message("/a", 5, float64(1.5), 3)]), tmp_path)
+    (raw,) = bag.raw_messages()
+    assert (raw.log_time_ns, raw.publish_time_ns, raw.type, raw.encoding) == (5, 3, "std_msgs/msg/Float64", "cdr")
+    assert raw.channel.schema is not None and raw.channel.schema.data == b"float64 data\n"
+
+
+def test_a_bag_is_read_lazily(tmp_path: Path) -> None:
+    payload = random.Random(0).randbytes(1000)
+    text = Topic("/a", "std_msgs/msg/UInt8MultiArray")
+    layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    data = cdr(text.type, layout=layout, data=np.frombuffer(payload, np.uint8))
+    late_by_one = [i + 1 if i % 50 == 0 else i - 1 if i % 50 == 1 else i for i in range(20_000)]
+    file = write([text], [Message("/a", t, data) for t in late_by_one], Layout(chunk_size=100_000))
+    path = file.save(tmp_path / "x.mcap")
+    size = path.stat().st_size
+    del file
+    bag = Bag(path)
+    tracemalloc.start()
+    try:
+        times = [t for _, t, _ in bag.messages(["/a"])]
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert times == sorted(late_by_one)
+    assert size > 20_000_000 and peak < 3_000_000
+
+
+def test_attachments_metadata_and_private_records_are_passed_over(tmp_path: Path) -> None:
+    file = write(TWO, ramp("/a", range(10)))
+    first = places(file.data)[1].begin
+    attachment = struct.pack("<QQII", 1, 2, 0, 0) + struct.pack("<Q", 5_000_000) + bytes(5_000_000) + bytes(4)
+    extra = struct.pack("<BQ", Opcode.ATTACHMENT, len(attachment)) + attachment + struct.pack("<BQ", 0x90, 3) + b"abc"
+    path = tmp_path / "x.mcap"
+    path.write_bytes(file.data[:first] + extra + file.data[first:])
+    assert read_all(Bag(path)) == in_order(file.messages)
+
+
+# --- cut files ----------------------------------------------------------------------------------------------
+
+
+def count_by_mcap(data: bytes) -> int:
+    """Messages that the mcap library reads of a cut file, record by record."""
+    number = 0
+    with contextlib.suppress(McapError, struct.error, zstandard.ZstdError, RuntimeError, UnicodeDecodeError):
+        for record in StreamReader(BytesIO(data)).records:
+            number += isinstance(record, McapMessage)
+    return number
+
+
+@examples(250)
+@given(messages=MESSAGES, layout=LAYOUTS, where=st.floats(0, 1, exclude_max=True))
+def test_a_cut_file_reads_as_a_prefix(messages: list[Message], layout: Layout, where: float, tmp_path: Path) -> None:
+    file = write(TWO, messages, layout)
+    cut = int(where * len(file.data))
+    path = file.save(tmp_path / "x.mcap", cut)
+    try:
+        bag = Bag(path)
+    except BagError as error:
+        assert count_by_mcap(file.data[:cut]) == 0 and "\n" not in str(error)
+        return
+    got = read_all(bag)
+    assert got == in_order(messages[: len(got)])
+    assert count_by_mcap(file.data[:cut]) <= len(got)
+    number = f"{len(got)} message" + "s" * (len(got) != 1)
+    assert any("no footer" in warning and number in warning for warning in bag.warnings)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_the_chunk_that_a_cut_goes_through_is_read_as_far_as_it_goes(compression: str, tmp_path: Path) -> None:
+    noise = random.Random(1)
+    messages = [Message("/a", i, float64(noise.random())) for i in range(60_000)]
+    file = write([Topic("/a")], messages, Layout(compression, chunk_size=10**9))
+    chunk = next(place for place in places(file.data) if place.opcode == Opcode.CHUNK)
+    cut = (chunk.begin + chunk.end) // 2
+    assert count_by_mcap(file.data[:cut]) <= 1
+    bag = Bag(file.save(tmp_path / "x.mcap", cut))
+    got = read_all(bag)
+    assert 20_000 < len(got) < 40_000 and got == in_order(messages[: len(got)])
+    number = f"{len(got):,}".replace(",", " ")
+    assert bag.warnings == [f"{tmp_path / 'x.mcap'}: cut after {number} messages (no footer); read up to the cut"]
+
+
+def test_a_file_cut_after_its_data_is_complete(tmp_path: Path) -> None:
+    file = write(TWO, ramp("/a", range(100)))
+    end = next(place for place in places(file.data) if place.opcode == Opcode.DATA_END).end
+    bag = Bag(file.save(tmp_path / "x.mcap", end + 3))
+    assert read_all(bag) == in_order(file.messages)
+    assert bag.warnings == [f"{tmp_path / 'x.mcap'}: no footer at its end; all its 100 messages could be read"]
+
+
+def test_zeros_after_a_power_cut_end_the_reading(tmp_path: Path) -> None:
+    file = write(TWO, ramp("/a", range(1000)), Layout(chunk_size=500))
+    cut = len(file.data) // 2
+    path = tmp_path / "x.mcap"
+    path.write_bytes(file.data[:cut] + bytes(1_000_000))
+    bag = Bag(path)
+    got = read_all(bag)
+    assert 300 < len(got) < 700
+    assert bag.warnings and any("left out" in warning for warning in bag.warnings)
+
+
+# --- damaged files ------------------------------------------------------------------------------------------
+
+
+def chunked(compression: str = "zstd", number: int = 1000, **options: bool) -> File:
+    noise = random.Random(2)
+    messages = [Message("/a", i * SECOND, float64(noise.random())) for i in range(number)]
+    return write([Topic("/a")], messages, Layout(compression, chunk_size=3000, **options))
+
+
+def chunks(data: bytes) -> list[tuple[int, int]]:
+    return [(place.begin, place.end) for place in places(data) if place.opcode == Opcode.CHUNK]
+
+
+def patched(file: File, at: int, patch: bytes) -> File:
+    return File(file.data[:at] + patch + file.data[at + len(patch) :], file.messages)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_flipped_bit_in_a_chunk_costs_that_chunk_alone(compression: str, tmp_path: Path) -> None:
+    file = chunked(compression)
+    begin, end = chunks(file.data)[3]
+    first, last = struct.unpack_from("<QQ", file.data, begin + 9)
+    for at in random.Random(3).sample(range(begin + 60, end), 20):
+        bag = read(patched(file, at, bytes([file.data[at] ^ 4])), tmp_path)
+        assert read_all(bag) == in_order([m for m in file.messages if not first <= m.log_time <= last])
+        warning = bag.warnings[0]
+        assert f"chunk at byte {begin} (log time {first // SECOND}.000 to {last // SECOND}.000 s)" in warning
+        assert "left out" in warning
+
+
+def test_a_flipped_bit_outside_chunks_is_told(tmp_path: Path) -> None:
+    file = write([Topic("/a")], ramp("/a", range(100)), Layout(chunked=False))
+    last = [place for place in places(file.data) if place.opcode == Opcode.MESSAGE][-1]
+    bag = read(patched(file, last.end - 1, b"\x41"), tmp_path)
+    assert len(read_all(bag)) == 100
+    assert any("checksum of the file is wrong" in warning for warning in bag.warnings)
+
+
+@pytest.mark.parametrize("length", [1 << 60, 2**64 - 1, 1 << 33, 5, 0, 4000])
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_record_that_lies_about_its_length_costs_one_chunk(compression: str, length: int, tmp_path: Path) -> None:
+    file = chunked(compression)
+    begin, end = chunks(file.data)[3]
+    assert length != end - begin - 9
+    first, last = struct.unpack_from("<QQ", file.data, begin + 9)
+    with bounded(seconds=5, memory=8_000_000):
+        bag = read(patched(file, begin + 1, struct.pack("<Q", length)), tmp_path)
+        got = read_all(bag)
+    assert got == in_order([m for m in file.messages if not first <= m.log_time <= last])
+    assert bag.warnings
+
+
+@contextlib.contextmanager
+def bounded(seconds: float, memory: int) -> Iterator[None]:
+    begin = time.monotonic()
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert time.monotonic() - begin < seconds
+    assert peak < memory
+
+
+@pytest.mark.parametrize("size", [1 << 60, 2**64 - 1, 1 << 33, 1 << 29, 10_000_000, 100, 0])
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_chunk_that_lies_about_its_decompressed_size_is_left_out(compression: str, size: int, tmp_path: Path) -> None:
+    file = chunked(compression)
+    begin, _ = chunks(file.data)[0]
+    with bounded(seconds=5, memory=40_000_000):
+        bag = read(patched(file, begin + 9 + 16, struct.pack("<Q", size)), tmp_path)
+        got = read_all(bag)
+    assert 0 < len(got) < len(file.messages) and set(got) < set(in_order(file.messages))
+    assert f"chunk at byte {begin}" in bag.warnings[0]
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+@pytest.mark.parametrize("stated", [1000, 1 << 60])
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_bomb_is_not_blown_up(compression: str, stated: int, whole: bool, tmp_path: Path) -> None:
+    zeros = bytes(1 << 28)
+    packed = lz4.frame.compress(zeros) if compression == "lz4" else zstandard.compress(zeros)
+    packed = packed * (4 if compression == "zstd" else 1)
+    del zeros
+    name = compression.encode()
+    chunk = struct.pack("<QQQII", 0, 1, stated, 0, len(name)) + name + struct.pack("<Q", len(packed)) + packed
+    file = chunked()
+    at = chunks(file.data)[1][0]
+    data = file.data[:at] + struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk
+    if whole:
+        data += file.data[at:]
+    path = tmp_path / "x.mcap"
+    path.write_bytes(data)
+    # Where a cut goes through a chunk, its checksum tells nothing, and it is read up to the limit.
+    limit = 12_000_000 if whole or stated == 1000 else 3 << 28
+    with bounded(seconds=20, memory=limit):
+        bag = Bag(path)
+        got = read_all(bag)
+    assert got and bag.warnings
+    assert got == in_order(file.messages[: len(got)]) if not whole else set(got) <= set(in_order(file.messages))
+
+
+@pytest.mark.parametrize("length", [1 << 60, 2**32 - 1])
+def test_strings_and_arrays_that_lie_about_their_length(length: int, tmp_path: Path) -> None:
+    number = struct.pack("<I", length & 0xFFFFFFFF)
+    text = b"\x00\x01\x00\x00" + number + b"abc\x00"
+    array = b"\x00\x01\x00\x00" + bytes(8) + number + bytes(16)
+    topics = [Topic("/text", "std_msgs/msg/String"), Topic("/array", "std_msgs/msg/Float64MultiArray")]
+    file = write(topics, [Message("/text", 1, text), Message("/array", 2, array)])
+    with bounded(seconds=5, memory=8_000_000):
+        bag = read(file, tmp_path)
+        assert list(bag.messages(bag.topics)) == []
+    assert len([warning for warning in bag.warnings if "1 message left out that cannot be decoded" in warning]) == 2
+
+
+def test_an_unknown_compression_is_named(tmp_path: Path) -> None:
+    file = write([Topic("/a")], ramp("/a", range(3)), Layout("zstd"))
+    at = file.data.index(b"zstd", chunks(file.data)[0][0])
+    assert "compression 'brot'" in error_of(patched(file, at, b"brot").save(tmp_path / "x.mcap"))
+
+
+def test_a_damaged_summary_is_read_without(tmp_path: Path) -> None:
+    file = chunked()
+    summary = next(place for place in places(file.data) if place.opcode == Opcode.DATA_END).end
+    bag = read(patched(file, summary + 20, bytes([file.data[summary + 20] ^ 1])), tmp_path)
+    assert read_all(bag) == in_order(file.messages)
+    assert bag.warnings == [f"{tmp_path / 'x.mcap'}: the checksum of its summary is wrong; read without it"]
+
+
+def test_channels_of_a_damaged_chunk_are_found_in_the_summary(tmp_path: Path) -> None:
+    """The channel stands in the first chunk only; without a summary the others belong to no topic."""
+    file = chunked()
+    begin, end = chunks(file.data)[0]
+    bag = read(patched(file, end - 100, bytes(50)), tmp_path)
+    assert 0 < bag.topics["/a"].count < 1000
+    file = chunked("none", summary=False, indexes=False)
+    begin, end = chunks(file.data)[0]
+    assert "its checksum is wrong" in error_of(patched(file, end - 100, bytes(50)).save(tmp_path / "y.mcap"))
+
+
+def mutate(data: bytes, dice: random.Random) -> bytes:
+    changed = bytearray(data)
+    for _ in range(dice.choice([1, 1, 1, 2, 5, 30])):
+        at = dice.randrange(len(changed))
+        kind = dice.randrange(6)
+        if kind == 0:
+            changed[at] ^= 1 << dice.randrange(8)
+        elif kind == 1:
+            changed[at] = dice.choice([0, 255, dice.randrange(256)])
+        elif kind == 2:
+            changed[at : at + 8] = dice.choice([b"\xff" * 8, b"\0" * 8, struct.pack("<Q", 1 << dice.randrange(64))])
+        elif kind == 3:
+            del changed[at : at + dice.randrange(1, 40)]
+        elif kind == 4:
+            changed[at:at] = dice.randbytes(dice.randrange(1, 40))
+        else:
+            other = dice.randrange(len(changed))
+            changed[at : at + 30] = changed[other : other + 30]
+    return bytes(changed)
+
+
+FUZZED = [
+    Layout(compression, chunked, chunk_size=400, summary=summary)
+    for compression, chunked in (("none", True), ("lz4", True), ("zstd", True), ("none", False))
+    for summary in (True, False)
+]
+
+
+@pytest.mark.parametrize("layout", FUZZED, ids=str)
+def test_fuzzed_files_give_a_reading_or_one_sentence(layout: Layout, tmp_path: Path) -> None:
+    joints = Topic("/j", "sensor_msgs/msg/JointState")
+
+    def state(i: int) -> bytes:
+        values = np.array([i, i / 2])
+        return cdr(joints.type, header=header(i), name=["a", "b"], position=values, velocity=values, effort=values[:0])
+
+    messages = [Message("/j", i, state(i)) for i in range(15)] + ramp("/a", range(15))
+    original = write([joints, Topic("/a")], messages, layout).data
+    dice = random.Random(repr(layout))
+    path = tmp_path / "x.mcap"
+    readings = 0
+    for _ in range(120):
+        path.write_bytes(mutate(original, dice))
+        begin = time.monotonic()
+        try:
+            bag = Bag(path)
+            times = [raw.log_time_ns for raw in bag.raw_messages()]
+            assert times == sorted(times)
+            assert sum(info.count for info in bag.topics.values()) <= len(times)
+            list(bag.messages([topic for topic, info in bag.topics.items() if info.readable]))
+            describe(bag)
+            readings += 1
+            sentences = bag.warnings
+        except BagError as error:
+            sentences = [str(error)]
+        assert all("\n" not in sentence and str(path) in sentence for sentence in sentences)
+        assert time.monotonic() - begin < 5
+    assert readings > 30
+
+
+# --- types --------------------------------------------------------------------------------------------------
+
+GOOD = Topic("/good")
+
+
+def with_good(topics: list[Topic], messages: list[Message], folder: Path) -> Bag:
+    """A bag that also has one good topic; checks that the others do not disturb it."""
+    bag = read(write([GOOD, *topics], [*ramp("/good", range(5)), *messages]), folder)
+    assert [m.data for _, _, m in bag.messages(["/good"])] == [0, 1, 2, 3, 4]
+    return bag
+
+
+BAD_SCHEMAS = {
+    "service": (Topic("/bad", "x/srv/Y_Event", schema="int64 a\n---\nint64 b\n"), "from '---' on"),
+    "garbage": (Topic("/bad", "x/msg/Y", schema="\x01 what is this?"), "cannot be used"),
+    "not utf-8": (Topic("/bad", "x/msg/Y", schema="float64 \udcff"), "cannot be used"),
+    "missing inside": (Topic("/bad", "x/msg/Y", schema="x/Z z\n"), "x/msg/Z is used and not defined"),
+    "empty, not in Jazzy": (Topic("/bad", "x/msg/Y", schema=""), "the file holds no definition of x/msg/Y"),
+    "itself": (Topic("/bad", "x/msg/Y", schema="x/Y y\n"), "contains itself"),
+    "wide string": (Topic("/bad", "x/msg/Y", schema="wstring y\n"), "cannot be used"),
+    "huge array": (Topic("/bad", "x/msg/Y", schema="string[100000000] y\n"), "too long to decode"),
+    "no name": (Topic("/bad", "x/msg/Y", schema_name="", schema="float64 y\n"), "cannot be used"),
+    "protobuf": (Topic("/bad", "x/msg/Y", schema="float64 y\n", schema_encoding="protobuf"), "written in 'protobuf'"),
+    "no schema": (Topic("/bad", "x/msg/Y", schema_encoding=""), "does not say what type"),
+    "json": (Topic("/bad", "std_msgs/msg/Float64", encoding="json"), "its messages are in json"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SCHEMAS)
+def test_a_topic_that_cannot_be_decoded_disturbs_no_other(case: str, tmp_path: Path) -> None:
+    topic, reason = BAD_SCHEMAS[case]
+    schema = topic.schema
+    if schema and "\udcff" in schema:  # bytes that are no text
+        topics = [GOOD, Topic("/bad", "x/msg/Y", schema="float64 ????")]
+        file = write(topics, ramp("/good", range(5)), Layout(chunked=False))
+        bag = read(File(file.data.replace(b"????", b"\xff\xfe\xfd\xfc")), tmp_path)
+    else:
+        bag = with_good([topic], [Message("/bad", 7, float64(7))], tmp_path)
+        assert bag.topics["/bad"].count == 1
+        assert [raw.data for raw in bag.raw_messages(["/bad"])] == [float64(7)]
+    info = bag.topics["/bad"]
+    assert not info.readable and reason in info.reason and bag.topics["/good"].readable
+    with pytest.raises(BagError, match="topic /bad cannot be decoded") as caught:
+        bag.messages(["/good", "/bad"])
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
+    assert {item.info.topic for item in describe(bag)} == {"/good", "/bad"}
+
+
+def test_a_topic_that_is_not_there(tmp_path: Path) -> None:
+    bag = with_good([Topic("/other")], [], tmp_path)
+    with pytest.raises(BagError, match=r"there is no topic /nix; topics there: /good, /other"):
+        bag.messages(["/nix"])
+    with pytest.raises(BagError, match=r"/nix"):
+        bag.raw_messages(["/nix"])
+
+
+def test_schema_names_with_and_without_msg(tmp_path: Path) -> None:
+    schema = f"float64 y\nZ z\n{'=' * 80}\nMSG: x/Z\nint32 i\n"
+    topic = Topic("/short", "x/msg/Y", schema_name="x/Y", schema=schema)
+    bag = with_good([topic], [Message("/short", 1, float64(2.5) + struct.pack("<i", 4))], tmp_path)
+    assert bag.topics["/short"].type == "x/msg/Y"
+    ((_, _, decoded),) = bag.messages(["/short"])
+    assert (decoded.y, decoded.z.i) == (2.5, 4)
+    assert bag.fields("x/msg/Y") == {"y": FieldType("number", "float64"), "z": FieldType("message", "x/msg/Z")}
+
+
+IDL = """\
+================================================================================
+IDL: x/msg/Y
+// generated from rosidl_adapter/resource/msg.idl.em
+// generated code does not contain a copyright notice
+
+#include "x/msg/Z.idl"
+
+module x {
+  module msg {
+    typedef double double__3[3];
+    @verbatim (language="comment", text=
+      "Two lines" "\\n"
+      "of comment")
+    struct Y {
+      @verbatim (language="comment", text= "# A field")
+      @default (value=1.5)
+      @unit (value="m")
+      double y;
+      double__3 v;
+      sequence<float> w;
+      x::msg::Z z;
+    };
+  };
+};
+================================================================================
+IDL: x/msg/Z
+module x { module msg { struct Z { int32 i; boolean b; string s; octet o; }; }; };
+"""
+
+
+def test_idl_definitions(tmp_path: Path) -> None:
+    topic = Topic("/idl", "x/msg/Y", schema=IDL, schema_encoding="ros2idl")
+    bag = with_good([topic], [], tmp_path)
+    assert bag.topics["/idl"].readable, bag.topics["/idl"].reason
+    assert bag.fields("x/msg/Y") == {
+        "y": FieldType("number", "float64"),
+        "v": FieldType("number", "float64", 3),
+        "w": FieldType("number", "float32", 0),
+        "z": FieldType("message", "x/msg/Z"),
+    }
+    kinds = {name: field.kind for name, field in bag.fields("x/msg/Z").items()}
+    assert kinds == {"i": "number", "b": "bool", "s": "string", "o": "other"}
+    payload = b"\x00\x01\x00\x00" + struct.pack("<4dIff", 1, 2, 3, 4, 2, 5, 6) + struct.pack("<i?", 7, True)
+    payload += b"\0\0\0" + struct.pack("<I", 2) + b"s\0" + b"\x09"
+    bag = with_good([topic], [Message("/idl", 1, payload)], tmp_path)
+    ((_, _, decoded),) = bag.messages(["/idl"])
+    assert (decoded.y, list(decoded.v), list(decoded.w), decoded.z.i, decoded.z.s) == (1, [2, 3, 4], [5, 6], 7, "s")
+
+
+def test_a_definition_that_is_not_in_the_file_is_taken_from_jazzy(tmp_path: Path) -> None:
+    twist = cdr("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0)
+    bag = with_good([Topic("/v", "geometry_msgs/msg/Vector3", schema="")], [Message("/v", 1, twist)], tmp_path)
+    assert [m.z for _, _, m in bag.messages(["/v"])] == [3.0]
+    assert any("/v: the file holds no definition of geometry_msgs/msg/Vector3" in warning for warning in bag.warnings)
+
+
+def test_types_of_one_name_and_two_meanings_do_not_mix(tmp_path: Path) -> None:
+    topics = [Topic("/f", "x/msg/Y", schema="float64 y\n"), Topic("/i", "x/msg/Y", schema="int64 y\nint64 more\n")]
+    messages = [Message("/f", 1, float64(2.5)), Message("/i", 2, b"\0\1\0\0" + struct.pack("<qq", 3, 4))]
+    bag = with_good(topics, messages, tmp_path)
+    assert [m.y for _, _, m in bag.messages(["/f", "/i"])] == [2.5, 3]
+    assert set(bag.type_fields("/f")("x/msg/Y")) == {"y"}
+    assert set(bag.type_fields("/i")("x/msg/Y")) == {"y", "more"}
+
+
+def test_two_channels_of_one_type_are_one_topic(tmp_path: Path) -> None:
+    messages = [Message("/a", i, float64(i), channel=i % 2) for i in range(10)]
+    bag = read(write([Topic("/a"), Topic("/a")], messages), tmp_path)
+    assert [m.data for _, _, m in bag.messages(["/a"])] == list(range(10))
+    assert bag.topics["/a"].count == 10 and bag.warnings == []
+
+
+def test_of_two_types_on_a_topic_the_frequent_one_counts(tmp_path: Path) -> None:
+    messages = [Message("/a", i, float64(i)) for i in range(6)]
+    messages += [Message("/a", 10 + i, b"\0\1\0\0" + struct.pack("<i", i), channel=1) for i in range(4)]
+    bag = read(write([Topic("/a"), Topic("/a", "std_msgs/msg/Int32")], messages), tmp_path)
+    info = bag.topics["/a"]
+    assert (info.type, info.count, info.readable, info.last) == ("std_msgs/msg/Float64", 6, True, 5)
+    assert "4 messages of std_msgs/msg/Int32" in info.reason and any(info.reason in text for text in bag.warnings)
+    assert [m.data for _, _, m in bag.messages(["/a"])] == list(range(6))
+    assert len(list(bag.raw_messages(["/a"]))) == 10
+
+
+def test_messages_that_do_not_fit_their_definition_are_left_out_and_counted(tmp_path: Path) -> None:
+    broken = [b"", b"\0\1\0\0", b"\0\1\0\0\1\2\3", b"\0\7\0\0" + bytes(8), float64(1) + bytes(20)]
+    messages = [*ramp("/a", range(5)), *(Message("/a", 10 + i, data) for i, data in enumerate(broken))]
+    bag = read(write([Topic("/a")], [*messages, Message("/a", 20, float64(9))]), tmp_path)
+    for _ in range(2):  # and told once, however often the bag is read
+        assert [m.data for _, _, m in bag.messages(["/a"])] == [0, 1, 2, 3, 4, 9]
+        (warning,) = bag.warnings
+        assert warning.startswith(f"{tmp_path / 'x.mcap'}: /a: 5 messages left out that cannot be decoded (")
+
+
+def test_fields_serve_as_types_for_field_paths(tmp_path: Path) -> None:
+    bag = with_good([Topic("/o", "nav_msgs/msg/Odometry"), Topic("/j", "sensor_msgs/msg/JointState")], [], tmp_path)
+    FieldPath("yaw(pose.pose.orientation)").check("/o", "nav_msgs/msg/Odometry", bag.fields)
+    FieldPath("position[fan]").check("/j", "sensor_msgs/msg/JointState", bag.type_fields("/j"))
+    with pytest.raises(SignalError, match="poze"):
+        FieldPath("poze.pose").check("/o", "nav_msgs/msg/Odometry", bag.fields)
+    with pytest.raises(SignalError, match="x/msg/Nix: not defined"):
+        bag.fields("x/msg/Nix")
+    assert bag.fields("nav_msgs/msg/Odometry")["child_frame_id"] == FieldType("string", "string")
+    assert bag.fields("geometry_msgs/msg/PoseWithCovariance")["covariance"] == FieldType("number", "float64", 36)
+
+
+def test_messages_that_rosbag2_compressed_one_by_one(tmp_path: Path) -> None:
+    writer = Rosbag2Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    point = message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
+    stamped = message("geometry_msgs/msg/PointStamped", header=header(5), point=point)
+    with writer:
+        connection = writer.add_connection("/p", "geometry_msgs/msg/PointStamped", typestore=JAZZY)
+        for i in range(10):
+            writer.write(connection, i, JAZZY.serialize_cdr(stamped, "geometry_msgs/msg/PointStamped"))
+    bag = Bag(tmp_path / "bag")
+    assert [m.point.y for _, _, m in bag.messages(["/p"])] == [2.0] * 10
+    assert describe(bag)[0].stamps == "usable"
+
+
+# --- what is no recording -----------------------------------------------------------------------------------
+
+
+def test_what_a_file_is_instead(tmp_path: Path) -> None:
+    def saved(name: str, data: bytes) -> Path:
+        (tmp_path / name).write_bytes(data)
+        return tmp_path / name
+
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+    assert "git lfs pull" in error_of(saved("lfs.mcap", pointer))
+    assert "is empty" in error_of(saved("empty.mcap", b""))
+    assert "cut after 5 bytes" in error_of(saved("short.mcap", b"\x89MCAP"))
+    assert "a text file" in error_of(saved("notes.txt", b"hello\nworld\n"))
+    assert "zeros only" in error_of(saved("zeros.mcap", bytes(5000)))
+    assert "not an MCAP file" in error_of(saved("noise.mcap", random.Random(5).randbytes(5000)))
+    assert "another version" in error_of(saved("new.mcap", b"\x89MCAP1\r\n" + bytes(100)))
+    assert "unpack it" in error_of(saved("bag.tar.gz", b"\x1f\x8b" + bytes(100)))
+
+
+def test_a_file_that_is_missing_names_those_beside_it(tmp_path: Path) -> None:
+    assert "there is no such file or folder; check the path" in error_of(tmp_path / "nix.mcap")
+    write(TWO, []).save(tmp_path / "there.mcap")
+    assert "there are there.mcap" in error_of(tmp_path / "nix.mcap")
+    assert "neither a file nor a folder" in error_of(Path("/dev/zero"))
+    os.symlink(tmp_path / "nowhere", tmp_path / "link.mcap")
+    assert "there is no such file" in error_of(tmp_path / "link.mcap")
+    assert "File name too long" in error_of(tmp_path / ("x" * 5000))
+
+
+@contextlib.contextmanager
+def as_somebody() -> Iterator[None]:
+    """Without the rights of root, whom no permission stops."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+def test_a_file_or_folder_without_permission() -> None:
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))
+    try:
+        folder.chmod(0o755)
+        locked = write(TWO, ramp("/a", range(3))).save(folder / "locked" / "x.mcap")
+        alone = write(TWO, ramp("/a", range(3))).save(folder / "alone.mcap")
+        alone.chmod(0)
+        locked.parent.chmod(0)
+        with as_somebody():
+            for path in (alone, locked, locked.parent):
+                assert "no permission" in error_of(path)
+    finally:
+        (folder / "locked").chmod(0o755)
+        shutil.rmtree(folder)
+
+
+def advised(text: str) -> list[str]:
+    """The command that a sentence gives in backquotes, run by this interpreter's environment."""
+    command = shlex.split(text.split("`")[1])
+    beside = Path(sys.executable).parent / command[0]
+    return [str(beside) if beside.exists() else command[0], *command[1:]]
+
+
+@needs_data
+@pytest.mark.parametrize("what", ["db3", "db3/wall_follower_0.db3"])
+def test_the_advice_for_sqlite_converts_it(what: str, tmp_path: Path) -> None:
+    text = error_of(DATA / "neato" / what)
+    assert "sqlite3" in text
+    command = advised(text)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    bag = Bag(tmp_path / command[command.index("--dst") + 1])
+    info = bag.topics["/odom"]
+    assert (info.type, info.count, info.readable) == ("nav_msgs/msg/Odometry", 52, True)
+    assert bag.warnings == [] and len(list(bag.messages(["/odom", "/cmd_vel"]))) == 52 + bag.topics["/cmd_vel"].count
+    twist = bag.fields("geometry_msgs/msg/Twist")
+    assert twist["linear"] == FieldType("message", "geometry_msgs/msg/Vector3")
+
+
+def test_the_advice_for_sqlite_that_has_its_definitions(tmp_path: Path) -> None:
+    with Rosbag2Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/a", "std_msgs/msg/Float64", typestore=JAZZY)
+        writer.write(connection, 1, float64(2.5))
+    text = error_of(tmp_path / "bag")
+    assert "--exclude-msgtype" not in text
+    assert subprocess.run(advised(text), cwd=tmp_path, capture_output=True, check=False).returncode == 0
+    assert [m.data for _, _, m in Bag(tmp_path / "bag_mcap").messages(["/a"])] == [2.5]
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    shutil.rmtree(tmp_path / "bag_mcap")
+    with pytest.raises(BagError, match="sqlite3") as caught:
+        Bag(tmp_path / "bag")
+    assert subprocess.run(advised(str(caught.value)), cwd=tmp_path, capture_output=True, check=False).returncode == 0
+    assert [m.data for _, _, m in Bag(tmp_path / "bag_mcap").messages(["/a"])] == [2.5]
+
+
+def test_the_advice_for_a_ros_1_bag(tmp_path: Path) -> None:
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    with Ros1Writer(tmp_path / "old.bag") as writer:
+        connection = writer.add_connection("/a", "std_msgs/msg/Float64", typestore=noetic)
+        data = noetic.serialize_ros1(noetic.types["std_msgs/msg/Float64"](2.5), "std_msgs/msg/Float64")
+        writer.write(connection, 1, data)
+    text = error_of(tmp_path / "old.bag")
+    assert subprocess.run(advised(text), cwd=tmp_path, capture_output=True, check=False).returncode == 0
+    assert [m.data for _, _, m in Bag(tmp_path / "old_mcap").messages(["/a"])] == [2.5]
+
+
+@pytest.mark.skipif(shutil.which("zstd") is None, reason="the zstd command is not installed")
+@pytest.mark.parametrize("name", ["x.mcap.zstd", "x.mcap.zst", "x.mcap"])
+def test_the_advice_for_a_file_compressed_as_a_whole(name: str, tmp_path: Path) -> None:
+    file = write([Topic("/a")], ramp("/a", range(3)))
+    (tmp_path / "in").mkdir()
+    path = tmp_path / "in" / name
+    path.write_bytes(zstandard.compress(file.data))
+    command = advised(error_of(path))
+    assert subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode == 0
+    assert read_all(Bag(tmp_path / command[-1])) == in_order(file.messages)
+    if name != "x.mcap":
+        with pytest.raises(BagError, match="zstd -d"):
+            Bag(tmp_path / "in")
+        (tmp_path / "in" / "metadata.yaml").write_text(metadata_yaml([name]))
+        with pytest.raises(BagError, match="zstd -d"):
+            Bag(tmp_path / "in")
+
+
+# --- folders and groups -------------------------------------------------------------------------------------
+
+
+def part(
+    begin: float, end: float, step: float = 0.1, topic: str = "/a", type_name: str = "std_msgs/msg/Float64"
+) -> File:
+    times = [round((begin + i * step) * SECOND) for i in range(round((end - begin) / step) + 1)]
+    return write([Topic(topic, type_name)], ramp(topic, times))
+
+
+def test_a_folder_without_metadata_is_one_split_bag_or_an_error(tmp_path: Path) -> None:
+    parts = {f"s_{i}.mcap": part(10 * i, 10 * i + 9.9) for i in (8, 9, 10, 11)}
+    bag = Bag(write_folder(tmp_path / "split", parts))
+    assert [p.name for p in bag.parts] == ["s_8.mcap", "s_9.mcap", "s_10.mcap", "s_11.mcap"]
+    assert bag.topics["/a"].count == 400 and bag.warnings == []
+    runs = {f"r_{i}.mcap": part(100 * i, 100 * i + 9.9) for i in (0, 1)}
+    assert "r_0.mcap, r_1.mcap" in error_of(write_folder(tmp_path / "runs", runs))
+    mixed = {"a_0.mcap": part(0, 1), "b_0.mcap": part(0, 1)}
+    assert "name them one by one: a_0.mcap, b_0.mcap" in error_of(write_folder(tmp_path / "mixed", mixed))
+    (tmp_path / "bare").mkdir()
+    assert "there is no .mcap file in this folder" in error_of(tmp_path / "bare")
+    assert "name the folders in it: mixed, runs, split" in error_of(tmp_path)
+
+
+def test_metadata_yaml_decides(tmp_path: Path) -> None:
+    parts = {"late.mcap": part(10, 19), "early.mcap": part(0, 9), "other.mcap": part(50, 51)}
+    folder = write_folder(tmp_path / "bag", parts, metadata_yaml(["early.mcap", "bag/late.mcap", "gone.mcap"]))
+    bag = Bag(folder)
+    assert [p.name for p in bag.parts] == ["early.mcap", "late.mcap"]
+    assert sorted(bag.warnings) == [
+        f"{folder / 'gone.mcap'}: metadata.yaml lists this part, and it is not there",
+        f"{folder / 'other.mcap'}: metadata.yaml does not list this file; it is left out",
+    ]
+    (folder / "metadata.yaml").write_text(metadata_yaml(["gone.mcap"]))
+    assert "lists gone.mcap, and none of them is there" in error_of(folder)
+    for text in ("", "]", "x: [", "rosbag2_bagfile_information: 3", "\0", metadata_yaml([])):
+        alone = write_folder(tmp_path / "alone", {"x.mcap": part(0, 9)}, text)
+        assert len(read_all(Bag(alone))) == 91 and "metadata.yaml cannot be used" in Bag(alone).warnings[0]
+    (alone / "metadata.yaml").write_text(metadata_yaml(["x.mcap"], storage="''"))
+    assert len(read_all(Bag(alone))) == 91
+    (alone / "metadata.yaml").write_text(metadata_yaml(["x.mcap"], storage="my_plugin"))
+    assert "'my_plugin'" in error_of(alone)
+
+
+def test_the_part_that_was_open_when_the_power_went(tmp_path: Path) -> None:
+    parts = {"s_0.mcap": part(0, 9), "s_1.mcap": part(9.1, 19), "s_2.mcap": File(b"")}
+    folder = write_folder(tmp_path / "bag", parts)
+    bag = Bag(folder)
+    assert bag.topics["/a"].count == 91 + 100
+    assert bag.warnings == [f"{folder / 's_2.mcap'}: the file is empty; it is left out"]
+    nothing = write_folder(tmp_path / "nothing", {"s_0.mcap": File(b""), "s_1.mcap": File(b"")})
+    assert "no message can be read" in error_of(nothing)
+
+
+def test_a_recording_without_messages_is_one(tmp_path: Path) -> None:
+    bag = read(write(TWO, []), tmp_path)
+    assert list(bag.messages(bag.topics)) == [] and bag.warnings == []
+    assert [item.info.count for item in describe(bag)] == [0] * len(bag.topics)
+
+
+def names(bags: list[Bag]) -> list[list[str]]:
+    return [[p.name for p in bag.parts] for bag in bags]
+
+
+def test_parts_of_one_split_bag_are_one_recording(tmp_path: Path) -> None:
+    for i in range(12):
+        part(10 * i, 10 * i + 9.9).save(tmp_path / f"s_{i}.mcap")
+    shell_order = sorted(tmp_path.glob("s_*.mcap"))
+    (bag,) = group_recordings(shell_order)
+    assert [p.name for p in bag.parts] == [f"s_{i}.mcap" for i in range(12)]
+    assert [t for _, t, _ in bag.messages(["/a"])] == [i * SECOND // 10 for i in range(1200)]
+
+
+APART = {
+    "a pause between them": {"r_0.mcap": part(0, 9), "r_1.mcap": part(15, 20)},
+    "both begin at zero, as in simulated time": {"r_0.mcap": part(0, 9), "r_1.mcap": part(0, 9)},
+    "the second is earlier": {"r_0.mcap": part(10, 19), "r_1.mcap": part(0, 9.9)},
+    "other topics": {"r_0.mcap": part(0, 9), "r_1.mcap": part(9.1, 19, topic="/b")},
+    "other types": {"r_0.mcap": part(0, 9), "r_1.mcap": part(9.1, 19, type_name="std_msgs/msg/Float32")},
+    "a hole in the numbers": {"r_0.mcap": part(0, 9), "r_2.mcap": part(9.1, 19)},
+    "not from zero": {"r_1.mcap": part(0, 9), "r_2.mcap": part(9.1, 19)},
+    "other stems": {"a_0.mcap": part(0, 9), "b_1.mcap": part(9.1, 19)},
+    "no numbers": {"a.mcap": part(0, 9), "b.mcap": part(9.1, 19)},
+}
+
+
+@pytest.mark.parametrize("case", APART)
+def test_files_that_may_be_separate_runs_stay_apart(case: str, tmp_path: Path) -> None:
+    files = [file.save(tmp_path / name) for name, file in APART[case].items()]
+    assert names(group_recordings(files)) == [[file.name] for file in files]
+
+
+def test_slow_recordings_are_joined_over_their_own_pauses(tmp_path: Path) -> None:
+    files = [part(0, 90, 10).save(tmp_path / "s_0.mcap"), part(99, 190, 10).save(tmp_path / "s_1.mcap")]
+    assert names(group_recordings(files)) == [["s_0.mcap", "s_1.mcap"]]
+
+
+def test_metadata_beside_files_joins_them(tmp_path: Path) -> None:
+    parts = {"r_0.mcap": part(0, 9), "r_1.mcap": part(100, 109), "r_2.mcap": part(200, 209)}
+    write_folder(tmp_path, parts, metadata_yaml(parts))
+    files = [tmp_path / "r_2.mcap", tmp_path / "r_0.mcap"]
+    assert names(group_recordings(files)) == [["r_0.mcap", "r_2.mcap"]]
+    assert names(group_recordings(files[:1])) == [["r_2.mcap"]]
+    (tmp_path / "metadata.yaml").write_text(metadata_yaml(["old_0.db3"], storage="sqlite3"))
+    assert names(group_recordings(files)) == [["r_2.mcap"], ["r_0.mcap"]]
+
+
+def test_folders_and_files_in_the_order_given(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "f", {"f_0.mcap": part(0, 9)})
+    other = part(0, 9).save(tmp_path / "x_5.mcap")
+    third = part(0, 9).save(tmp_path / "x_6.mcap")
+    assert names(group_recordings([other, folder, third])) == [["x_5.mcap"], ["x_6.mcap"], ["f_0.mcap"]]
+    for twice in ([other, other], [folder, folder], [folder, folder / "f_0.mcap"]):
+        with pytest.raises(BagError, match="named twice"):
+            group_recordings(twice)
+    with pytest.raises(BagError, match="there is no such file"):
+        group_recordings([other, tmp_path / "x_9.mcap"])
+
+
+# --- what could be a signal ---------------------------------------------------------------------------------
+
+
+def test_describe_offers_paths_that_can_be_read(tmp_path: Path) -> None:
+    odd_names = ["fan", "3", " spaced ", "a[b]"]
+    joints = cdr(
+        "sensor_msgs/msg/JointState",
+        header=header(SECOND),
+        name=odd_names,
+        position=np.arange(4.0),
+        velocity=np.arange(3.0),
+        effort=np.zeros(0),
+    )
+    multi = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    array = cdr("std_msgs/msg/Float64MultiArray", layout=multi, data=np.arange(100.0))
+    single = cdr("std_msgs/msg/Float64MultiArray", layout=multi, data=np.arange(1.0))
+    quaternion = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.6, w=0.8)
+    point = message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
+    pose = message("geometry_msgs/msg/Pose", position=point, orientation=quaternion)
+    poses = cdr("geometry_msgs/msg/PoseArray", header=header(0), poses=[pose, pose])
+    topics = [
+        Topic("/joints", "sensor_msgs/msg/JointState"),
+        Topic("/array", "std_msgs/msg/Float64MultiArray"),
+        Topic("/single", "std_msgs/msg/Float64MultiArray"),
+        Topic("/poses", "geometry_msgs/msg/PoseArray"),
+        Topic("/text", "std_msgs/msg/String"),
+    ]
+    messages = [
+        Message("/joints", 1, joints),
+        Message("/array", 1, array),
+        Message("/single", 1, single),
+        Message("/poses", 1, poses),
+        Message("/text", 1, cdr("std_msgs/msg/String", data="3")),
+    ]
+    bag = read(write(topics, messages), tmp_path)
+    found = {item.info.topic: item for item in describe(bag)}
+    assert found["/joints"].fields == (
+        *("position[fan]", 'position["3"]', 'position[" spaced "]', 'position["a[b]"]'),
+        "velocity[0..2]",
+    )
+    assert found["/array"].fields == ("layout.data_offset", "data[0..99]")
+    assert found["/single"].fields == ("layout.data_offset", "data[0]")
+    assert found["/text"].fields == ()
+    assert found["/poses"].fields[3:6] == tuple(f"{f}(poses[0..1].orientation)" for f in ("roll", "pitch", "yaw"))
+    for topic, _, decoded in bag.messages(bag.topics):
+        for text in found[topic].fields:
+            path = FieldPath(text.replace("[0..", "["))  # the last of each range
+            path.check(topic, bag.topics[topic].type, bag.fields)
+            assert path.read(decoded) == path.read(decoded)  # a number, not NaN
+
+
+def test_describe_counts_rates_gaps_and_stamps(tmp_path: Path) -> None:
+    def stamped(stamp: int, little_endian: bool = True) -> bytes:
+        point = message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
+        return cdr("geometry_msgs/msg/PointStamped", little_endian, header=header(stamp), point=point)
+
+    kind = "geometry_msgs/msg/PointStamped"
+    late = "float64 y\nstd_msgs/Header header\n"
+    topics = [Topic("/usable", kind), Topic("/zero", kind), Topic("/mixed", kind), Topic("/none"), Topic("/once")]
+    topics += [Topic("/big", kind), Topic("/late", "x/msg/Late", schema=late), Topic("/never", kind)]
+    messages = []
+    for i in range(11):
+        t = (100 + i) * SECOND // 10 + (2 * SECOND if i == 10 else 0)
+        messages += [Message("/usable", t, stamped(t - 7 * SECOND)), Message("/zero", t, stamped(0))]
+        messages += [Message("/mixed", t, stamped(t if i % 2 else 0)), Message("/none", t, float64(i))]
+        messages += [Message("/big", t, stamped(t, little_endian=False))]
+        behind = b"\0\1\0\0" + struct.pack("<diII", 1.0, 5, 7, 1) + b"\0"
+        messages += [Message("/late", t, behind)]
+    messages.append(Message("/once", 0, float64(0)))
+    found = {item.info.topic: item for item in describe(read(write(topics, messages), tmp_path))}
+    stamps = {topic: item.stamps for topic, item in found.items()}
+    assert stamps == {
+        "/usable": "usable", "/zero": "zero", "/mixed": "mixed", "/none": "none", "/once": "none", "/big": "usable",
+        "/late": "usable", "/never": "none",
+    }  # fmt: skip
+    assert found["/usable"].stamp_offset == pytest.approx(7) and found["/big"].stamp_offset == 0
+    assert found["/none"].rate == pytest.approx(10) and found["/none"].largest_gap == pytest.approx(2.1)
+    assert found["/once"].rate is None and found["/once"].largest_gap is None
+    assert found["/never"].info.count == 0 and found["/never"].fields == ()
+
+
+def test_header_stamps_of_messages() -> None:
+    assert header_stamp_ns(message("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0)) is None
+    vector = message("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0)
+    for stamp, expected in ((0, None), (1, 1), (1_700_000_000_123_456_789, 1_700_000_000_123_456_789)):
+        stamped = message("geometry_msgs/msg/Vector3Stamped", header=header(stamp), vector=vector)
+        assert header_stamp_ns(stamped) == expected
+
+
+# --- real recordings ----------------------------------------------------------------------------------------
+
+COUNTS = {
+    "cougars_auv/SO_bag_0.mcap": (2671, {"/coug2/controls/command": 201, "/coug2/modem_imu": 161}),
+    "crazyflie/rollbag_0.mcap": (3284, {"/cf_controll": 316, "/vicon/Group466CF/Group466CF/pose": 2652}),
+    "crazyflie/yx3bag_0.mcap": (701, {"/cf_logpos": 112}),
+    "crazyflie/yx4bag_0.mcap": (3073, {"/cf_controll": 237}),
+    "go2/test_3.mcap": (16983, {"/go2/joint_states": 10449, "/go2/joint_command": 6534}),
+    "hunter_se/straight_even_t_0_2_run_01.mcap": (5030, {"/hunter/cmd": 2515}),
+    "hunter_se/straight_even_t_0_2_run_02.mcap": (5030, {"/hunter/cmd": 2515}),
+    "hunter_se/straight_odd_t_0_5_run_01.mcap": (5026, {"/hunter/cmd": 2513}),
+    "hunter_se/straight_odd_t_0_5_run_02.mcap": (5036, {"/hunter/twist": 2518}),
+    "micro_gas_turbine/ex_1.mcap": (19840, {"/mgt/el_power": 9920, "/mgt/input_voltage": 9920}),
+    "micro_gas_turbine/ex_20.mcap": (12990, {"/mgt/el_power": 6495}),
+    "micro_gas_turbine/ex_24.mcap": (18046, {"/mgt/el_power": 9023}),
+    "neato/draw_square.mcap": (1185, {"/cmd_vel": 17, "/odom": 292}),
+    "neato/person_follower.mcap": (872, {"/cmd_vel": 276, "/odom": 149}),
+    "odd/bag_with_topics_and_service_events.mcap": (10, {"/test_topic1": 1, "/test_service1/_service_event": None}),
+    "odd/cdr_test_0.mcap": (7, {"/test_topic": 3, "/array_topic": 4}),
+    "odd/multiple_files_0.mcap": (1324, {"/chatter": 1324}),
+    "odd/multiple_files_1.mcap": (1324, {"/chatter": 1324}),
+    "odd/multiple_files_2.mcap": (529, {"/chatter": 529}),
+    "odd/only_services.mcap": (12, {"/add_two_ints/_service_event": None}),
+    "odd/only_topics.mcap": (7, {"/parameter_events": 7, "/rosout": 0}),
+    "odd/rewriter_a_0.mcap": (150, {"a_empty": None, "b_basictypes": 50}),
+    "odd/rollbag_truncated.mcap": (2025, {"/vicon/Group466CF/Group466CF/pose": 1601, "/cf_controll": 212}),
+    "odd/rollbag_zstd.mcap": (3284, {"/cf_controll": 316}),
+    "odd/talker.mcap": (20, {"/topic": 10, "/rosout": 10}),
+    "odd/test_bag_for_seek_0.mcap": (5, {"topic1": 5}),
+    "odd/wbag_0.mcap": (1246, {"AAA": 174, "HHH": 148}),
+    "odd/wrong_rmw_test_0.mcap": (7, {"/test_topic": None, "/array_topic": None}),
+}  # messages in all; messages decoded per topic, None where it cannot be
+
+
+@needs_data
+@pytest.mark.parametrize("name", COUNTS)
+def test_real_recordings(name: str) -> None:
+    bag = Bag(DATA / name)
+    total, decoded = COUNTS[name]
+    raw = [(r.log_time_ns, r.topic, r.data) for r in bag.raw_messages()]
+    assert len(raw) == total and [t for t, *_ in raw] == sorted(t for t, *_ in raw)
+    for topic, number in decoded.items():
+        if number is None:
+            assert not bag.topics[topic].readable and bag.topics[topic].reason
+            continue
+        assert bag.topics[topic].readable, bag.topics[topic].reason
+        assert sum(1 for _ in bag.messages([topic])) == number == bag.topics[topic].count
+    if name == "odd/rollbag_truncated.mcap":
+        assert bag.warnings == [f"{DATA / name}: cut after 2 025 messages (no footer); read up to the cut"]
+    else:
+        assert bag.warnings == []
+    assert {item.info.topic for item in describe(bag)} == set(bag.topics)
+
+
+@needs_data
+@pytest.mark.parametrize("name", [n for n in COUNTS if "truncated" not in n])
+def test_real_recordings_read_as_the_mcap_library_reads_them(name: str) -> None:
+    topics: dict[int, str] = {}
+    expected = []
+    with open(DATA / name, "rb") as stream:
+        for record in StreamReader(stream, validate_crcs=True).records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, McapMessage):
+                expected.append((topics[record.channel_id], record.log_time, record.data))
+    assert read_all(Bag(DATA / name)) == sorted(expected, key=lambda m: m[1])
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["go2/test_3.mcap", "crazyflie/yx4bag_0.mcap", "cougars_auv/SO_bag_0.mcap"])
+def test_real_recordings_decode_as_rosbags_decodes_them(name: str) -> None:
+    with AnyReader([DATA / name]) as reader:
+        kept = [c for c in reader.connections if c.topic != "/rosout"]
+        expected = sorted(
+            ((t, c.topic, repr(reader.deserialize(data, c.msgtype))) for c, t, data in reader.messages(kept)),
+        )
+    bag = Bag(DATA / name)
+    assert sorted((t, topic, repr(m)) for topic, t, m in bag.messages({c.topic for c in kept})) == expected
+
+
+@needs_data
+def test_real_files_that_are_no_recording() -> None:
+    assert "is empty" in error_of(DATA / "odd/empty.mcap")
+    assert "git lfs pull" in error_of(DATA / "odd/lfs_pointer.mcap")
+    assert "a text file" in error_of(DATA / "README.md")
+    assert "multiple_files_0.mcap" in error_of(DATA / "odd")
+    assert "name them one by one: ex_1.mcap, ex_20.mcap, ex_24.mcap" in error_of(DATA / "micro_gas_turbine")
+    assert "name the folders in it: cougars_auv, crazyflie, go2" in error_of(DATA)
+
+
+@needs_data
+def test_real_split_bag_is_one_and_real_runs_are_separate(tmp_path: Path) -> None:
+    split = sorted((DATA / "odd").glob("multiple_files_*.mcap"))
+    (bag,) = group_recordings(split)
+    assert bag.topics["/chatter"].count == 1324 + 1324 + 529
+    assert [m.data for _, _, m in bag.messages(["/chatter"])][-1] == "test"
+    runs = [DATA / "micro_gas_turbine" / f"ex_{i}.mcap" for i in (1, 20)]
+    assert names(group_recordings(runs)) == [["ex_1.mcap"], ["ex_20.mcap"]]
+    repeats = sorted((DATA / "hunter_se").glob("*.mcap"))
+    assert names(group_recordings(repeats)) == [[path.name] for path in repeats]
+    for path in split:
+        shutil.copy(path, tmp_path)
+    assert Bag(tmp_path).topics["/chatter"].count == 3177
+
+
+@needs_data
+def test_real_stamps_and_offers() -> None:
+    cougars = {item.info.topic: item for item in describe(Bag(DATA / "cougars_auv/SO_bag_0.mcap"))}
+    assert cougars["/coug2/modem_imu"].stamps == "zero"
+    assert cougars["/coug2/depth_data"].stamp_offset == pytest.approx(515_220, abs=1)
+    go2 = {item.info.topic: item for item in describe(Bag(DATA / "go2/test_3.mcap"))}
+    assert "position[j11]" in go2["/go2/joint_states"].fields and go2["/go2/joint_states"].stamps == "usable"
+    assert go2["/go2/joint_command"].rate == pytest.approx(500, rel=0.01)
+    vicon = {item.info.topic: item for item in describe(Bag(DATA / "crazyflie/yx3bag_0.mcap"))}
+    pose = vicon["/vicon/Group466CF/Group466CF/pose"]
+    assert pose.largest_gap == pytest.approx(0.93, abs=0.01) and "roll(pose.orientation)" in pose.fields
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["odd/rollbag_zstd.mcap", "neato/person_follower.mcap", "odd/cdr_test_0.mcap"])
+def test_mutated_real_recordings(name: str, tmp_path: Path) -> None:
+    original = (DATA / name).read_bytes()
+    dice = random.Random(name)
+    path = tmp_path / "x.mcap"
+    for _ in range(60):
+        path.write_bytes(mutate(original, dice))
+        begin = time.monotonic()
+        with contextlib.suppress(BagError):
+            bag = Bag(path)
+            describe(bag)
+            list(bag.messages([topic for topic, info in bag.topics.items() if info.readable]))
+        assert time.monotonic() - begin < 20
+
+
+def test_checksums_are_those_of_the_format() -> None:
+    """The writer of these tests really writes checksums, else the tests of damage would show nothing."""
+    begin, _ = chunks(chunked("none").data)[0]
+    assert struct.unpack_from("<I", chunked("none").data, begin + 9 + 24)[0] != 0
+    assert zlib.crc32(b"123456789") == 0xCBF43926
