@@ -131,7 +131,7 @@ def sample(stream: Stream, signals: SignalMap) -> Transient:
         min_step=signals.min_step,
         counters=sampler.counters,
         sources=stream.bag.parts,
-        warnings=stream.bag.warnings,
+        notes=stream.bag.warnings,
     )
 
 
@@ -193,12 +193,15 @@ def read_transients(
         return transients
     resolved, words = _resolve_operating_point(resolved, transients)
     if any(FieldPath(s.field).unwrap for s in asked):  # the branch of an angle starts nearest to steady
-        return [sample(stream, resolved) for stream in streams]
-    note = f"operating point: auto resolved from {words}"
-    return [_with_signals(t, resolved, note) for t in transients]
+        transients = [sample(stream, resolved) for stream in streams]
+    numbers = ", ".join(f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals)
+    note = f"operating point from {words}: {numbers}"
+    return [_with_signals(t, resolved, note if t is transients[0] else None) for t in transients]
 
 
-def read_for_model(path: str | os.PathLike[str], model: UncertainLTI, progress: Progress | None = None) -> Transient:
+def read_for_model(
+    recording: Bag | str | os.PathLike[str], model: UncertainLTI, progress: Progress | None = None
+) -> Transient:
     """Read one recording with the signals and sampling that a model was fitted with.
 
     Raises
@@ -213,7 +216,7 @@ def read_for_model(path: str | os.PathLike[str], model: UncertainLTI, progress: 
         raise SignalError(
             "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
         )
-    bag = Bag(path)
+    bag = recording if isinstance(recording, Bag) else Bag(recording)
     for topic, found in _types([bag], signals).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
@@ -248,7 +251,7 @@ def _resolve_operating_point(signals: SignalMap, transients: Sequence[Transient]
     return replace(signals, states=tuple(filled[:n]), controls=tuple(filled[n:])), words
 
 
-def _with_signals(transient: Transient, signals: SignalMap, note: str) -> Transient:
+def _with_signals(transient: Transient, signals: SignalMap, note: str | None) -> Transient:
     return Transient(
         transient.t_ns,
         transient.x,
@@ -259,7 +262,7 @@ def _with_signals(transient: Transient, signals: SignalMap, note: str) -> Transi
         min_step=transient.min_step,
         counters=transient.counters,
         sources=transient.sources,
-        warnings=(*transient.warnings, note),
+        notes=(*transient.notes, *([note] if note else [])),
     )
 
 

@@ -58,7 +58,7 @@ class Transient:
         Counts of a `Sampler` to start from.
     sources : sequence of paths, optional
         Files that the run was read from.
-    warnings : sequence of str, optional
+    notes : sequence of str, optional
         What the reader of the files had to say.
 
     A sample at most max_gap earlier than the one before is dropped as late; one earlier than that starts a new
@@ -90,7 +90,7 @@ class Transient:
         min_step: float = 0.0,
         counters: Mapping[str, int] | None = None,
         sources: Sequence[str | os.PathLike[str]] = (),
-        warnings: Sequence[str] = (),
+        notes: Sequence[str] = (),
     ) -> None:
         self.name = name
         self.signals = signals
@@ -103,7 +103,7 @@ class Transient:
         self.control_names = _names(control_names, signals.controls if signals else None, "u", self.u, name)
         self.counters = Counter(counters or {})
         self.sources = tuple(os.fspath(s) for s in sources)
-        self.warnings = tuple(warnings)
+        self.notes = tuple(notes)
         min_step_ns = to_ns(min_step)
         median = median_step_ns([t_ns], min_step_ns)
         if max_gap is None:

@@ -1,0 +1,261 @@
+"""The command `uncertain-lti`."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from uncertain_lti import __version__
+from uncertain_lti.errors import BagError, UncertainLTIError
+
+DONE, ALARM, BAD_INPUT = 0, 1, 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; exit status 0 done, 1 the alarm was raised, 2 bad usage or input."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        return int(options.run(options))
+    except UncertainLTIError as error:
+        print(f"uncertain-lti {options.command}: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        print(
+            f"uncertain-lti {options.command}: the Python package {error.name} is not installed; {extra}",
+            file=sys.stderr,
+        )
+        return BAD_INPUT
+    except BrokenPipeError:  # `| head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except KeyboardInterrupt:
+        print(f"uncertain-lti {options.command}: interrupted; nothing was written", file=sys.stderr)
+        return BAD_INPUT
+
+
+_FIT = "install what fitting needs: pip install 'uncertain-lti-ros[fit]'"
+_ROS = "source a ROS 2 Jazzy installation, or pip install 'uncertain-lti-ros[ros]'"
+_EXTRAS = {
+    **dict.fromkeys(("cvxpy", "osqp", "daqp", "piqp", "highspy", "scipy"), _FIT),
+    **dict.fromkeys(("rclpy", "std_msgs", "sensor_msgs", "rosgraph_msgs", "std_srvs", "uncertain_lti_ros"), _ROS),
+    "matplotlib": "install what figures need: pip install 'uncertain-lti-ros[plots]'",
+}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="uncertain-lti",
+        description="Fit an uncertain linear model to recorded transients, and tell when a machine leaves it.",
+        epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input.",
+    )
+    parser.add_argument("--version", action="version", version=f"uncertain-lti {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, run: Any, text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        sub.set_defaults(run=run)
+        return sub
+
+    topics = command("topics", _topics, "list the topics of a recording, and which fields could be signals")
+    topics.add_argument("bag", metavar="BAG", help="MCAP file, or folder of a recording")
+    topics.add_argument("--json", action="store_true", help="print JSON")
+
+    fit = command("fit", _fit, "fit a model to recordings")
+    fit.add_argument(
+        "bags", metavar="BAG", nargs="+", help="MCAP files and folders; parts of a split bag are one recording"
+    )
+    fit.add_argument(
+        "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
+    )
+    fit.add_argument("--output", required=True, metavar="MODEL", help="model file to write (*.model.json)")
+    fit.add_argument("--criterion", choices=("qp", "lp"), default="qp", help="(10) squared or (11) largest width")
+    fit.add_argument(
+        "--additive",
+        choices=("none", "disturbance", "noise", "both"),
+        default="none",
+        help="further terms: drift with its half-width, measurement noise",
+    )
+    fit.add_argument("--json", action="store_true", help="print JSON")
+
+    check = command("check", _check, "check a recording against a model")
+    check.add_argument("model", metavar="MODEL", help="model file")
+    check.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders")
+    check.add_argument("--violations", type=int, help="alarm: so many violations (default: the model's)")
+    check.add_argument("--window", type=int, help="alarm: among so many last verdicts (default: the model's)")
+    check.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
+    check.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
+
+    info = command("info", _info, "show what is in a model file")
+    info.add_argument("model", metavar="MODEL", help="model file")
+    info.add_argument("--json", action="store_true", help="print the file as JSON")
+
+    for name, module, text in (
+        ("play", "player", "publish a recording through rclpy"),
+        ("record", "recorder", "record topics through rclpy"),
+        ("demo", "demo", "fit the shipped recording and watch a second one live"),
+    ):
+        sub = command(name, None, text)
+        sub.set_defaults(run=_ros(module))
+        if _installed(module):  # --help lists their options; they import rclpy only when they run
+            import_module(f"uncertain_lti_ros.{module}").add_arguments(sub)
+        else:
+            sub.add_argument("rest", nargs="*", help=argparse.SUPPRESS)
+    return parser
+
+
+def _installed(module: str) -> bool:
+    try:
+        return find_spec(f"uncertain_lti_ros.{module}") is not None
+    except ModuleNotFoundError:  # core on its own
+        return False
+
+
+def _ros(module: str) -> Any:
+    def run(options: argparse.Namespace) -> int:
+        return int(import_module(f"uncertain_lti_ros.{module}").run(options))
+
+    return run
+
+
+def _progress(text: str) -> Any:
+    """A bar on a terminal, nothing elsewhere."""
+    from tqdm import tqdm
+
+    def wrap(messages: Iterable[object], total: int) -> Iterable[object]:
+        bar: Iterable[object] = tqdm(messages, desc=text, total=total, unit=" messages", leave=False, disable=None)
+        return bar
+
+    return wrap
+
+
+def _topics(options: argparse.Namespace) -> int:
+    from uncertain_lti.bag import Bag, describe
+    from uncertain_lti.report import number, table
+
+    bag = Bag(options.bag)
+    facts = describe(bag)
+    if options.json:
+        _print_json(
+            {
+                "recording": str(bag.path),
+                "warnings": bag.warnings,
+                "topics": [
+                    {
+                        "topic": f.info.topic,
+                        "type": f.info.type,
+                        "count": f.info.count,
+                        "readable": f.info.readable,
+                        "reason": f.info.reason,
+                        "rate": f.rate,
+                        "largest_gap": f.largest_gap,
+                        "header_stamps": f.stamps,
+                        "log_minus_header": f.stamp_offset,
+                        "fields": list(f.fields),
+                    }
+                    for f in facts
+                ],
+            }
+        )
+        return DONE
+    _say(bag.warnings)
+    rows = []
+    for f in facts:
+        stamps: str = f.stamps
+        if f.stamp_offset is not None and abs(f.stamp_offset) > 1.0:
+            stamps += f", log {f.stamp_offset:+.0f} s"
+        rows.append([f.info.topic, f.info.type, str(f.info.count), number(f.rate), number(f.largest_gap), stamps])
+    print(table(("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps"), rows))
+    for f in facts:
+        if not f.info.readable or f.info.reason:
+            print(f"{f.info.topic}: {f.info.reason}")
+        if f.fields:
+            print(f"{f.info.topic}: {', '.join(f.fields)}")
+    return DONE
+
+
+def _fit(options: argparse.Namespace) -> int:
+    from uncertain_lti import fit, read_transients
+    from uncertain_lti.report import fit_text, recording_text
+
+    transients = read_transients(options.bags, options.signals, _progress("reading"))
+    if not options.json:
+        for transient in transients:
+            _say(transient.notes)
+            print(recording_text(transient))
+    output = Path(options.output)
+    if not output.parent.is_dir():
+        raise BagError(f"{output}: the folder {output.parent} is not there; make it first")
+    model = fit(transients, options.criterion, additive=options.additive)
+    sources = [{"file": name, "sha256": _sha256(name)} for t in transients for name in t.sources]
+    model = model.with_(fit={**model.fit, "sources": sources})
+    model.save(output)
+    if options.json:
+        _print_json({"model": str(output), "fit": model.to_dict()["fit"]})
+    else:
+        print(fit_text(model, transients))
+        print(f"model written to {output}")
+    return DONE
+
+
+def _sha256(path: str) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _check(options: argparse.Namespace) -> int:
+    from uncertain_lti import EnvelopeMonitor, UncertainLTI
+    from uncertain_lti.bag import group_recordings
+    from uncertain_lti.reading import read_for_model
+    from uncertain_lti.report import check_data, check_text
+
+    model = UncertainLTI.load(options.model)
+    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
+    results = []
+    for bag in group_recordings(options.bags):
+        transient = read_for_model(bag, model, _progress("reading"))
+        _say(transient.notes)
+        data = check_data(model, monitor.check(transient), samples=options.json)
+        results.append(data)
+        if not options.json:
+            print(check_text(data))
+    if options.json:
+        _print_json({"model": options.model, "alarm": any(r["alarm"] for r in results), "recordings": results})
+    return ALARM if any(r["alarm"] for r in results) else DONE
+
+
+def _info(options: argparse.Namespace) -> int:
+    from uncertain_lti import UncertainLTI
+    from uncertain_lti.report import model_text
+
+    model = UncertainLTI.load(options.model)
+    if options.json:
+        _print_json(model.to_dict())
+    else:
+        print(model_text(model))
+    return DONE
+
+
+def _print_json(data: Any) -> None:
+    json.dump(data, sys.stdout, allow_nan=False, indent=1)
+    sys.stdout.write("\n")
+
+
+def _say(notes: Iterable[str]) -> None:
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

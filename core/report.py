@@ -1,0 +1,245 @@
+"""What a fit or a check found, as text for people and as plain data for programs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.model import UncertainLTI
+from uncertain_lti.monitor import Verdicts
+from uncertain_lti.reading import unused
+from uncertain_lti.transient import Transient
+
+Array = NDArray[np.float64]
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Columns aligned with spaces; the first to the left, the others to the right."""
+    lines = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    return "\n".join(
+        "  "
+        + "  ".join(
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def number(value: float | None) -> str:
+    """Four digits, or a dash for nothing."""
+    return "-" if value is None or math.isnan(value) else f"{value:.4g}"
+
+
+def recording_text(transient: Transient) -> str:
+    """One recording: what was read, and what of it is not used."""
+    usable = int(transient.usable.sum())
+    span = float(np.ptp(transient.t_ns)) * 1e-9 if len(transient) else 0.0
+    text = f"{transient.name}: {len(transient)} samples over {span:.4g} s, {usable} usable transitions"
+    left = unused(transient)
+    return f"{text} ({', '.join(left)})" if left else text
+
+
+def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
+    """Summary of a fit: widths beside what the states do, and what the user should know."""
+    facts = model.fit
+    criterion = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}[facts["criterion"]]
+    steps = [t.transitions() for t in transients]
+    moves = np.vstack([s.x_next - s.x for s in steps])
+    states = np.vstack([s.x for s in steps])
+    rms, span = np.sqrt(np.mean(moves**2, axis=0)), np.ptp(states, axis=0)
+    rows = []
+    for i, signal in enumerate(model.signals.states):
+        rows.append(
+            [
+                signal.name + (f" [{signal.unit}]" if signal.unit else ""),
+                number(facts["mean_width_recorded"][i]),
+                number(facts["max_width_recorded"][i]),
+                number(rms[i]),
+                number(span[i]),
+                f"{facts['mean_width_recorded'][i] / span[i]:.2%}" if span[i] > 0 else "-",
+            ]
+        )
+    lines = [
+        f"criterion {criterion}; additive: {facts['additive']}; {facts['transitions']} transitions, "
+        f"{facts['violations']} outside, gap to the optimum {facts['gap']:.1e}",
+        table(("one-step envelope", "mean width", "largest", "rms step", "range", "width/range"), rows),
+        f"eigenvalues of A [1/s]: {_eigenvalues(model)}",
+    ]
+    return "\n".join(lines + [f"note: {message}" for message in facts["messages"]])
+
+
+def _eigenvalues(model: UncertainLTI) -> str:
+    return ", ".join(
+        f"{v.real:.4g}{v.imag:+.4g}j" if abs(v.imag) > 1e-12 * abs(v) else f"{v.real:.4g}" for v in model.eigenvalues()
+    )
+
+
+def model_text(model: UncertainLTI) -> str:
+    """Summary of a model file."""
+    s, facts = model.sampling, model.fit
+    lines = [repr(model)]
+    if s.clock:
+        lines.append(
+            f"clock {s.clock} ({s.time.get(s.clock, '?')} time), step {number(s.dt_median)} s "
+            f"({number(s.dt_min)} to {number(s.dt_max)}), max_gap {number(s.max_gap)} s"
+        )
+    signals = [
+        [
+            f"{kind} {signal.name}",
+            signal.topic or "-",
+            signal.field,
+            number(float(signal.steady)),
+            number(float(signal.scale)),
+            signal.unit or "-",
+        ]
+        for kind, group in (("state", model.signals.states), ("control", model.signals.controls))
+        for signal in group
+    ]
+    lines.append(table(("signal", "topic", "field", "steady", "scale", "unit"), signals))
+    names = [*model.state_names, *model.control_names]
+    nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
+    extra = [
+        ("c", np.column_stack([model.c, model.dc])),
+        ("v (noise)", np.column_stack([np.zeros(model.n), model.v])),
+    ]
+    shown = [(name, pair) for name, pair in extra if pair.any()]
+    rows = [
+        [name]
+        + [f"{nominal[i, j]:.4g} ± {half[i, j]:.3g}" for j in range(len(names))]
+        + [f"{pair[i, 0]:.4g} ± {pair[i, 1]:.3g}" for _, pair in shown]
+        for i, name in enumerate(model.state_names)
+    ]
+    lines.append(table(("A, B [1/s]", *names, *(name for name, _ in shown)), rows))
+    lines.append(f"eigenvalues of A [1/s]: {_eigenvalues(model)}")
+    if facts.get("mean_width_recorded"):
+        widths = [
+            [name, number(a), number(b)]
+            for name, a, b in zip(
+                model.state_names, facts["mean_width_recorded"], facts["max_width_recorded"], strict=True
+            )
+        ]
+        lines.append(table(("one-step envelope", "mean width", "largest"), widths))
+    alarm = model.alarm
+    lines.append(
+        f"alarm: {alarm.violations} of the last {alarm.window} verdicts violated; margin {number(alarm.margin)}"
+    )
+    return "\n".join(lines + [f"note: {message}" for message in facts.get("messages", [])])
+
+
+def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) -> dict[str, Any]:
+    """Result of a check as plain data.
+
+    Counts, the first and the longest violation of each state, the spans in which the alarm was raised, widths beside
+    coverage; with samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no
+    verdict).
+    """
+    transient = verdicts.transient
+    t = transient.t_ns
+    judged = int(verdicts.judged.sum())
+    width = np.where(verdicts.judged[:, None], verdicts.upper - verdicts.lower, np.nan)
+    states = {}
+    for i, name in enumerate(model.state_names):
+        flags = verdicts.flags[:, i]
+        bad = flags == 1.0
+        runs = _runs(bad)
+        longest = max(runs, key=lambda run: (run[1] - run[0], -run[0]), default=None)
+        states[name] = {
+            "violations": int(bad.sum()),
+            "inside": None if not judged else 1.0 - int(bad.sum()) / judged,
+            "first_violation": _instant(transient, runs[0][0]) if runs else None,
+            "longest_violation": None
+            if longest is None
+            else {**_instant(transient, longest[0]), "samples": longest[1] - longest[0], **_length(t, longest)},
+            "mean_width": float(np.nanmean(width[:, i])) if judged else None,
+            "max_width": float(np.nanmax(width[:, i])) if judged else None,
+            "unit": model.signals.states[i].unit,
+        }
+    alarms = _runs(verdicts.alarm)
+    data: dict[str, Any] = {
+        "recording": transient.name,
+        "samples": len(transient),
+        "verdicts": judged,
+        "no_verdict": unused(transient),
+        "violated": int(verdicts.violated.sum()),
+        "inside": None if not judged else 1.0 - int(verdicts.violated.sum()) / judged,
+        "outside_domain": int(verdicts.outside_domain.sum()),
+        "states": states,
+        "alarm": bool(alarms),
+        "alarms": [{**_instant(transient, start), **_length(t, (start, stop))} for start, stop in alarms],
+    }
+    if samples:
+        data["verdict_per_sample"] = [
+            {
+                "t_ns": int(t[k]),
+                "status": status.value,
+                "flags": _list(verdicts.flags[k]),
+                "lower": _list(verdicts.lower[k]),
+                "upper": _list(verdicts.upper[k]),
+                "state": _list(transient.x[k]),
+                "utilisation": _list(verdicts.utilisation[k]),
+                "outside_domain": bool(verdicts.outside_domain[k]),
+                "alarm": bool(verdicts.alarm[k]),
+            }
+            for k, status in enumerate(transient.statuses())
+        ]
+    return data
+
+
+def check_text(data: dict[str, Any]) -> str:
+    """Summary of `check_data` for a person."""
+    rows = []
+    for name, s in data["states"].items():
+        longest = s["longest_violation"]
+        rows.append(
+            [
+                name + (f" [{s['unit']}]" if s["unit"] else ""),
+                str(s["violations"]),
+                "-" if s["inside"] is None else f"{s['inside']:.3%}",
+                number(s["mean_width"]),
+                number(s["max_width"]),
+                "-" if s["first_violation"] is None else f"{s['first_violation']['t']:.4f} s",
+                "-" if longest is None else f"{longest['samples']} from {longest['t']:.4f} s",
+            ]
+        )
+    inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} inside all bounds"
+    head = f"{data['recording']}: {data['samples']} samples, {data['verdicts']} verdicts, {inside}"
+    lines = [
+        head + (f"; no verdict or not used: {', '.join(data['no_verdict'])}" if data["no_verdict"] else ""),
+        table(("state", "violations", "inside", "mean width", "largest", "first", "longest"), rows),
+    ]
+    if data["verdicts"]:
+        lines.append(f"outside the fitted domain: {data['outside_domain'] / data['verdicts']:.2%} of the verdicts")
+    if data["alarm"]:
+        first = data["alarms"][0]
+        lines.append(
+            f"ALARM: raised {len(data['alarms'])} times, first at {first['t']:.4f} s for {number(first['seconds'])} s"
+        )
+    else:
+        lines.append("no alarm" if data["verdicts"] else "no verdict was possible, so nothing is known")
+    return "\n".join(lines)
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """[start, stop) of every run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _instant(transient: Transient, k: int) -> dict[str, Any]:
+    """Sample k: its time since the first sample, s, and its stamp, ns."""
+    return {"k": k, "t": float(transient.t[k]), "t_ns": int(transient.t_ns[k])}
+
+
+def _length(t_ns: NDArray[np.int64], run: tuple[int, int]) -> dict[str, float]:
+    """From the first to the last sample of a run, s."""
+    return {"seconds": float(t_ns[run[1] - 1] - t_ns[run[0]]) * 1e-9}
+
+
+def _list(row: Array) -> list[float | None]:
+    return [v if math.isfinite(v) else None for v in row.tolist()]
