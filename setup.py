@@ -21,7 +21,8 @@ def share(folder: str) -> list[tuple[str, list[str]]]:
 
 
 extras = {
-    # What `uncertain_lti.fit` needs. None of these asks for numpy 2, so a sourced ROS 2 keeps its numpy.
+    # What `uncertain_lti.fit` needs. The newest of these want numpy 2: in a sourced ROS 2 say
+    # `pip install '.[fit]' 'numpy<2'` (./run pins its numpy), and pip takes the last that do without.
     "fit": ["cvxpy", "daqp", "highspy", "osqp>=1", "piqp", "scipy"],
     "frames": ["pandas"],
     "plots": ["matplotlib"],
@@ -36,8 +37,6 @@ setup(
     name=NAME,
     version="0.1.0",
     description="Linear models with bounded uncertainty, fitted to recordings and watched live in ROS 2",
-    long_description=(ROOT / "README.md").read_text() if (ROOT / "README.md").exists() else "",
-    long_description_content_type="text/markdown",
     maintainer="uncertain-lti maintainers",
     maintainer_email="maintainers@uncertain-lti.example",
     license="Apache-2.0",
