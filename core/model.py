@@ -208,9 +208,10 @@ class UncertainLTI:
         lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1], dt.shape)
         if not lead:
             return self._one(x, u, float(dt))
-        flat_x = np.broadcast_to(x, (*lead, self.n)).reshape(-1, self.n)
-        flat_u = np.broadcast_to(u, (*lead, self.m)).reshape(-1, self.m)
-        flat_dt = np.broadcast_to(dt, lead).reshape(-1)
+        count = math.prod(lead)  # not -1: that says nothing where there are no controls
+        flat_x = np.broadcast_to(x, (*lead, self.n)).reshape(count, self.n)
+        flat_u = np.broadcast_to(u, (*lead, self.m)).reshape(count, self.m)
+        flat_dt = np.broadcast_to(dt, lead).reshape(count)
         centre, half = np.empty(flat_x.shape), np.empty(flat_x.shape)
         for start in range(0, len(flat_dt), _BLOCK):
             part = slice(start, start + _BLOCK)

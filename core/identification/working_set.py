@@ -17,7 +17,7 @@ Index = NDArray[np.intp]
 
 SUBSAMPLE = 10_000
 """Transitions of the first solve; full passes only correct it."""
-TOLERANCE = 1e-10
+TOLERANCE = 1e-11
 """Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
 TIE_BREAK = 1e-8
 """Weight of the squared distance of the centre beside the squared widths.

@@ -1,0 +1,394 @@
+"""Identification: exact, contained, and honest about the data."""
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
+from uncertain_lti.errors import FitError
+from uncertain_lti.identification import formulation
+from uncertain_lti.identification.problem import assemble, moments
+from uncertain_lti.identification.working_set import SUBSAMPLE
+from uncertain_lti.plants.leibov import leibov2006
+
+ADDITIVE = ("none", "disturbance", "noise", "both")
+CLARABEL = dict(tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12)
+
+
+def drawn(model, N, seed, noise=0.0, dt=0.025, jitter=0.0, rest=20):
+    """A transient of a plant whose elements are drawn anew inside their intervals at every step."""
+    rng = np.random.default_rng(seed)
+    n, m = model.n, model.m
+    u = np.repeat(rng.uniform(-1, 1, (N // 15 + 1, m)), 15, axis=0)[: N + 1]
+    u[N // 2 : N // 2 + rest] = 0.0
+    t_ns = np.concatenate([[0], np.cumsum(np.rint(dt * 1e9 * (1 + jitter * rng.uniform(-1, 1, N))).astype(np.int64))])
+    x = np.zeros((N + 1, n))
+    for k in range(N):
+        A = model.A + model.dA * rng.uniform(-1, 1, (n, n))
+        B = model.B + model.dB * rng.uniform(-1, 1, (n, m))
+        x[k + 1] = x[k] + (t_ns[k + 1] - t_ns[k]) * 1e-9 * (A @ x[k] + B @ u[k])
+    return Transient(t_ns, x + noise * rng.standard_normal(x.shape), u, name=f"drawn {seed}")
+
+
+def small_plant(seed, n=2, m=1):
+    rng = np.random.default_rng(seed)
+    A = -np.diag(rng.uniform(1, 8, n)) + rng.uniform(-1, 1, (n, n))
+    return UncertainLTI(
+        A, rng.uniform(-3, 3, (n, m)), rng.uniform(0, 1, (n, n)) * (rng.random((n, n)) < 0.7), rng.uniform(0, 1, (n, m))
+    )
+
+
+def count_outside(model, transients):
+    """Transition by transition with `bounds`, independent of the vectorised path of the fit."""
+    outside = 0
+    for transient in transients:
+        x = model.operating_point.normalise_x(transient.x)
+        u = model.operating_point.normalise_u(transient.u)
+        for k in np.flatnonzero(transient.usable):
+            lower, upper = model.bounds(x[k], u[k], transient.dt[k])
+            outside += int((~((lower <= x[k + 1]) & (x[k + 1] <= upper))).sum())
+    return outside
+
+
+def widths(model, transient):
+    s = transient.transitions()
+    lower, upper = model.bounds(model.operating_point.normalise_x(s.x), model.operating_point.normalise_u(s.u), s.dt)
+    return upper - lower
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize("additive", ADDITIVE)
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_nothing_is_left_outside(criterion, additive, noise):
+    transients = [
+        drawn(leibov2006(), 400, seed, noise, jitter=0.3, rest=0 if additive == "none" else 20) for seed in (1, 2)
+    ]
+    model = fit(transients, criterion, additive=additive)
+    assert count_outside(model, transients) == 0
+    assert model.fit["violations"] == 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(1, 4),
+    m=st.integers(0, 3),
+    criterion=st.sampled_from(["qp", "lp"]),
+    additive=st.sampled_from(ADDITIVE),
+    noise=st.sampled_from([0.0, 1e-6, 1e-2]),
+    scale=st.sampled_from([1e-6, 1.0, 1e6]),
+    offset=st.sampled_from([0.0, 1e3]),
+)
+def test_nothing_is_left_outside_whatever_the_data(seed, n, m, criterion, additive, noise, scale, offset):
+    raw = drawn(small_plant(seed, n, max(m, 1)), 120, seed, noise, jitter=0.5, rest=0)
+    transient = Transient(raw.t_ns, raw.x * scale + offset, raw.u[:, :m])
+    point = OperatingPoint(np.full(n, offset), np.zeros(m), np.full(n, scale), np.ones(m))
+    try:
+        model = fit(transient, criterion, additive=additive, operating_point=point)
+    except FitError as error:  # a first sample at rest has no envelope without an additive term
+        assert additive == "none" and "at rest" in str(error)
+        return
+    assert count_outside(model, [transient]) == 0
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize("additive", ADDITIVE)
+@pytest.mark.parametrize("kind", ["ones", "per state", "per sample", "full"])
+def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
+    n = 3
+    transient = drawn(small_plant(5, n, 2), 300, 5, noise=0.0 if additive == "none" else 1e-3, jitter=0.4)
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((300, n, n))
+    weights = {
+        "ones": None,
+        "per state": np.array([1.0, 0.01, 30.0]),
+        "per sample": rng.uniform(0.1, 10, (300, n)),
+        "full": root @ root.transpose(0, 2, 1) + 0.1 * np.eye(n),
+    }[kind]
+    model = fit(transient, criterion, weights, additive)
+    problem = assemble([transient], OperatingPoint.identity(n, 2), weights, additive)
+    _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL, **CLARABEL)
+    assert np.atleast_1d(model.fit["objective"]) == pytest.approx(expected, rel=1e-6)
+    assert model.fit["gap"] < 1e-7
+    # and the number stored is that of the bounds themselves
+    width = widths(model, transient)
+    W = np.ones(n) if weights is None else weights
+    if criterion == "qp":
+        stored = np.einsum("ki,kij,kj->", width, W, width) if kind == "full" else np.sum(W * width**2)
+    else:
+        diagonal = np.diagonal(W, axis1=1, axis2=2) if kind == "full" else W
+        stored = np.max(np.sqrt(diagonal) * width, axis=0)
+    assert np.asarray(model.fit["objective"]) == pytest.approx(stored, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_large_problem_reaches_the_same_optimum(criterion):
+    """Beyond the size of the first subsample, where full passes have to correct it."""
+    transient = drawn(small_plant(8), 3 * SUBSAMPLE, 8, noise=1e-3)
+    model = fit(transient, criterion, additive="noise")
+    problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
+    _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL if criterion == "qp" else cp.HIGHS)
+    assert np.atleast_1d(model.fit["objective"]) == pytest.approx(expected, rel=1e-6)
+    s = transient.transitions()
+    lower, upper = model.bounds(s.x, s.u, s.dt)
+    assert ((lower <= s.x_next) & (s.x_next <= upper)).all()
+
+
+@pytest.mark.parametrize("method", ["working-set", "cvxpy"])
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_both_methods_agree_and_contain(method, criterion):
+    transient = drawn(small_plant(11), 200, 11)
+    model = fit(transient, criterion, method=method)
+    assert count_outside(model, [transient]) == 0
+    other = fit(transient, criterion)
+    # OSQP stops at its tolerance, and the repair pays for what it left outside
+    assert np.asarray(model.fit["objective"]) == pytest.approx(np.asarray(other.fit["objective"]), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_objective_is_never_above_that_of_the_published_matrices(seed):
+    plant = leibov2006()
+    transient = drawn(plant, 1200, seed)
+    width = widths(plant, transient)
+    assert fit(transient, "qp").fit["objective"] <= np.sum(width**2) * (1 + 1e-9)
+    assert (fit(transient, "lp").fit["objective"] <= width.max(axis=0) * (1 + 1e-9)).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_additive_terms_never_cost(seed):
+    """The set with additive terms contains both the pure intervals and the constant box."""
+    transient = drawn(small_plant(seed), 250, seed, noise=1e-3, rest=0)
+    transient = Transient(transient.t_ns[1:], transient.x[1:], transient.u[1:])
+    s = transient.transitions()
+    phi = np.hstack([s.x, s.u])
+    box = []
+    for i in range(2):  # the best constant box: least largest residual
+        theta, r = cp.Variable(3), cp.Variable()
+        cp.Problem(cp.Minimize(r), [cp.abs(s.x_next[:, i] - s.x[:, i] - 0.025 * phi @ theta) <= r]).solve(cp.HIGHS)
+        box.append(2 * float(r.value))
+    for additive in ("noise", "both"):
+        qp, lp = fit(transient, "qp", additive=additive), fit(transient, "lp", additive=additive)
+        assert qp.fit["objective"] <= fit(transient, "qp").fit["objective"] * (1 + 1e-8)
+        assert (lp.fit["objective"] <= np.asarray(fit(transient, "lp").fit["objective"]) * (1 + 1e-8)).all()
+        assert qp.fit["objective"] <= len(s.k) * np.sum(np.square(box)) * (1 + 1e-8)
+        assert (lp.fit["objective"] <= np.array(box) * (1 + 1e-8)).all()
+
+
+def test_ties_of_the_linear_programme_are_broken_as_stated():
+    """Least sum of squared widths among the optima, then least squared distance of the centre."""
+    transient = drawn(small_plant(21), 150, 21)
+    s = transient.transitions()
+    z = np.hstack([s.x, s.u])
+    model = fit(transient, "lp")
+    rows, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
+    for i in range(2):
+        theta, d = cp.Variable(3), cp.Variable(3, nonneg=True)
+        increment = (s.x_next - s.x)[:, i]
+        centre, h = 0.025 * z @ theta, 0.025 * np.abs(z) @ d
+        contained = [centre - h <= increment, increment <= centre + h]
+        first = cp.Problem(cp.Minimize(cp.max(2 * h)), contained)
+        first.solve(cp.CLARABEL, **CLARABEL)
+        bounded = [*contained, 2 * h <= first.value * (1 + 1e-9)]
+        second = cp.Problem(cp.Minimize(cp.sum_squares(2 * h)), bounded)
+        second.solve(cp.CLARABEL, **CLARABEL)
+        assert np.sum((2 * 0.025 * np.abs(z) @ half[i]) ** 2) == pytest.approx(second.value, rel=1e-4)
+        third = cp.Problem(
+            cp.Minimize(cp.sum_squares(increment - centre)),
+            [*bounded, cp.sum_squares(2 * h) <= second.value * (1 + 1e-7)],
+        )
+        third.solve(cp.CLARABEL)
+        ours = np.sum((increment - 0.025 * z @ rows[i]) ** 2)
+        assert ours == pytest.approx(third.value, rel=2e-3)
+
+
+def test_centre_of_the_quadratic_programme_is_the_closest_one():
+    """Where many centres are optimal (few samples bind), the one of least squared distance is taken."""
+    rng = np.random.default_rng(2)
+    x = np.zeros((41, 1))
+    u = rng.uniform(-1, 1, (41, 1)) * 1e-3  # u hardly matters against one dominating disturbed sample
+    for k in range(40):
+        x[k + 1] = 0.9 * x[k] + u[k] + (1.0 if k == 5 else 0.0)
+    transient = Transient(np.arange(41) * 0.1, x, u)
+    model = fit(transient, "qp", additive="noise")
+    s = transient.transitions()
+    z, v, increment = np.hstack([s.x, s.u]), float(model.v[0]), (s.x_next - s.x)[:, 0]
+    h = 0.1 * np.abs(z) @ np.concatenate([model.dA[0], model.dB[0]]) + v
+    theta = cp.Variable(2)
+    best = cp.Problem(
+        cp.Minimize(cp.sum_squares(increment - 0.1 * z @ theta)),
+        [cp.abs(increment - 0.1 * z @ theta) <= h * (1 + 1e-9)],
+    )
+    best.solve(cp.CLARABEL, **CLARABEL)
+    ours = np.sum((increment - 0.1 * z @ np.concatenate([model.A[0], model.B[0]])) ** 2)
+    assert ours == pytest.approx(best.value, rel=1e-4)
+
+
+def test_fitted_twice_is_the_same_to_the_bit():
+    transient = drawn(leibov2006(), 500, 3)
+    for criterion in ("qp", "lp"):
+        one, two = fit(transient, criterion), fit(transient, criterion)
+        for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+            assert np.array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_recordings_are_not_joined():
+    """The step from the end of one recording to the start of the next is no transition."""
+    plant = small_plant(31)
+    parts = [drawn(plant, 150, seed) for seed in (1, 2, 3)]
+    parts[1] = Transient(parts[1].t_ns + 10**12, parts[1].x, parts[1].u)
+    model = fit(parts)
+    assert model.fit["transitions"] == sum(int(p.usable.sum()) for p in parts) == 450
+    shifted = [Transient(p.t_ns + 7 * i, p.x, p.u) for i, p in enumerate(parts)]
+    assert fit(shifted).A == pytest.approx(model.A)
+
+
+def test_operating_point_only_changes_units():
+    """Scaling a signal scales its row and column, nothing else."""
+    transient = drawn(small_plant(41), 300, 41, noise=1e-3)
+    X, U = np.array([200.0, 0.01]), np.array([5.0])
+    scaled = Transient(transient.t_ns, transient.x * X + 3.0, transient.u * U - 1.0)
+    point = OperatingPoint(np.full(2, 3.0), np.full(1, -1.0), X, U)
+    for criterion in ("qp", "lp"):
+        plain = fit(transient, criterion, additive="noise")
+        same = fit(scaled, criterion, additive="noise", operating_point=point)
+        assert same.A == pytest.approx(plain.A, rel=1e-4, abs=1e-4)
+        assert np.asarray(same.fit["objective"]) == pytest.approx(np.asarray(plain.fit["objective"]), rel=1e-6)
+        assert same.fit["mean_width_recorded"] == pytest.approx(plain.fit["mean_width"] * X, rel=1e-4)
+
+
+def test_exact_linear_data_gives_the_matrices_and_next_to_no_width():
+    plant = UncertainLTI([[-1.0, 0.5], [0.2, -3.0]], [[1.0], [2.0]], np.zeros((2, 2)), np.zeros((2, 1)))
+    transient = drawn(plant, 200, 0)
+    for criterion in ("qp", "lp"):
+        model = fit(transient, criterion)
+        assert count_outside(model, [transient]) == 0
+        assert model.A == pytest.approx(plant.A, abs=1e-8)
+        assert model.B == pytest.approx(plant.B, abs=1e-8)
+        assert (model.fit["max_width"] < 1e-9).all()
+
+
+def test_domain_and_steps_are_those_of_the_data():
+    transient = drawn(small_plant(51), 100, 51, jitter=0.5)
+    model = fit(transient)
+    s = transient.transitions()
+    assert np.array_equal(model.domain.x_min, s.x.min(axis=0)) and np.array_equal(model.domain.u_max, s.u.max(axis=0))
+    sampling = model.sampling
+    assert (sampling.dt_min, sampling.dt_max, sampling.dt_median) == (s.dt.min(), s.dt.max(), np.median(s.dt))
+    assert not model.domain.outside(s.x, s.u).any()
+
+
+# --- what the user is told ---
+
+
+def test_too_few_transitions():
+    t = drawn(small_plant(1, 3, 2), 4, 1)
+    with pytest.raises(FitError, match="4 usable transitions for 5 unknown"):
+        fit(t)
+
+
+def test_rest_with_a_moving_successor_names_sample_and_remedy():
+    transient = drawn(small_plant(1), 100, 1, rest=0)
+    x, u = transient.x.copy(), transient.u.copy()
+    x[40], u[40], x[60], u[60] = 0.0, 0.0, 0.0, 0.0
+    transient = Transient(transient.t_ns, x, u, name="run.mcap", state_names=["speed", "flow"])
+    with pytest.raises(FitError, match=r"run\.mcap: sample 40 .*'speed'.*--additive noise") as caught:
+        fit(transient)
+    assert "1 other" in str(caught.value)
+    for additive in ADDITIVE[1:]:
+        assert count_outside(fit(transient, additive=additive), [transient]) == 0
+
+
+def test_input_that_never_moves_is_named():
+    raw = drawn(small_plant(1, 2, 2), 200, 1, rest=0)
+    for value, words in ((0.0, "'steering' is 0 in every transition"), (0.7, "'steering' is constant")):
+        u = raw.u.copy()
+        u[:, 1] = value
+        model = fit(
+            Transient(raw.t_ns, raw.x, u, control_names=["throttle", "steering"]),
+            additive="disturbance" if value else "noise",
+        )
+        assert any(words in message for message in model.fit["messages"])
+        assert count_outside(model, [Transient(raw.t_ns, raw.x, u)]) == 0
+        if value == 0.0:
+            assert model.fit["rank"] == 3
+            assert (model.B[:, 1] == 0).all() and (model.dB[:, 1] == 0).all()
+
+
+def test_signals_that_move_together_are_named():
+    raw = drawn(small_plant(1, 2, 2), 200, 1, rest=0)
+    u = np.column_stack([raw.u[:, 0], -2.0 * raw.u[:, 0]])
+    model = fit(Transient(raw.t_ns, raw.x, u, control_names=["left", "right"]), additive="noise")
+    assert any("'left' and 'right' move together" in message for message in model.fit["messages"])
+    assert model.fit["rank"] == 3
+
+
+def test_unstable_nominal_model_is_said():
+    plant = UncertainLTI([[2.0]], [[1.0]], [[0.3]], [[0.1]])
+    model = fit(drawn(plant, 60, 0, rest=0))
+    assert any("unstable" in message for message in model.fit["messages"])
+
+
+def test_noise_near_rest_is_named_with_the_remedy():
+    transient = drawn(small_plant(3), 400, 3, noise=2e-3, rest=150)
+    model = fit(transient)
+    assert any("absurdly wide" in message and "--additive noise" in message for message in model.fit["messages"])
+    better = fit(transient, additive="noise")
+    assert not any("absurdly" in message for message in better.fit["messages"])
+    assert (better.fit["mean_width"] < model.fit["mean_width"]).all()
+
+
+def test_constant_step_gives_the_width_to_noise_and_says_so():
+    transient = drawn(small_plant(3), 200, 3, noise=1e-3)
+    model = fit(transient, additive="both")
+    assert (model.dc == 0).all() and (model.v > 0).any() and (model.c != 0).any()
+    assert any("v takes the width" in message for message in model.fit["messages"])
+    jittered = fit(drawn(small_plant(3), 200, 3, noise=1e-3, jitter=0.5), additive="both")
+    assert not any("v takes the width" in message for message in jittered.fit["messages"])
+
+
+def test_wrong_options_are_refused():
+    transient = drawn(small_plant(1), 50, 1)
+    cases = [
+        (dict(criterion="lq"), "criterion is 'lq'"),
+        (dict(additive="white"), "additive is 'white'"),
+        (dict(method="magic"), "method is 'magic'"),
+        (dict(weights=np.ones(3)), r"weights have shape \(3,\)"),
+        (dict(weights=np.array([1.0, 0.0])), "must be positive"),
+        (dict(weights=np.array([1.0, np.nan])), "not finite"),
+        (dict(weights=np.tile([[1.0, 2.0], [2.0, 1.0]], (50, 1, 1))), "not positive definite"),
+        (dict(weights=np.tile([[1.0, 0.5], [0.0, 1.0]], (50, 1, 1))), "not symmetric"),
+        (dict(weights=[np.ones((49, 2))]), r"must be \(50, 2\)"),
+        (dict(weights="heavy"), "not arrays of numbers"),
+        (dict(operating_point=OperatingPoint.identity(3, 1)), "3 states"),
+    ]
+    for options, words in cases:
+        with pytest.raises(FitError, match=words):
+            fit(transient, **options)
+    with pytest.raises(FitError, match="no transients"):
+        fit([])
+    other = Transient(transient.t_ns, transient.x, transient.u, state_names=["a", "b"])
+    with pytest.raises(FitError, match="read all recordings with one signals file"):
+        fit([transient, other])
+
+
+def test_nothing_usable_is_said():
+    x = np.full((20, 1), np.nan)
+    with pytest.raises(FitError, match="no usable transition among 20 samples"):
+        fit(Transient(np.arange(20) * 0.1, x, np.zeros((20, 1)), name="silent.mcap"))
+
+
+def test_moments_are_plain_sums():
+    transient = drawn(small_plant(61), 200, 61, jitter=0.3)
+    weights = np.random.default_rng(0).uniform(0.5, 2, (200, 2))
+    problem = assemble([transient], OperatingPoint.identity(2, 1), weights, "both")
+    sums = moments(problem)
+    s = transient.transitions()
+    psi = np.column_stack([np.abs(s.x), np.abs(s.u), np.ones(200), 1 / s.dt]) * s.dt[:, None]
+    for i in range(2):
+        assert sums.gram[i] == pytest.approx((psi * weights[:, i, None]).T @ psi)
+    phi = np.column_stack([s.x, s.u, np.ones(200)]) * s.dt[:, None]
+    assert sums.centre == pytest.approx(phi.T @ phi)
+    assert sums.target == pytest.approx(phi.T @ (s.x_next - s.x))
