@@ -9,7 +9,6 @@ import os
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +20,20 @@ DONE, ALARM, BAD_INPUT = 0, 1, 2
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; exit status 0 done, 1 the alarm was raised, 2 bad usage or input."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    command = next((a for a in given if not a.startswith("-")), "")
     try:
+        options = _parser(command).parse_args(given)
         return int(options.run(options))
     except UncertainLTIError as error:
-        print(f"uncertain-lti {options.command}: {error}", file=sys.stderr)
+        print(f"uncertain-lti {command}: {error}", file=sys.stderr)
         return BAD_INPUT
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
         print(
-            f"uncertain-lti {options.command}: the Python package {error.name} is not installed; {extra}",
+            f"uncertain-lti {command}: the Python package {error.name} is not installed; {extra}",
             file=sys.stderr,
         )
         return BAD_INPUT
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except KeyboardInterrupt:
-        print(f"uncertain-lti {options.command}: interrupted; nothing was written", file=sys.stderr)
+        print(f"uncertain-lti {command}: interrupted; nothing was written", file=sys.stderr)
         return BAD_INPUT
 
 
@@ -54,7 +54,8 @@ _EXTRAS = {
 }
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(chosen: str) -> argparse.ArgumentParser:
+    """Arguments of every command; those of the ROS commands, which import rclpy, only of the chosen one."""
     parser = argparse.ArgumentParser(
         prog="uncertain-lti",
         description="Fit an uncertain linear model to recorded transients, and tell when a machine leaves it.",
@@ -106,20 +107,10 @@ def _parser() -> argparse.ArgumentParser:
         ("record", "recorder", "record topics through rclpy"),
         ("demo", "demo", "fit the shipped recording and watch a second one live"),
     ):
-        sub = command(name, None, text)
-        sub.set_defaults(run=_ros(module))
-        if _installed(module):  # --help lists their options; they import rclpy only when they run
+        sub = command(name, _ros(module), text)
+        if name == chosen:
             import_module(f"uncertain_lti_ros.{module}").add_arguments(sub)
-        else:
-            sub.add_argument("rest", nargs="*", help=argparse.SUPPRESS)
     return parser
-
-
-def _installed(module: str) -> bool:
-    try:
-        return find_spec(f"uncertain_lti_ros.{module}") is not None
-    except ModuleNotFoundError:  # core on its own
-        return False
 
 
 def _ros(module: str) -> Any:

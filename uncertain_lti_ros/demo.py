@@ -1,0 +1,181 @@
+"""`uncertain-lti demo`: fit the shipped recording, watch a second one live, and show where it leaves its envelope."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+
+from uncertain_lti import EnvelopeMonitor, fit, read_transients
+from uncertain_lti.errors import BagError, UncertainLTIError
+from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.plots import envelope_figure
+from uncertain_lti.reading import read_for_model
+from uncertain_lti.report import check_data, check_text, fit_text
+from uncertain_lti_ros.process import Life, living
+from uncertain_lti_ros.terminal import say
+
+FIT, CHECK = "leibov_fit.mcap", "leibov_check.mcap"
+_FLAGS = "/envelope_monitor/flags"
+_PATIENCE = 20.0  # s for another process to do its next step
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti demo`."""
+    parser.add_argument("--output", metavar="FOLDER", default="demo-output", help="where model and figure are written")
+    parser.add_argument("--rate", type=float, default=4.0, metavar="R", help="speed of the player (default 4)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the demo; 0 where the live verdicts are those of the offline check and the departure was seen.
+
+    Raises
+    ------
+    UncertainLTIError
+        The recordings are not there, or a node does not answer.
+    """
+    bags = _bags()
+    output = Path(args.output)
+    output.mkdir(parents=True, exist_ok=True)
+    model_file, figure = output / "leibov.model.json", output / "envelope.png"
+
+    print(f"1. Fitting {FIT}: a turbofan drawn anew inside its published intervals at every step (Leibov 2006)")
+    transients = read_transients(bags / FIT, leibov2006().signals)
+    model = fit(transients, "qp")
+    model.save(model_file)
+    print(fit_text(model, transients))
+    print(f"   model: {model_file}")
+
+    print(f"\n2. Playing {CHECK} at {args.rate:g} times real time to a live envelope_monitor node")
+    offline = EnvelopeMonitor(model).check(read_for_model(bags / CHECK, model))
+    with living(lambda: Node("uncertain_lti_demo")) as life:
+        live = _watch(life, model_file, bags / CHECK, args.rate, offline.transient.t_ns)
+
+    print("\n3. The same recording checked offline")
+    print(check_text(check_data(model, offline, samples=False)))
+    expected = offline.flags[offline.judged]
+    same = sum(
+        np.array_equal(flags, live.get(t_ns, ()))
+        for t_ns, flags in zip(offline.transient.t_ns[offline.judged].tolist(), expected, strict=True)
+    )
+    print(f"live and offline verdicts: {same} of {len(expected)} equal")
+    left = offline.transient.t_ns[0] + _departure(bags / CHECK) * 10**9
+    t = float(left - offline.transient.t_ns[0]) * 1e-9
+    after = offline.judged & (offline.transient.t_ns > left)
+    print(
+        f"the plant leaves its intervals at {t:.2f} s: violated in {int((offline.violated & ~after).sum())} of "
+        f"{int((offline.judged & ~after).sum())} verdicts before and {int((offline.violated & after).sum())} of "
+        f"{int(after.sum())} after"
+    )
+    envelope_figure(model, offline, figure, states=["fan_speed"], event=(t, "leaves its intervals"))
+    print(f"figure: {figure}")
+    return 0 if same == len(expected) and offline.violated[after].any() else 2
+
+
+def _bags() -> Path:
+    """Folder of the shipped recordings: in a checkout, or in the share folder of an installation."""
+    roots = [Path(__file__).resolve().parents[1], *(Path(p) / "share/uncertain_lti_ros" for p in _prefixes())]
+    for root in roots:
+        if (root / "bags" / FIT).is_file():
+            return root / "bags"
+    raise BagError(f"bags/{FIT} is not beside the package or in its share folder; run the demo from a checkout")
+
+
+def _prefixes() -> Iterator[str]:
+    yield from os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    yield sys.prefix
+
+
+def _departure(bag: Path) -> float:
+    """Instant of the departure in s after the first state, from the recording's own metadata."""
+    from mcap.reader import make_reader
+
+    with open(bag, "rb") as stream:
+        for record in make_reader(stream).iter_metadata():
+            for key, value in record.metadata.items():
+                if key == "leaves its intervals":
+                    return float(value.split()[0])
+    raise BagError(f"{bag}: its metadata does not say when the plant leaves its intervals; make it with bags/make.py")
+
+
+def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> dict[int, Any]:
+    """Start monitor and player as processes, show the flags as they come; {t_ns: flags}."""
+    flags: dict[int, Any] = {}
+    names: list[str] = []
+
+    def take(message: JointState) -> None:
+        names[:] = message.name
+        stamp = message.header.stamp
+        flags[stamp.sec * 10**9 + stamp.nanosec] = np.array(message.position)
+
+    subscription = life.node.create_subscription(JointState, _FLAGS, take, QoSProfile(depth=1000))
+    monitor = [sys.executable, "-m", "uncertain_lti_ros.envelope_monitor", "--ros-args", "-p", f"model:={model}"]
+    player = [sys.executable, "-m", "uncertain_lti.cli", "play", str(bag), "--rate", str(rate)]
+    with _process([*monitor, "--log-level", "warn"]):
+        _until(life, lambda: life.node.count_publishers(_FLAGS) > 0, "the envelope_monitor node did not start")
+        with _process(player) as playing:
+            shown, silent_since = 0, time.monotonic()
+            while life.alive and len(flags) < len(expected):
+                before = len(flags)
+                life.spin_once(0.1)
+                if len(flags) > before:
+                    silent_since = time.monotonic()
+                elif time.monotonic() - silent_since > _PATIENCE or (
+                    playing.poll() is not None and time.monotonic() - silent_since > 2.0
+                ):
+                    say(f"no more flags after {len(flags)} of {len(expected)}")
+                    break
+                if len(flags) - shown >= 100 or len(flags) == len(expected):
+                    _show(flags, shown, names, int(expected[0]))
+                    shown = len(flags)
+    life.node.destroy_subscription(subscription)
+    return flags
+
+
+def _show(flags: dict[int, Any], since: int, names: list[str], start_ns: int) -> None:
+    """One line for the flags that came since the last one."""
+    stamps = list(flags)[since:]
+    recent = np.array([flags[t] for t in stamps])
+    judged = np.isfinite(recent).all(axis=1)
+    violated = int((recent == 1.0).any(axis=1).sum())
+    where = [f"{n} {int((recent[:, i] == 1.0).sum())}" for i, n in enumerate(names) if (recent[:, i] == 1.0).any()]
+    word = f"VIOLATED {violated}: {', '.join(where)}" if violated else "contained"
+    print(
+        f"   t = {(stamps[0] - start_ns) * 1e-9:6.2f} to {(stamps[-1] - start_ns) * 1e-9:6.2f} s: "
+        f"{int(judged.sum())} verdicts, {word}",
+        flush=True,
+    )
+
+
+@contextlib.contextmanager
+def _process(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that ends with the block, also when that fails."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _until(life: Life, done: Any, otherwise: str) -> None:
+    limit = time.monotonic() + _PATIENCE
+    while not done():
+        if not life.alive or time.monotonic() > limit:
+            raise UncertainLTIError(f"{otherwise} within {_PATIENCE:g} s; look at its messages above")
+        life.spin_once(0.1)
