@@ -100,7 +100,8 @@ def definition(type_name: str) -> str:
             if "/" in element:
                 waiting.append(full_name(element))
             written = {"boolean": "bool", "octet": "byte"}.get(element, _NUMBERS.get(element, element))
-            lines.append(f"{re.sub(r'<([0-9]+)>', r'<=\1', written)}{array} {field}\n")
+            written = re.sub(r"<(\d+)>", r"<=\1", written)  # a bounded string
+            lines.append(f"{written}{array} {field}\n")
         bodies[name] = "".join(lines)
     first, *others = bodies.items()
     parts = [first[1]]

@@ -28,10 +28,10 @@ class Wish:
     durability: DurabilityPolicy | None = None
 
 
-def choose_qos(offers: Iterable[QoSProfile], wish: Wish, received: bool = False) -> QoSProfile:
+def choose_qos(offers: Iterable[QoSProfile], wish: Wish, history: bool = True) -> QoSProfile:
     """Reliable only if every publisher is, transient local only if every publisher is; without any, reliable, volatile.
 
-    received: messages have come through already; then history is no longer asked for, it would repeat them.
+    history: whether messages sent before may still be asked for; where some have come, that would repeat them.
     """
     offers = list(offers)
     reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
@@ -41,7 +41,7 @@ def choose_qos(offers: Iterable[QoSProfile], wish: Wish, received: bool = False)
         depth=wish.depth,
         reliability=wish.reliability or (ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
         durability=wish.durability
-        or (DurabilityPolicy.TRANSIENT_LOCAL if lasting and not received else DurabilityPolicy.VOLATILE),
+        or (DurabilityPolicy.TRANSIENT_LOCAL if lasting and history else DurabilityPolicy.VOLATILE),
     )
 
 
@@ -114,7 +114,8 @@ class MatchedSubscription:
         if self._subscription is None:
             self._subscribe(choose_qos(offers, self._wish))
         elif offers:  # when the last publisher leaves, the next one is likely to offer the same
-            qos = choose_qos(offers, self._wish, received=self.received > 0)
+            lasting = self._qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            qos = choose_qos(offers, self._wish, history=lasting or not self.received)
             if (qos.reliability, qos.durability) != (self._qos.reliability, self._qos.durability):
                 self._node.destroy_subscription(self._subscription)
                 self._subscribe(qos)

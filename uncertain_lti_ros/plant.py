@@ -1,0 +1,102 @@
+"""`plant`: the published engine as a node, drawn anew inside its intervals at each step."""
+
+from __future__ import annotations
+
+import time
+
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+
+from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
+from uncertain_lti_ros.process import Life, living
+
+_SETTLE = 0.5  # s from the first subscriber on, for the others to come
+
+
+class Plant(Node):
+    """Publishes state and control as JointState (`position` means value), both of sample k with the stamp t_k."""
+
+    def __init__(self) -> None:
+        super().__init__("plant")
+
+        def integer(name: str, default: int, low: int, text: str) -> int:
+            bounds = [IntegerRange(from_value=low, to_value=10**9, step=0)]
+            descriptor = ParameterDescriptor(description=text, read_only=True, integer_range=bounds)
+            return int(self.declare_parameter(name, default, descriptor).value)
+
+        def real(name: str, default: float, low: float, text: str) -> float:
+            bounds = [FloatingPointRange(from_value=low, to_value=1e9, step=0.0)]
+            descriptor = ParameterDescriptor(description=text, read_only=True, floating_point_range=bounds)
+            return float(self.declare_parameter(name, default, descriptor).value)
+
+        self.steps = integer("steps", 1200, 2, "Samples to publish.")
+        self.seed = integer("seed", 1, 0, "Seed of the pulses and of the draws.")
+        self.fault_at = integer(
+            "fault_at", -1, -1, "Sample from which on the matrices leave their intervals; -1: never."
+        )
+        self.rate = real("rate", 1.0, 1e-3, "Speed of publication; stamps are 0.025 s apart at any rate.")
+        self.wait = real("wait", 30.0, 0.0, "Time to wait for subscribers of both topics, s.")
+        qos = QoSProfile(depth=1000)
+        self.state = self.create_publisher(JointState, STATE_TOPIC, qos)
+        self.control = self.create_publisher(JointState, CONTROL_TOPIC, qos)
+
+
+def run(life: Life) -> int:
+    """Wait for subscribers, publish one transient, wait until it has been received."""
+    node = life.node
+    assert isinstance(node, Plant)
+    publishers = (node.state, node.control)
+    if not _subscribed(life, publishers, node.wait):
+        if life.alive:
+            node.get_logger().error(f"no subscriber of both topics within {node.wait:g} s; start one first")
+        return 2
+    run = transient(
+        node.steps,
+        node.seed,
+        None if node.fault_at < 0 else node.fault_at,
+        start_ns=node.get_clock().now().nanoseconds,
+    )
+    node.get_logger().info(f"publishing {run}")
+    began = time.monotonic()
+    for k, t_ns in enumerate(run.t_ns.tolist()):
+        due = began + (t_ns - int(run.t_ns[0])) * 1e-9 / node.rate
+        while life.alive and (rest := due - time.monotonic()) > 0:
+            life.spin_once(rest)
+        if not life.alive:
+            return 0
+        sides = zip(publishers, (run.state_names, run.control_names), (run.x, run.u), strict=True)
+        for publisher, names, values in sides:
+            publishers, (run.state_names, run.control_names), (run.x, run.u), strict=True
+        ):
+            message = JointState(name=names, position=values[k])
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 10**9)
+            publisher.publish(message)
+    for publisher in publishers:
+        publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=10.0))
+    node.get_logger().info(f"published {len(run)} samples")
+    return 0
+
+
+def _subscribed(life: Life, publishers: tuple[Publisher, ...], limit: float) -> bool:
+    began = time.monotonic()
+    since: float | None = None
+    while life.alive:
+        now = time.monotonic()
+        if all(publisher.get_subscription_count() for publisher in publishers):
+            since = since or now
+            if now - since >= _SETTLE:
+                return True
+        elif now - began > limit:
+            return False
+        life.spin_once(0.05)
+    return False
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until its transient is over."""
+    with living(Plant, args) as life:
+        return run(life)

@@ -1,0 +1,312 @@
+"""`uncertain-lti play`: the messages of a recording, as they are, back to their topics."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+from rclpy.client import Client
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from uncertain_lti.bag import Bag, RawMessage
+from uncertain_lti.errors import BagError, SignalError, UncertainLTIError
+from uncertain_lti.signals import TypeFields
+from uncertain_lti_ros.messages import live_fields, message_class
+from uncertain_lti_ros.process import Life, living
+from uncertain_lti_ros.terminal import Progress, say, seconds
+
+CLOCK = "/clock"
+_DEPTH = 1000
+_CROWD = 2000.0
+"""Messages a second up to which a subscriber keeps up; faster only where the recording itself is faster."""
+_SETTLE = 0.5  # s without a new subscriber
+_ACKNOWLEDGED = 10.0  # s to wait at the end until everything sent has been received
+_LOCKSTEP_TIMEOUT = 10.0  # s
+_REPEAT = 0.1  # s after which /clock, which is best effort, is sent again
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti play`."""
+    parser.add_argument("bag", metavar="BAG", help="recording (MCAP file, or folder of a split one)")
+    parser.add_argument("--rate", type=_rate, metavar="R", help="speed, times real time (default 1)")
+    parser.add_argument("--clock", action="store_true", help="publish /clock (log time) before each message")
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play these only (default: all)")
+    parser.add_argument(
+        "--wait", type=seconds, default=10.0, metavar="S", help="wait this long for subscribers (default 10 s)"
+    )
+    parser.add_argument(
+        "--lockstep", metavar="NODE",
+        help="wait after each message until this envelope_monitor has taken it; as fast as it can, and exact also "
+        "where log time is the clock (then with --clock, and the node with use_sim_time)",
+    )  # fmt: skip
+
+
+@dataclass
+class _Played:
+    """A topic that can be played."""
+
+    topic: str
+    count: int
+    publisher: Publisher
+    sent: int = field(default=0)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play to the end, or until SIGINT or SIGTERM.
+
+    Raises
+    ------
+    BagError
+        The recording or a topic is not there, or nothing in it can be played.
+    UncertainLTIError
+        The node of --lockstep is not there or does not take a message.
+    """
+    if args.lockstep and args.rate is not None:
+        raise UncertainLTIError("--lockstep goes as fast as the node takes messages; leave out --rate")
+    bag = Bag(args.bag)
+    with living(lambda: Node(f"uncertain_lti_player_{os.getpid()}")) as life:
+        played = _offer(life.node, bag, args.topics, args.clock)
+        clock = life.node.create_publisher(Clock, CLOCK, QoSProfile(depth=_DEPTH)) if args.clock else None
+        for warning in bag.warnings:
+            say(warning)
+        _wait(life, played, args.wait)
+        messages = (m for m in bag.raw_messages(list(played)) if m.channel.counted)
+        began = time.monotonic()
+        if args.lockstep:
+            _lockstep(life, played, clock, args.lockstep, messages, args.wait)
+        else:
+            _paced(life, played, clock, args.rate or 1.0, messages, _crowd(bag, played))
+        took = time.monotonic() - began
+        missed = [
+            p.topic
+            for p in played.values()
+            if life.alive and not p.publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED))
+        ]
+        if missed:
+            say(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
+    sent = sum(p.sent for p in played.values())
+    print(f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s")
+    return 0
+
+
+def _offer(node: Node, bag: Bag, topics: list[str] | None, clock: bool) -> dict[str, _Played]:
+    """Publishers of what can be played; says of each other topic why it cannot."""
+    asked = list(bag.topics) if topics is None else list(dict.fromkeys(topics))
+    for topic in asked:
+        if topic not in bag.topics:
+            raise BagError(f"{bag.path}: there is no topic {topic}; topics there: {', '.join(bag.topics) or 'none'}")
+    played: dict[str, _Played] = {}
+    for topic in asked:
+        info = bag.topics[topic]
+        try:
+            if clock and topic == CLOCK:
+                raise SignalError("--clock makes its own")
+            if not info.readable:
+                raise SignalError(info.reason)
+            kind = message_class(info.type)
+            _hold_layout(info.type, bag.type_fields(topic), live_fields)
+        except SignalError as error:
+            say(f"{topic} is not played: {error}")
+            continue
+        qos = QoSProfile(depth=_DEPTH, durability=_durability(bag, topic))
+        publisher = node.create_publisher(kind, topic, qos)
+        played[topic] = _Played(topic, info.count, publisher)
+    if not played:
+        raise BagError(f"{bag.path}: no topic of it can be played here; the lines above say why")
+    return played
+
+
+def _hold_layout(type_name: str, recorded: TypeFields, installed: TypeFields) -> None:
+    """Raise SignalError where recorded bytes would be read wrongly by the type that is installed."""
+    waiting, seen = [type_name], set()
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        layouts = []
+        for fields in (recorded(name), installed(name)):
+            layouts.append(
+                [(n.rstrip("_"), f.kind, f.array, "" if f.kind == "string" else f.type_name) for n, f in fields.items()]
+            )
+            waiting += [f.type_name for f in fields.values() if f.kind == "message"]
+        same = [[(n, k, a, "uint8" if t == "char" else t) for n, k, a, t in layout] for layout in layouts]
+        if same[0] != same[1]:
+            raise SignalError(f"{name} was recorded in another version than is installed; install the recorded one")
+
+
+def _durability(bag: Bag, topic: str) -> DurabilityPolicy:
+    """Transient local where every publisher was, as the recorder wrote down."""
+    first = next((message for message in bag.raw_messages([topic]) if message.channel.counted), None)
+    try:
+        offered = yaml.safe_load(first.channel.metadata.get("offered_qos_profiles") or "[]") if first else []
+        lasting = bool(offered) and all(o["durability"] in (1, "transient_local") for o in offered)
+    except (yaml.YAMLError, TypeError, LookupError):  # notes of some recorder; nothing else depends on them
+        lasting = False
+    return DurabilityPolicy.TRANSIENT_LOCAL if lasting else DurabilityPolicy.VOLATILE
+
+
+def _crowd(bag: Bag, played: dict[str, _Played]) -> float:
+    """Messages a second that are sent at most while catching up."""
+    infos = [info for topic in played if (info := bag.topics[topic]).first is not None]
+    span = max((i.last or 0 for i in infos), default=0) - min((i.first or 0 for i in infos), default=0)
+    count = sum(i.count for i in infos)
+    return max(_CROWD, 1.5 * count / (span * 1e-9)) if span > 1e9 else _CROWD
+
+
+def _wait(life: Life, played: dict[str, _Played], limit: float) -> None:
+    """Wait until every subscription that the graph shows is connected, and no new one has come for a while."""
+    began = changed = time.monotonic()
+    connected: dict[str, int] = {}
+    while life.alive:
+        now = time.monotonic()
+        counts = {p.topic: p.publisher.get_subscription_count() for p in played.values()}
+        wanted = {p.topic: life.node.count_subscribers(p.topic) for p in played.values()}
+        if counts != connected:
+            connected, changed = counts, now
+        if any(counts.values()) and counts == wanted and now - changed >= _SETTLE:
+            return
+        if now - began > limit:
+            break
+        life.spin_once(0.05)
+    unmet = [t for t in played if wanted[t] > counts[t]]
+    if not any(wanted.values()):
+        say(f"nobody subscribes to {', '.join(played)} after {limit:g} s; playing all the same")
+    elif unmet:
+        say(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing all the same")
+
+
+def _paced(
+    life: Life, played: dict[str, _Played], clock: Publisher | None, rate: float, messages: Iterator[RawMessage],
+    crowd: float,
+) -> None:  # fmt: skip
+    progress, total, sent = Progress(), sum(p.count for p in played.values()), 0
+    began = last = time.monotonic()
+    first: int | None = None
+    behind = 0.0
+    for message in messages:
+        if first is None:
+            first = message.log_time_ns
+        due = began + (message.log_time_ns - first) * 1e-9 / rate
+        at = max(due, last + 1.0 / crowd)
+        while life.alive and (rest := at - time.monotonic()) > 0:
+            time.sleep(min(rest, 0.1))
+        if not life.alive:
+            return
+        last = time.monotonic()
+        behind = max(behind, last - due)
+        if clock is not None:
+            clock.publish(_clock(message.log_time_ns))
+        _send(played, message)
+        sent += 1
+        progress.show(f"{sent} of {total} messages")
+    progress.clear()
+    if behind > 1.0:
+        say(f"fell behind the asked rate by up to {behind:.1f} s, to keep messages at least {1e3 / crowd:.2g} ms apart")
+
+
+def _send(played: dict[str, _Played], message: RawMessage) -> None:
+    topic = played[message.topic]
+    topic.publisher.publish(message.data)
+    topic.sent += 1
+
+
+def _clock(t_ns: int) -> Clock:
+    message = Clock()
+    message.clock.sec, message.clock.nanosec = divmod(t_ns, 10**9)
+    return message
+
+
+def _lockstep(
+    life: Life, played: dict[str, _Played], clock: Publisher | None, node: str, messages: Iterator[RawMessage],
+    wait: float,
+) -> None:  # fmt: skip
+    follower = _Follower(life, f"{node if node.startswith('/') else '/' + node}/status", wait)
+    if clock is not None and not follower.status.get("use_sim_time", True):
+        raise UncertainLTIError(
+            f"{node}: does not follow /clock; start it with -p use_sim_time:=true, or leave out --clock"
+        )
+    progress, total = Progress(), sum(p.count for p in played.values())
+    for sent, message in enumerate(messages, start=1):
+        if clock is not None:
+            follower.reach(clock, message.log_time_ns)
+        if not life.alive:
+            return
+        topic = played[message.topic].publisher.topic_name
+        before = follower.received(topic)
+        _send(played, message)
+        follower.take(topic, before, sent)
+        progress.show(f"{sent} of {total} messages")
+    progress.clear()
+
+
+class _Follower:
+    """The envelope_monitor that playing waits for, seen through its status service."""
+
+    def __init__(self, life: Life, name: str, wait: float) -> None:
+        self._life, self._name = life, name
+        self._client: Client = life.node.create_client(Trigger, name)
+        self.status: dict[str, Any] = {}
+        began = time.monotonic()
+        while life.alive and not self._client.service_is_ready():
+            if time.monotonic() - began > wait:
+                raise UncertainLTIError(f"{name}: no such service after {wait:g} s; start the monitor, or name it so")
+            life.spin_once(0.05)
+        self._ask()
+
+    def received(self, topic: str) -> int | None:
+        """Messages it has taken from a topic; None where it does not listen."""
+        count: int | None = self.status.get("received", {}).get(topic)
+        return count
+
+    def reach(self, clock: Publisher, at_ns: int) -> None:
+        """Publish /clock until its node time is this."""
+        tick = _clock(at_ns)
+        clock.publish(tick)
+        began = repeated = time.monotonic()
+        while self._life.alive and self._ask().get("now_ns") != at_ns:
+            now = time.monotonic()
+            if now - repeated > _REPEAT:
+                clock.publish(tick)
+                repeated = now
+            self._give_up(began, f"{CLOCK} at {at_ns} ns")
+
+    def take(self, topic: str, before: int | None, number: int) -> None:
+        """Wait until it has taken one more message from a topic, if it listens."""
+        began = time.monotonic()
+        while before is not None and self._life.alive and (self._ask() and self.received(topic)) == before:
+            self._give_up(began, f"message {number}, on {topic},")
+
+    def _give_up(self, began: float, what: str) -> None:
+        if time.monotonic() - began > _LOCKSTEP_TIMEOUT:
+            raise UncertainLTIError(
+                f"{self._name}: {what} was not taken within {_LOCKSTEP_TIMEOUT:g} s; is the monitor active, and does "
+                f"nobody else publish on its topics?"
+            )
+
+    def _ask(self) -> dict[str, Any]:
+        future = self._client.call_async(Trigger.Request())
+        began = time.monotonic()
+        while self._life.alive and not future.done():
+            self._life.spin_once()
+            self._give_up(began, "a request for its status")
+        self.status = json.loads(future.result().message) if future.done() else {}
+        return self.status
+
+
+def _rate(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise ValueError(text)
+    return value

@@ -1,0 +1,212 @@
+"""`uncertain-lti record`: topics, as they are published, to an MCAP file."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import yaml
+from mcap.writer import CompressionType, Writer
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from uncertain_lti.errors import BagError
+from uncertain_lti_ros.messages import definition, message_class
+from uncertain_lti_ros.process import Life, living
+from uncertain_lti_ros.subscriptions import MatchedSubscription
+from uncertain_lti_ros.terminal import Progress, say, seconds
+
+_FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
+_LOOK = 0.5  # s between two looks at the graph
+_CHUNK = 1 << 20  # bytes
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti record`."""
+    parser.add_argument("topics", nargs="+", metavar="TOPIC", help="topic to record; waited for until it is there")
+    parser.add_argument("--output", "-o", required=True, metavar="BAG", help="MCAP file to write; must not exist yet")
+    parser.add_argument("--duration", type=seconds, metavar="S", help="stop S seconds after the first message")
+    parser.add_argument("--wait", type=seconds, metavar="S", help="give up when a topic is not there after S seconds")
+    parser.add_argument(
+        "--note", action="append", default=[], type=_note, metavar="NAME=TEXT",
+        help="write this to the file as well, in a metadata record; may be given several times",
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Record until SIGINT, SIGTERM or the end of the duration; the file is whole or not there.
+
+    While recording it is called BAG.part, with all but the last seconds readable.
+
+    Raises
+    ------
+    BagError
+        The output exists or cannot be written, a topic never came, or nothing was recorded.
+    SignalError
+        The message type of a topic is not installed.
+    """
+    output = Path(args.output)
+    if output.suffix != ".mcap":
+        output = output.with_name(f"{output.name}.mcap")
+    with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
+        topics = list(dict.fromkeys(life.node.resolve_topic_name(topic) for topic in args.topics))
+        types = _wait_for(life, topics, args.wait)
+        subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics if topic in types]
+        if subscriptions:
+            print(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C", flush=True)
+            _record(life, subscriptions, file, args.duration)
+        if not file.count:
+            raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
+    lost = sum(subscription.lost for subscription in subscriptions)
+    print(
+        f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s"
+        + (f", {lost} lost on the way" if lost else "")
+    )
+    return 0
+
+
+def _wait_for(life: Life, topics: list[str], limit: float | None) -> dict[str, str]:
+    """Type of each topic, as soon as all are there; {} when a signal came first."""
+    began, told = time.monotonic(), False
+    while life.alive:
+        there = dict(life.node.get_topic_names_and_types())
+        missing = [topic for topic in topics if topic not in there]
+        for topic in topics:
+            if len(there.get(topic, ())) > 1:
+                raise BagError(f"{topic}: is published as {' and '.join(there[topic])}; record one type at a time")
+        if not missing:
+            return {topic: there[topic][0] for topic in topics}
+        waited = time.monotonic() - began
+        if limit is not None and waited > limit:
+            raise BagError(f"{', '.join(missing)}: not there after {limit:g} s; start what publishes it")
+        if waited > 1.0 and not told:
+            say(f"waiting for {', '.join(missing)}")
+            told = True
+        life.spin_once()
+    return {}
+
+
+def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSubscription:
+    clock = node.get_clock()
+    kind = message_class(type_name)
+    channel = file.channel(topic, type_name, [info.qos_profile for info in node.get_publishers_info_by_topic(topic)])
+    return MatchedSubscription(
+        node, topic, type_name, kind, lambda data: file.write(channel, clock.now().nanoseconds, data), raw=True
+    )
+
+
+def _record(life: Life, subscriptions: list[MatchedSubscription], file: _File, duration: float | None) -> None:
+    progress = Progress()
+    looked = flushed = time.monotonic()
+    while life.alive:
+        now = time.monotonic()
+        if now - looked > _LOOK or any(s.look_soon for s in subscriptions):
+            looked = now
+            for subscription in subscriptions:
+                subscription.look()
+        if now - flushed > _FLUSH:
+            flushed = now
+            file.flush()
+        if duration is not None and file.began is not None and now - file.began >= duration:
+            break
+        progress.show(f"{file.count} messages, {file.span:.1f} s")
+        life.spin_once(0.05)
+    progress.clear()
+
+
+class _File:
+    """MCAP file that bears its name only once it is whole."""
+
+    def __init__(self, path: Path, notes: dict[str, str]) -> None:
+        self.path, self._notes = path, notes
+        self._part = path.with_name(f"{path.name}.part")
+        self.count = 0
+        self.began: float | None = None
+        self._first = self._last = 0
+
+    def __enter__(self) -> _File:
+        for path in (self.path, self._part):
+            if path.exists():
+                raise BagError(f"{path}: is there already; choose another output or move it away")
+        try:
+            self._stream: BinaryIO = open(self._part, "xb")
+        except OSError as error:
+            raise BagError(f"{self._part}: cannot be written: {error.strerror}; choose another output") from None
+        self._writer = Writer(self._stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        self._writer.start(profile="ros2", library="uncertain-lti")
+        if self._notes:
+            self._writer.add_metadata("uncertain_lti", self._notes)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        try:
+            if self.count:
+                self._writer.finish()
+                self._stream.flush()
+                os.fsync(self._stream.fileno())
+            self._stream.close()
+            if self.count:
+                os.replace(self._part, self.path)
+            else:
+                self._part.unlink()
+        except OSError as error:
+            raise BagError(f"{self._part}: cannot be finished: {error.strerror}; what is in it can be read") from None
+
+    @property
+    def span(self) -> float:
+        """Log time from the first to the last message, s."""
+        return (self._last - self._first) * 1e-9
+
+    def channel(self, topic: str, type_name: str, offered: list[QoSProfile]) -> int:
+        schema = self._writer.register_schema(type_name, "ros2msg", definition(type_name).encode())
+        metadata = {"offered_qos_profiles": _qos_text(offered)}
+        return int(self._writer.register_channel(topic, "cdr", schema, metadata))
+
+    def write(self, channel: int, log_time: int, data: bytes) -> None:
+        if self.began is None:
+            self.began, self._first = time.monotonic(), log_time
+        self._last = max(log_time, self._last)  # a clock that is set back must not reorder what was received
+        try:
+            self._writer.add_message(channel, self._last, bytes(data), self._last, self.count)
+        except OSError as error:
+            raise BagError(f"{self._part}: cannot be written: {error.strerror}; make room") from None
+        self.count += 1
+
+    def flush(self) -> None:
+        try:
+            self._writer.flush()
+        except OSError as error:
+            raise BagError(f"{self._part}: cannot be written: {error.strerror}; make room") from None
+
+
+def _qos_text(profiles: list[QoSProfile]) -> str:
+    """As rosbag2 writes it since version 9 of its metadata."""
+
+    def duration(value: Any) -> dict[str, int]:
+        return dict(zip(("sec", "nsec"), divmod(value.nanoseconds, 10**9), strict=True))
+
+    listed = [
+        {
+            "history": profile.history.name.lower(),
+            "depth": profile.depth,
+            "reliability": profile.reliability.name.lower(),
+            "durability": profile.durability.name.lower(),
+            "deadline": duration(profile.deadline),
+            "lifespan": duration(profile.lifespan),
+            "liveliness": profile.liveliness.name.lower(),
+            "liveliness_lease_duration": duration(profile.liveliness_lease_duration),
+            "avoid_ros_namespace_conventions": profile.avoid_ros_namespace_conventions,
+        }
+        for profile in profiles
+    ]
+    return str(yaml.safe_dump(listed, sort_keys=False)) if listed else ""
+
+
+def _note(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f"{text!r} does not read NAME=TEXT")
+    return name, value
