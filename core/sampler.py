@@ -76,12 +76,13 @@ class _Message:
 class _Topic:
     """Messages of one topic that may still be chosen, and how far it got."""
 
-    __slots__ = ("header", "kept", "last_stamp", "chosen", "unwrap", "previous", "steady")
+    __slots__ = ("header", "kept", "last_stamp", "chosen", "unwrap", "previous", "steady", "ahead")
 
     def __init__(self, header: bool, unwrap: list[int], steady: list[float]) -> None:
         self.header = header
         self.kept: deque[_Message] = deque(maxlen=BUFFERED_MESSAGES)
         self.last_stamp: int | None = None
+        self.ahead = False  # its time has stepped back, the clock's has not yet
         self.chosen: _Message | None = None
         self.unwrap = unwrap
         self.steady = steady
@@ -183,8 +184,9 @@ class Sampler:
                 state.kept.clear()  # a looped bag: what was kept belongs to the end of the last pass
                 state.chosen = None
                 state.previous = list(state.steady)
+                state.ahead = True
             state.last_stamp = message.stamp
-            if self._closed is not None and self._came_late(state, message):
+            if self._closed is not None and not state.ahead and self._came_late(state, message):
                 self.counters[f"late {topic}"] += 1
         state.unwrapped(message.values)
         state.kept.append(message)
@@ -224,6 +226,10 @@ class Sampler:
             self._closed, self._before = closing, z
         if status.opens_segment:
             self._history = {}
+        if status is Status.RESET:
+            self._closed = None  # nothing of this pass can be late for a sample of the one before
+            for other in self._topics.values():
+                other.ahead = False
         if self._one_topic:
             x_next = np.full(self._n, math.nan)
             for i, value in zip(self._where[self.clock], message.values, strict=True):
