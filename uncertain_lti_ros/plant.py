@@ -70,8 +70,6 @@ def run(life: Life) -> int:
             return 0
         sides = zip(publishers, (run.state_names, run.control_names), (run.x, run.u), strict=True)
         for publisher, names, values in sides:
-            publishers, (run.state_names, run.control_names), (run.x, run.u), strict=True
-        ):
             message = JointState(name=names, position=values[k])
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 10**9)
             publisher.publish(message)
