@@ -527,6 +527,8 @@ class UncertainLTI:
                 if getattr(signal, key) == "auto":
                     raise ModelError(f"{key} of '{signal.name}' is auto; a model file holds numbers")
         n, m = len(signals.states), len(signals.controls)
+        _array(data["A"], "A", (n, n))  # against the names, before A says how many rows the others have
+        _array(data["B"], "B", (n, m))
         domain = None
         if "domain" in data:
             box = _object(data["domain"], "domain")

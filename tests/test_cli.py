@@ -1,0 +1,239 @@
+"""The commands: what they print, what they return, and one sentence for bad input."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_writer import Message, Topic, cdr, header, write
+
+from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
+from uncertain_lti.cli import main
+from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
+
+SIGNALS = """
+states:
+  - {name: fan, topic: /engine/state, field: "position[fan_speed]"}
+  - {name: core, topic: /engine/state, field: "position[compressor_speed]"}
+controls:
+  - {name: fuel, topic: /engine/control, field: "position[main_fuel_flow]"}
+  - {name: area, topic: /engine/control, field: "position[nozzle_throat_area]"}
+"""
+
+
+def joint_state(names, values, stamp_ns):
+    empty = np.empty(0)
+    return cdr(
+        "sensor_msgs/msg/JointState",
+        header=header(stamp_ns),
+        name=list(names),
+        position=np.array(values),
+        velocity=empty,
+        effort=empty,
+    )
+
+
+def engine_bag(path, steps=300, seed=1, change=lambda k, x: x, **run):
+    """A run of the published engine as a bag, state before control at every instant."""
+    plant = transient(steps, seed, start_ns=10**18, **run)
+    messages = []
+    for k, t in enumerate(plant.t_ns.tolist()):
+        x = change(k, plant.x[k])
+        messages.append(Message(STATE_TOPIC, t, joint_state(plant.state_names, x, t), t))
+        messages.append(Message(CONTROL_TOPIC, t, joint_state(plant.control_names, plant.u[k], t), t))
+    topics = [Topic(STATE_TOPIC, "sensor_msgs/msg/JointState"), Topic(CONTROL_TOPIC, "sensor_msgs/msg/JointState")]
+    return write(topics, messages).save(path)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "signals.yaml").write_text(SIGNALS)
+    engine_bag(tmp_path / "run.mcap")
+    return tmp_path
+
+
+def fitted(folder, *more, bags=("run.mcap",)):
+    arguments = ["fit", *(str(folder / b) for b in bags), "--signals", str(folder / "signals.yaml")]
+    return main([*arguments, "--output", str(folder / "m.model.json"), *more])
+
+
+def refused(capsys, arguments):
+    """Status 2 and one sentence on standard error, no traceback, nothing on standard output."""
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1 and "Traceback" not in said.err, said.err
+    return said.err
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_fit_then_check_the_same_recording(folder, capsys, criterion):
+    assert fitted(folder, "--criterion", criterion, "--additive", "noise") == 0
+    printed = capsys.readouterr().out
+    assert "0 outside" in printed and "fan" in printed and "m.model.json" in printed
+    assert main(["check", str(folder / "m.model.json"), str(folder / "run.mcap")]) == 0
+    assert "100.000% inside all bounds" in capsys.readouterr().out
+    assert main(["info", str(folder / "m.model.json")]) == 0
+    assert "position[fan_speed]" in capsys.readouterr().out
+
+
+def test_fit_says_what_it_used(folder, capsys):
+    assert fitted(folder, "--additive", "noise", "--json") == 0
+    printed = json.loads(capsys.readouterr().out)
+    model = UncertainLTI.load(folder / "m.model.json")
+    assert printed["fit"] == model.to_dict()["fit"]
+    (source,) = model.fit["sources"]
+    assert source["file"].endswith("run.mcap") and len(source["sha256"]) == 64
+    assert model.fit["transitions"] == 299 and model.fit["violations"] == 0
+    assert model.sampling.clock == STATE_TOPIC and model.signals.states[0].type == "sensor_msgs/msg/JointState"
+
+
+def test_check_tells_when_and_how_long(folder, capsys):
+    """A sensor that jumps for three samples: two transitions of the jump and nothing else."""
+    assert fitted(folder, "--additive", "noise") == 0
+    bad = engine_bag(folder / "bad.mcap", change=lambda k, x: x + (5.0 if 100 <= k < 103 else 0.0) * np.eye(5)[0])
+    capsys.readouterr()
+    assert main(["check", str(folder / "m.model.json"), str(bad), "--json"]) == 1
+    (result,) = json.loads(capsys.readouterr().out)["recordings"]
+    fan = result["states"]["fan"]
+    assert fan["first_violation"]["k"] == 100 and fan["first_violation"]["t"] == pytest.approx(2.5)
+    assert fan["first_violation"]["t_ns"] == 10**18 + 2_500_000_000
+    flags = np.array([s["flags"] for s in result["verdict_per_sample"]], dtype=float)
+    assert np.isnan(flags[0]).all() and flags.shape == (300, 2)
+    assert flags[100, 0] == 1 and flags[103, 0] == 1 and np.nansum(flags[:100]) == 0
+    assert fan["violations"] == np.nansum(flags[:, 0])
+    assert result["alarm"] and result["alarms"][0]["k"] == 100
+    assert main(["check", str(folder / "m.model.json"), str(bad)]) == 1
+    assert "ALARM" in capsys.readouterr().out
+    # an alarm rule of the command line in place of the model's: 250 of 250 never comes true
+    rule = ["--violations", "250", "--window", "250"]
+    assert main(["check", str(folder / "m.model.json"), str(bad), *rule]) == 0
+
+
+def test_commands_say_what_the_library_says(folder, capsys):
+    from uncertain_lti import read_transients
+
+    transients = read_transients(folder / "run.mcap", folder / "signals.yaml")
+    model = fit(transients, additive="noise")
+    assert fitted(folder, "--additive", "noise") == 0
+    same = UncertainLTI.load(folder / "m.model.json")
+    assert np.array_equal(same.A, model.A) and np.array_equal(same.dB, model.dB)
+    capsys.readouterr()
+    assert main(["check", str(folder / "m.model.json"), str(folder / "run.mcap"), "--json"]) == 0
+    (result,) = json.loads(capsys.readouterr().out)["recordings"]
+    verdicts = EnvelopeMonitor(model).check(transients[0])
+    for k, said in enumerate(result["verdict_per_sample"][1:], start=1):
+        assert said["lower"] == verdicts.lower[k].tolist() and said["flags"] == verdicts.flags[k].tolist()
+
+
+def test_topics(folder, capsys):
+    assert main(["topics", str(folder / "run.mcap")]) == 0
+    printed = capsys.readouterr().out
+    assert "/engine/state" in printed and "position[fan_speed]" in printed and "usable" in printed
+    assert main(["topics", str(folder / "run.mcap"), "--json"]) == 0
+    topics = {t["topic"]: t for t in json.loads(capsys.readouterr().out)["topics"]}
+    assert topics[STATE_TOPIC]["count"] == 300 and topics[STATE_TOPIC]["rate"] == pytest.approx(40.0)
+
+
+def test_several_recordings_are_separate_transients(folder, capsys):
+    engine_bag(folder / "second.mcap", steps=120, seed=2)
+    assert fitted(folder, "--additive", "noise", bags=("run.mcap", "second.mcap")) == 0
+    model = UncertainLTI.load(folder / "m.model.json")
+    assert model.fit["transients"] == 2 and model.fit["transitions"] == 299 + 119
+    capsys.readouterr()
+    assert main(["check", str(folder / "m.model.json"), str(folder / "run.mcap"), str(folder / "second.mcap")]) == 0
+    assert capsys.readouterr().out.count("100.000% inside") == 2
+
+
+# --- bad input ---
+
+
+def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
+    run, signals, out = str(folder / "run.mcap"), str(folder / "signals.yaml"), str(folder / "m.model.json")
+
+    def fit_with(text):
+        other = folder / f"signals{len(list(folder.iterdir()))}.yaml"
+        other.write_text(text)
+        return ["fit", run, "--signals", str(other), "--output", out, "--additive", "noise"]
+
+    empty, lfs, text = folder / "empty.mcap", folder / "lfs.mcap", folder / "text.mcap"
+    empty.write_bytes(b"")
+    lfs.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    text.write_text("not a bag")
+    cases = [
+        (["check", out, run], "no such model file"),
+        (["fit", str(folder / "nope.mcap"), "--signals", signals, "--output", out], "nope.mcap"),
+        (["fit", str(empty), "--signals", signals, "--output", out], "empty"),
+        (["fit", str(lfs), "--signals", signals, "--output", out], "git lfs pull"),
+        (["topics", str(text)], "text.mcap"),
+        (["fit", run, "--signals", str(folder / "nope.yaml"), "--output", out], "nope.yaml"),
+        (["fit", run, "--signals", signals, "--output", str(folder / "no" / "m.json")], "make it first"),
+        (fit_with(SIGNALS.replace("/engine/state", "/engine/stat")), "topics there: /engine/control, /engine/state"),
+        (fit_with(SIGNALS.replace("position[fan_speed]", "effort_[0]")), "fields there: header, name, position"),
+        (fit_with(SIGNALS.replace("position[fan_speed]", "name[0]")), "not one number"),
+        (fit_with(SIGNALS.replace("position[fan_speed]", "position")), "give an index"),
+        (fit_with(SIGNALS.replace("position[fan_speed]", "position[fan]")), "names there: fan_speed, compressor_speed"),
+        (fit_with(SIGNALS.replace("position[fan_speed]", "position.")), "not a field path"),
+        (fit_with(SIGNALS.replace("name: core", "name: fan")), "listed twice"),
+        (fit_with(SIGNALS.replace("name: core", "nam: core")), "unknown key 'nam'"),
+        (fit_with("states: []"), "at least one state"),
+        (fit_with("states: [1, 2"), "is not YAML"),
+        (fit_with("clock: /engine/control\n" + SIGNALS), "carries no state"),
+        (["fit", run, "--signals", signals, "--output", out], "--additive noise"),  # the plant rests exactly
+        (["check", str(folder / "signals.yaml"), run], "is not JSON"),
+        (["check", out, run, "--margin", "-1"], "no such model file"),
+    ]
+    for arguments, words in cases:
+        assert words in refused(capsys, arguments), arguments
+    assert not Path(out).exists()
+
+
+def test_alarm_rule_that_cannot_be(folder, capsys):
+    assert fitted(folder, "--additive", "noise") == 0
+    capsys.readouterr()
+    for rule in (["--violations", "3", "--window", "2"], ["--margin", "0"], ["--violations", "0"]):
+        said = refused(capsys, ["check", str(folder / "m.model.json"), str(folder / "run.mcap"), *rule])
+        assert "alarm:" in said
+
+
+def test_damaged_model_files(folder, capsys):
+    assert fitted(folder, "--additive", "noise") == 0
+    path = folder / "m.model.json"
+    whole = json.loads(path.read_text())
+    for change, words in (
+        ({"format": "uncertain-lti/9"}, "uncertain-lti/9"),
+        ({"dA": [[-1.0, 0.0], [0.0, 0.0]]}, "dA"),
+        ({"A": [[1.0]]}, "A"),
+        ({"v": [0.0, "x"]}, "v"),
+    ):
+        path.write_text(json.dumps({**whole, **change}))
+        capsys.readouterr()
+        said = refused(capsys, ["check", str(path), str(folder / "run.mcap")])
+        assert words in said and "m.model.json" in said
+
+
+def test_recordings_that_break_readers(recordings, folder, capsys):
+    odd = recordings / "odd"
+    assert fitted(folder, "--additive", "noise") == 0
+    for path in [*sorted(odd.glob("*.mcap")), recordings / "neato/db3", recordings / "neato/db3/wall_follower_0.db3"]:
+        capsys.readouterr()
+        assert main(["topics", str(path)]) in (0, 2)
+        said = capsys.readouterr()
+        assert "Traceback" not in said.err
+        refused(capsys, ["check", str(folder / "m.model.json"), str(path)])
+
+
+def test_help_and_usage():
+    """As a process: every command has --help; wrong usage is status 2."""
+    command = [sys.executable, "-m", "uncertain_lti.cli"]
+    environment = {**os.environ, "COLUMNS": "100"}
+    whole = subprocess.run([*command, "--help"], capture_output=True, text=True, env=environment, timeout=60)
+    assert whole.returncode == 0
+    for name in ("topics", "fit", "check", "info", "play", "record", "demo"):
+        assert name in whole.stdout
+        one = subprocess.run([*command, name, "--help"], capture_output=True, text=True, env=environment, timeout=60)
+        assert one.returncode == 0 and "usage" in one.stdout, one.stderr
+    for wrong in ([], ["fit"], ["nonsense"], ["check", "a", "b", "--margin", "x"]):
+        assert subprocess.run([*command, *wrong], capture_output=True, timeout=60).returncode == 2
