@@ -181,7 +181,6 @@ def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
         (fit_with("states: []"), "at least one state"),
         (fit_with("states: [1, 2"), "is not YAML"),
         (fit_with("clock: /engine/control\n" + SIGNALS), "carries no state"),
-        (["fit", run, "--signals", signals, "--output", out], "--additive noise"),  # the plant rests exactly
         (["check", str(folder / "signals.yaml"), run], "is not JSON"),
         (["check", out, run, "--margin", "-1"], "no such model file"),
     ]
