@@ -23,6 +23,7 @@ def envelope_figure(
     path: str | os.PathLike[str],
     states: Sequence[str] | None = None,
     event: tuple[float, str] | None = None,
+    span: tuple[float, float] | None = None,
 ) -> None:
     """Each state between its one-step bounds over time, in recorded units, violations marked, gaps left open.
 
@@ -37,6 +38,8 @@ def envelope_figure(
         Names of the states to show; default all.
     event : (float, str), optional
         Time in s and label of an instant to mark.
+    span : (float, float), optional
+        Show only this time, s.
 
     Raises
     ------
@@ -77,6 +80,12 @@ def envelope_figure(
         unit = model.signals.states[i].unit
         axis.set_ylabel(name.replace("_", " ") + (f" [{unit}]" if unit else ""))
         axis.margins(x=0.01)
+        if span is not None:
+            shown = (t >= span[0]) & (t <= span[1])
+            values = np.concatenate([lower[shown], upper[shown], verdicts.transient.x[shown, i]])
+            low, high = np.nanmin(values), np.nanmax(values)
+            axis.set_xlim(*span)
+            axis.set_ylim(low - 0.08 * (high - low), high + 0.25 * (high - low))
         axis.grid(alpha=0.25)
         axis.legend(loc="upper left", fontsize="small", ncols=4)
     if event is not None:
