@@ -85,8 +85,7 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     fit.add_argument(
         "--additive",
         choices=("none", "disturbance", "noise", "both"),
-        default="none",
-        help="further terms: drift with its half-width, measurement noise",
+        help="further terms: drift with its half-width, measurement noise (default: the signals file's, else none)",
     )
     fit.add_argument("--json", action="store_true", help="print JSON")
 

@@ -17,6 +17,8 @@ from uncertain_lti.signals import FieldPath, SignalMap
 _TWO_PI = 2.0 * math.pi
 BUFFERED_MESSAGES = 10_000
 """Messages kept per topic that wait for a later sample; older ones go first."""
+REMEMBERED_SAMPLES = 100
+"""Closed samples that a message is held against to see whether it came late."""
 
 
 def to_ns(seconds: float) -> int:
@@ -76,17 +78,54 @@ class _Message:
 class _Topic:
     """Messages of one topic that may still be chosen, and how far it got."""
 
-    __slots__ = ("header", "kept", "last_stamp", "chosen", "unwrap", "previous", "steady", "ahead")
+    __slots__ = ("header", "kept", "last", "jumped", "closed", "unwrap", "previous", "steady")
 
     def __init__(self, header: bool, unwrap: list[int], steady: list[float]) -> None:
         self.header = header
         self.kept: deque[_Message] = deque(maxlen=BUFFERED_MESSAGES)
-        self.last_stamp: int | None = None
-        self.ahead = False  # its time has stepped back, the clock's has not yet
-        self.chosen: _Message | None = None
+        self.last: dict[bool, int] = {}  # instant of the last message with a stamp, and of the last one without
+        self.jumped = False  # stepped back since the last closing
+        self.closed: deque[tuple[_Message, _Message | None]] = deque(maxlen=REMEMBERED_SAMPLES)  # and what they chose
         self.unwrap = unwrap
         self.steady = steady
         self.previous = list(steady)
+
+    def steps_back(self, message: _Message, limit: int) -> bool:
+        """Whether a message is more than limit before the last one on the same clock."""
+        stamped = message.stamp is not None
+        instant = message.arrival if message.stamp is None else message.stamp
+        last = self.last.get(stamped, instant)
+        self.last[stamped] = instant
+        return instant < last - limit
+
+    def came_late(self, message: _Message) -> bool:
+        """Whether a closed sample would have chosen this message."""
+        for sample, chosen in reversed(self.closed):
+            behind = _behind(sample, message)
+            if behind < 0:
+                break
+            if chosen is None or behind <= _behind(sample, chosen):
+                return True
+        return False
+
+    def choose(self, sample: _Message) -> _Message | None:
+        """The message with the greatest stamp at or before the sample, ties to the latest arrival."""
+        chosen, age = None, 2**63
+        for message in self.kept:
+            behind = _behind(sample, message)
+            if 0 <= behind <= age:
+                chosen, age = message, behind
+        return chosen
+
+    def close(self, sample: _Message, chosen: _Message | None, reset: bool) -> None:
+        """Forget what no later sample can choose: nothing where time jumps, as later samples are earlier then."""
+        if chosen is not None and not (reset or self.jumped):
+            self.kept = deque((m for m in self.kept if m is chosen or _behind(sample, m) < 0), BUFFERED_MESSAGES)
+        self.jumped = False
+        if reset:
+            self.closed.clear()  # nothing of this pass can be late for a sample of the one before
+        else:
+            self.closed.append((sample, chosen))
 
     def unwrapped(self, values: list[float]) -> list[float]:
         for i in self.unwrap:
@@ -156,8 +195,7 @@ class Sampler:
         self._open: _Message | None = None  # sample k: the clock message that opened it
         self._open_status = Status.FIRST
         self._open_dt = math.nan
-        self._closed: _Message | None = None  # sample k-1, and what was fixed when it closed
-        self._before: NDArray[np.float64] | None = None
+        self._before: NDArray[np.float64] | None = None  # z of sample k-1, fixed when it closed
         self._history: dict[int, deque[float]] = {}
 
     def push(self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]) -> list[Step]:
@@ -170,34 +208,25 @@ class Sampler:
         arrival_ns : int
             Log time, or live the node clock at receipt.
         stamp_ns : int or None
-            Header stamp; None where there is none or it is zero. Ignored for topics that go by log time.
+            Header stamp; None, zero or less where there is none. Ignored for topics that go by log time.
         values : sequence of float
             The topic's signals in the order of `signals.on(topic)`.
         """
         state = self._topics[topic]
-        message = _Message(arrival_ns, stamp_ns if state.header else None, list(values))
+        stamp = stamp_ns if state.header and stamp_ns is not None and stamp_ns > 0 else None
+        message = _Message(arrival_ns, stamp, list(values))
         if topic == self.clock:
             return self._push_clock(state, message)
-        if message.stamp is not None:
-            last = state.last_stamp
-            if last is not None and message.stamp < last - self.max_gap_ns:
-                state.kept.clear()  # a looped bag: what was kept belongs to the end of the last pass
-                state.chosen = None
-                state.previous = list(state.steady)
-                state.ahead = True
-            state.last_stamp = message.stamp
-            if self._closed is not None and not state.ahead and self._came_late(state, message):
-                self.counters[f"late {topic}"] += 1
+        if state.steps_back(message, self.max_gap_ns):  # a looped bag: what was kept belongs to the last pass
+            state.kept.clear()
+            state.closed.clear()
+            state.jumped = True
+            state.previous = list(state.steady)
+        elif state.came_late(message):
+            self.counters[f"late {topic}"] += 1
         state.unwrapped(message.values)
         state.kept.append(message)
         return []
-
-    def _came_late(self, state: _Topic, message: _Message) -> bool:
-        closed = self._closed
-        assert closed is not None
-        if closed.stamp is None or message.stamp is None or message.stamp > closed.stamp:
-            return False
-        return state.chosen is None or _behind(closed, message) <= _behind(closed, state.chosen)
 
     def _push_clock(self, state: _Topic, message: _Message) -> list[Step]:
         instant = message.stamp if state.header else message.arrival
@@ -220,16 +249,12 @@ class Sampler:
         state.unwrapped(message.values)
         if self._open is not None:
             closing = self._open
-            z = self._fix(closing, final=True)
+            z = self._fix(closing, final=True, reset=status is Status.RESET)
             if not self._one_topic:
                 steps.append(self._step(self._open_status, closing, self._open_dt, self._before, z[: self._n]))
-            self._closed, self._before = closing, z
+            self._before = z
         if status.opens_segment:
             self._history = {}
-        if status is Status.RESET:
-            self._closed = None  # nothing of this pass can be late for a sample of the one before
-            for other in self._topics.values():
-                other.ahead = False
         if self._one_topic:
             x_next = np.full(self._n, math.nan)
             for i, value in zip(self._where[self.clock], message.values, strict=True):
@@ -267,26 +292,21 @@ class Sampler:
             self.counters["missing"] += 1
         return Step(status, self._instant(message), message.arrival, dt, before[: self._n], before[self._n :], x_next)
 
-    def _fix(self, sample: _Message, final: bool) -> NDArray[np.float64]:
-        """z = [x; u] of the open sample from what has arrived; final: the sample closes now."""
+    def _fix(self, sample: _Message, final: bool, reset: bool = False) -> NDArray[np.float64]:
+        """z = [x; u] of the open sample from what has arrived; final: the sample closes now; reset: by a step back."""
         z = np.full(self._nm, math.nan)
         for topic, where in self._where.items():
             if topic == self.clock:
                 z[where] = sample.values
                 continue
             state = self._topics[topic]
-            chosen, age = None, 2**63
-            for message in state.kept:
-                behind = _behind(sample, message)
-                if 0 <= behind <= age:
-                    chosen, age = message, behind
+            chosen = state.choose(sample)
             if final:
-                state.chosen = chosen
-                if chosen is not None:  # older ones can no longer be the greatest stamp
-                    state.kept = deque(
-                        (m for m in state.kept if m is chosen or _behind(sample, m) < 0), BUFFERED_MESSAGES
-                    )
-            for i, value in zip(where, chosen.values if chosen else (), strict=bool(chosen)):
+                state.close(sample, chosen, reset)
+            if chosen is None:
+                continue
+            age = _behind(sample, chosen)
+            for i, value in zip(where, chosen.values, strict=True):
                 if age <= self._max_age[i]:
                     z[i] = value
                 elif final:

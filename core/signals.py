@@ -291,7 +291,7 @@ class SignalMap:
     the longest step that is still a transition (None: 2.5 x the median step); min_step (s) the shortest;
     max_skew (s) the greatest age of a state from another topic than the clock (None: max_gap); time says per
     topic whether its instant is the header stamp or the log time (not said: header where the type has one
-    and stamps are not zero).
+    and stamps are not zero). additive is the term that a fit uses where it is not told another.
 
     Raises
     ------
@@ -306,6 +306,7 @@ class SignalMap:
     min_step: float = 0.0
     max_skew: float | None = None
     time: Mapping[str, TimeSource] = field(default_factory=dict)
+    additive: Literal["none", "disturbance", "noise", "both"] | None = None
     source: str = "signals"
 
     def __post_init__(self) -> None:
@@ -407,13 +408,18 @@ class SignalMap:
 
         need_topics: every signal must name its topic; a model fitted to arrays has none.
         """
-        top = _keys(data, source, {"clock", "max_gap", "min_step", "max_skew", "topics", "states", "controls"})
+        top = _keys(
+            data, source, {"clock", "max_gap", "min_step", "max_skew", "additive", "topics", "states", "controls"}
+        )
         time: dict[str, TimeSource] = {}
         for topic, options in _keys(top.get("topics") or {}, f"{source}: topics", None).items():
             said = _keys(options, f"{source}: topics: {topic}", {"time"}).get("time")
             if said not in ("header", "log"):
                 raise SignalError(f"{source}: topics: {topic}: time is {said!r}; write header or log")
             time[topic] = said
+        additive = top.get("additive")
+        if additive not in (None, "none", "disturbance", "noise", "both"):
+            raise SignalError(f"{source}: additive is {additive!r}; write none, disturbance, noise or both")
         clock = top.get("clock")
         if clock is not None and not isinstance(clock, str):
             raise SignalError(f"{source}: clock is {clock!r}; write the name of a state topic")
@@ -425,6 +431,7 @@ class SignalMap:
             min_step=_number(top.get("min_step"), f"{source}: min_step") or 0.0,
             max_skew=_number(top.get("max_skew"), f"{source}: max_skew"),
             time=time,
+            additive=additive,
             source=source,
         )
 

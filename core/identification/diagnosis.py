@@ -119,6 +119,12 @@ def describe(
                 f"squares, because noise near rest ({rest:.0%} of the samples) inflates the half-widths; use an "
                 f"additive term: --additive noise, or --additive disturbance"
             )
+    span = np.ptp(problem.z[:, : problem.n], axis=0)
+    for i in np.flatnonzero((span > 0) & (mean_width > 0.5 * span)).tolist():
+        messages.append(
+            f"the envelope of '{states[i]}' is {mean_width[i] / span[i]:.0%} as wide as the state's own range, so few "
+            f"faults can show in it: one step is long for this state, or what moves it is not among the controls"
+        )
     if columns.drift and columns.noise and not columns.disturbance:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return found, messages

@@ -28,7 +28,7 @@ def fit(
     transients: Sequence[Transient] | Transient,
     criterion: Literal["qp", "lp"] = "qp",
     weights: ArrayLike | Sequence[ArrayLike] | None = None,
-    additive: Additive = "none",
+    additive: Additive | None = None,
     operating_point: OperatingPoint | None = None,
     *,
     method: Literal["working-set", "cvxpy"] = "working-set",
@@ -52,6 +52,7 @@ def fit(
         couple the rows in (10); (11) uses the diagonal. Default ones.
     additive : {"none", "disturbance", "noise", "both"}
         Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise).
+        Default: what the signals file says, else none.
     operating_point : OperatingPoint, optional
         Steady state and scales; default: those of the transients' signals, or values used as they are.
     method : {"working-set", "cvxpy"}
@@ -89,6 +90,8 @@ def fit(
             f"the transients {n} and {m}"
         )
     signals = _at(signals, operating_point)
+    if additive is None:
+        additive = signals.additive or "none"
     problem = assemble(transients, operating_point, weights, additive)
     names = [s.name for s in signals.states]
     check_solvable(problem, transients, names)
