@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -62,6 +63,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.add_post_set_parameters_callback(self._on_have_set)
         tick = min(0.1, self._real("heartbeat") / 4, self._real("diagnostics_period") / 2)
         self.create_timer(tick, self._on_tick, clock=self._steady)
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
 
     # --- parameters ---
 
@@ -181,6 +184,18 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._starts_itself = True
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self._starts_itself = self.trigger_activate() != TransitionCallbackReturn.SUCCESS
+
+    def _on_change_state(self, request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+        """Refuse what the state does not allow; rclpy on its own raises, which would end the process."""
+        try:
+            return self._change_state(request, response)
+        except RuntimeError:  # RCLError, which rclpy does not export
+            asked = request.transition.label or request.transition.id
+            state = self._state_machine.current_state[1]
+            there = ", ".join(transition[1] for transition in self._state_machine.available_transitions)
+            self.get_logger().error(f"no transition {asked} from {state}; there are {there or 'none'}")
+            response.success = False
+            return response
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load and check the model, and offer the outputs."""

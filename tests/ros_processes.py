@@ -1,0 +1,302 @@
+"""Real ROS 2 processes for tests: started with a domain of their own, watched from here, ended whatever happens."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from std_srvs.srv import Trigger
+
+PATIENCE = 20.0  # s
+MONITOR = "/envelope_monitor"
+_COMMANDS = """
+import argparse, sys
+from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti_ros import {0} as command
+parser = argparse.ArgumentParser()
+command.add_arguments(parser)
+try:
+    sys.exit(command.run(parser.parse_args()))
+except UncertainLTIError as error:
+    sys.exit(f"uncertain-lti: {{error}}")
+"""
+_NODES = "import sys; from uncertain_lti_ros.{0} import main; sys.exit(main())"
+
+
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """A ROS domain that no other test on this machine uses meanwhile."""
+    for number in random.sample(range(1, 101), 100):
+        lock = open(f"/tmp/uncertain-lti-test-domain-{number}", "w")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            continue
+        try:
+            yield number
+        finally:
+            lock.close()
+        return
+    raise RuntimeError("every ROS domain is in use by a test")
+
+
+def until(condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> Any:
+    """Wait for something that comes from another process; returns what the condition gave."""
+    end = time.monotonic() + patience
+    while not (found := condition()):
+        assert time.monotonic() < end, f"waited {patience:g} s for {what}"
+        time.sleep(0.01)
+    return found
+
+
+class Process:
+    """A process in a group of its own; what it prints goes to a file."""
+
+    def __init__(self, name: str, command: list[str], env: dict[str, str], log: Path) -> None:
+        self.name, self._log = name, log
+        with open(log, "wb") as stream:
+            self._process = subprocess.Popen(
+                command, env=env, stdout=stream, stderr=stream, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+
+    @property
+    def output(self) -> str:
+        return self._log.read_text(errors="replace")
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
+
+    def wait(self, patience: float = PATIENCE) -> int:
+        try:
+            return self._process.wait(patience)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"{self.name} still runs after {patience:g} s:\n{self.output}") from None
+
+    def succeed(self, patience: float = PATIENCE) -> str:
+        assert self.wait(patience) == 0, self.output
+        return self.output
+
+    def says(self, text: str, patience: float = PATIENCE) -> None:
+        until(lambda: text in self.output, f"{self.name} to say {text!r}; it said:\n{self.output}", patience)
+
+    def kill(self) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+
+class Topic:
+    """Messages of one topic as they arrived."""
+
+    def __init__(self, node: Node, kind: Any, name: str, qos: QoSProfile | int, **options: Any) -> None:
+        self.messages: list[Any] = []
+        self.times: list[float] = []
+        self.subscription = node.create_subscription(kind, name, self._take, qos, **options)
+
+    def _take(self, message: Any) -> None:
+        self.times.append(time.monotonic())
+        self.messages.append(message)
+
+    def connected(self) -> Topic:
+        until(self.subscription.get_publisher_count, f"a publisher of {self.subscription.topic_name}")
+        time.sleep(0.2)  # the publisher may know of us a moment later
+        return self
+
+    def count(self, number: int, patience: float = PATIENCE) -> list[Any]:
+        """The first `number` messages, as soon as they are here."""
+        name = self.subscription.topic_name
+        try:
+            until(lambda: len(self.messages) >= number, name, patience)
+        except AssertionError:
+            raise AssertionError(f"{name}: {len(self.messages)} of {number} messages") from None
+        return self.messages[:number]
+
+
+@contextmanager
+def open_world(folder: Path) -> Iterator[World]:
+    with own_domain() as domain:
+        world = World(domain, folder)
+        try:
+            yield world
+        finally:
+            world.close()
+
+
+class World:
+    """One ROS domain: processes in it, and a node here that listens, publishes and calls."""
+
+    def __init__(self, domain: int, folder: Path) -> None:
+        self.folder = folder
+        self.env = os.environ | {
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_LOG_DIR": str(folder / "log"),
+            "PYTHONUNBUFFERED": "1",
+        }
+        self._processes: list[Process] = []
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = Node("test", context=self._context)
+        self._executor = EventsExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._ends = False
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        while not self._ends:
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.kill()
+        self._ends = True
+        self._thread.join()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    # --- processes ---
+
+    def start(self, name: str, *command: str) -> Process:
+        log = self.folder / f"{len(self._processes)}-{name}.log"
+        process = Process(name, [sys.executable, *command], self.env, log)
+        self._processes.append(process)
+        return process
+
+    def run_node(self, module: str, parameters: dict[str, Any], *more: str) -> Process:
+        given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
+        return self.start(module, "-c", _NODES.format(module), "--ros-args", *given, *more)
+
+    def command(self, name: str, *arguments: Any) -> Process:
+        """`play` or `record`."""
+        module = {"play": "player", "record": "recorder"}[name]
+        return self.start(name, "-c", _COMMANDS.format(module), *(str(a) for a in arguments))
+
+    def monitor(self, model: Path | str, *more: str, name: str = MONITOR, **parameters: Any) -> Process:
+        """An envelope_monitor that is active."""
+        process = self.run_node("envelope_monitor", {"model": str(model)} | parameters, *more)
+        until(lambda: self.status(name).get("state") == "active" or not process.running, "an active monitor")
+        assert process.running, process.output
+        return process
+
+    # --- talking to them ---
+
+    def listen(self, kind: Any, name: str, qos: QoSProfile | int = 5000, **options: Any) -> Topic:
+        return Topic(self.node, kind, name, qos, **options)
+
+    def publisher(self, kind: Any, name: str, qos: QoSProfile | int = 1000) -> Any:
+        """A publisher; the subscribers it waits for are those of `subscribed`."""
+        return self.node.create_publisher(kind, name, qos)
+
+    @staticmethod
+    def subscribed(*publishers: Any) -> None:
+        for publisher in publishers:
+            until(publisher.get_subscription_count, f"a subscriber of {publisher.topic_name}")
+        time.sleep(0.2)
+
+    def call(self, kind: Any, name: str, request: Any, patience: float = PATIENCE) -> Any:
+        client = self.node.create_client(kind, name)
+        try:
+            until(client.service_is_ready, f"service {name}", patience)
+            future = client.call_async(request)
+            until(future.done, f"an answer of {name}", patience)
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def status(self, name: str = MONITOR) -> dict[str, Any]:
+        """What ~/status says."""
+        said: dict[str, Any] = json.loads(self.call(Trigger, f"{name}/status", Trigger.Request()).message)
+        return said
+
+    def set(self, name: str = MONITOR, **values: Any) -> tuple[bool, str]:
+        """Set parameters together; whether they were accepted, and the reason."""
+        request = SetParametersAtomically.Request(
+            parameters=[Parameter(key, value=value).to_parameter_msg() for key, value in values.items()]
+        )
+        result = self.call(SetParametersAtomically, f"{name}/set_parameters_atomically", request).result
+        return result.successful, result.reason
+
+    def change(self, label: str, name: str = MONITOR) -> bool:
+        """Ask for a lifecycle transition."""
+        request = ChangeState.Request(transition=Transition(id=_TRANSITIONS[label]))
+        return bool(self.call(ChangeState, f"{name}/change_state", request).success)
+
+    def state(self, name: str = MONITOR) -> str:
+        return str(self.call(GetState, f"{name}/get_state", GetState.Request()).current_state.label)
+
+    def diagnostics(self) -> Diagnostics:
+        return Diagnostics(self)
+
+
+_TRANSITIONS = {
+    "configure": Transition.TRANSITION_CONFIGURE,
+    "activate": Transition.TRANSITION_ACTIVATE,
+    "deactivate": Transition.TRANSITION_DEACTIVATE,
+    "cleanup": Transition.TRANSITION_CLEANUP,
+    "shutdown": Transition.TRANSITION_ACTIVE_SHUTDOWN,
+}
+
+
+class Diagnostics:
+    """The latest status of each name on /diagnostics."""
+
+    def __init__(self, world: World) -> None:
+        self.topic = world.listen(DiagnosticArray, "/diagnostics", 100)
+
+    def latest(self, name: str) -> Any:
+        for array in reversed(self.topic.messages):
+            for status in array.status:
+                if status.name == name:
+                    return status
+        return None
+
+    def reaches(
+        self, level: int, name: str = "envelope_monitor: monitor", saying: str = "", patience: float = 10
+    ) -> Any:
+        """A status of this level and message that comes from now on."""
+        before = len(self.topic.messages)
+
+        def found() -> Any:
+            for array in self.topic.messages[before:]:
+                for status in array.status:
+                    if status.name == name and status.level == bytes([level]) and saying in status.message:
+                        return status
+            return None
+
+        try:
+            return until(found, name, patience)
+        except AssertionError:
+            last = self.latest(name)
+            said = f"{last.level!r} {last.message}" if last else "nothing"
+            raise AssertionError(f"{name}: wanted level {level} {saying!r}, last was {said}") from None
+
+    @staticmethod
+    def values(status: Any) -> dict[str, str]:
+        return {value.key: value.value for value in status.values}

@@ -1,0 +1,698 @@
+"""The live node against real publishers in other processes: the promise of equal verdicts, and how it behaves."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_writer import Layout, Message, Topic, cdr, float64, header, write
+
+from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
+from uncertain_lti.bag import Bag
+from uncertain_lti.message_types import header_stamp_ns
+from uncertain_lti.model import Alarm, Domain, Sampling
+from uncertain_lti.monitor import Verdict
+from uncertain_lti.sampler import Sampler, Status
+from uncertain_lti.signals import FieldPath, Signal
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from geometry_msgs.msg import TwistStamped, Vector3Stamped
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_processes import Diagnostics, World, open_world, until
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64
+
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
+STATE, CONTROL = "/plant/state", "/plant/control"
+JOINT_STATE, VECTOR = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Vector3Stamped"
+STEP_NS = 10_000_000
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+# --- a model and recordings made by hand --------------------------------------------------------------------
+
+
+def by_hand(time: str = "header", **options: Any) -> UncertainLTI:
+    """Two states on a JointState, controls on a Vector3Stamped (header time) or a Float64 (log time)."""
+    if time == "header":
+        state = [(STATE, JOINT_STATE, "position[a]"), (STATE, JOINT_STATE, "position[b]")]
+        control = [(CONTROL, VECTOR, "vector.x"), (CONTROL, VECTOR, "vector.y")]
+    else:
+        state = [("/power", "std_msgs/msg/Float64", "data")]
+        control = [("/voltage", "std_msgs/msg/Float64", "data")]
+    names = ("a", "b"), ("p", "q")
+    signals = SignalMap(
+        tuple(
+            Signal(name, topic, path, steady=0.3, scale=1.7, type=kind)
+            for name, (topic, kind, path) in zip(names[0], state, strict=False)
+        ),
+        tuple(
+            Signal(name, topic, path, steady=0.1, scale=0.9, type=kind, max_hold=0.5)
+            for name, (topic, kind, path) in zip(names[1], control, strict=False)
+        ),
+    )
+    n, m = len(signals.states), len(signals.controls)
+    rng = np.random.default_rng(7)
+    clock = signals.states[0].topic
+    sampling = Sampling(
+        clock=clock,
+        clock_type=signals.states[0].type,
+        time=dict.fromkeys(signals.topics, time),
+        dt_median=STEP_NS * 1e-9,
+        max_gap=2.5 * STEP_NS * 1e-9,
+    )
+    model = UncertainLTI(
+        rng.normal(size=(n, n)) - 2.0 * np.eye(n),
+        rng.normal(size=(n, m)),
+        rng.uniform(0.1, 0.6, (n, n)),
+        rng.uniform(0.1, 0.6, (n, m)),
+        v=np.full(n, 1e-4),
+        signals=replace(signals, clock=clock, max_gap=sampling.max_gap, time=dict(sampling.time)),
+        sampling=sampling,
+        **options,
+    )
+    return model
+
+
+def saved(model: UncertainLTI, folder: Path, name: str = "hand") -> Path:
+    path = folder / f"{name}.model.json"
+    model.save(path)
+    return path
+
+
+def joint_state(t_ns: int, values: Any, names: tuple[str, ...] = ("a", "b")) -> bytes:
+    empty = np.empty(0)
+    return cdr(
+        JOINT_STATE, header=header(t_ns), name=list(names), position=np.array(values, dtype=np.float64),
+        velocity=empty, effort=empty,
+    )  # fmt: skip
+
+
+def vector(t_ns: int, x: float, y: float) -> bytes:
+    from bag_writer import message
+
+    return cdr(VECTOR, header=header(t_ns), vector=message("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0))
+
+
+def run_of(model: UncertainLTI, steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """States and controls in recorded units: drawn inside the bounds, a few of them pushed outside."""
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-1.0, 1.0, (steps, model.m))
+    x = np.zeros((steps, model.n))
+    for k in range(steps - 1):
+        centre, half = model.centre_and_half(x[k], u[k], STEP_NS * 1e-9)
+        x[k + 1] = centre + half * rng.uniform(-1.0, 1.0, model.n) * (1.5 if rng.random() < 0.1 else 1.0)
+    point = model.operating_point
+    return point.recorded_x(x), point.u_s + point.U * u
+
+
+def header_bag(model: UncertainLTI, path: Path, steps: int, seed: int = 1) -> Path:
+    """Control and state share their stamps and come in either order, with every disorder that sampling knows."""
+    rng = np.random.default_rng(seed)
+    x, u = run_of(model, steps, seed)
+    messages: list[Message] = []
+    t = EPOCH_NS
+    for k in range(steps):
+        log = t + 100_000_000 + int(rng.integers(0, 2_000_000))
+        state = Message(STATE, log, joint_state(t, x[k]))
+        control = Message(CONTROL, log + 300_000, vector(t, *u[k]))
+        if rng.random() < 0.5:
+            control = replace(control, log_time=log - 300_000)
+        kind = rng.random()
+        if kind < 0.02:  # names moved, a name missing, not a number
+            state = replace(state, data=joint_state(t, x[k][::-1], ("b", "a")))
+        elif kind < 0.03:
+            state = replace(state, data=joint_state(t, x[k], ("a", "c")))
+        elif kind < 0.04:
+            state = replace(state, data=joint_state(t, [np.nan, x[k][1]]))
+        elif kind < 0.05:
+            messages.append(replace(state, log_time=log + 500_000))  # an equal stamp
+        elif kind < 0.06:
+            messages.append(Message(STATE, log + 500_000, joint_state(t - STEP_NS // 2, x[k])))  # out of order
+        elif kind < 0.07:
+            messages.append(Message(STATE, log + 500_000, joint_state(0, x[k])))  # no stamp
+        elif kind < 0.09:
+            control = replace(control, log_time=log + 3 * STEP_NS)  # late
+        messages += [state, control]
+        t += STEP_NS + int(rng.integers(-1_000_000, 1_000_000)) + (5 * STEP_NS if rng.random() < 0.01 else 0)
+    messages.sort(key=lambda m: m.log_time)
+    topics = [Topic(STATE, JOINT_STATE), Topic(CONTROL, VECTOR)]
+    return write(topics, messages, Layout("zstd", chunk_size=1 << 16)).save(path)
+
+
+def log_bag(model: UncertainLTI, path: Path, steps: int, seed: int = 2) -> Path:
+    """No stamps at all: the order and the log time are the only clock; some controls share a state's log time."""
+    rng = np.random.default_rng(seed)
+    x, u = run_of(model, steps, seed)
+    messages = []
+    t = EPOCH_NS
+    for k in range(steps):
+        shift = int(rng.choice([-2_000_000, 0, 3_000_000]))
+        pair = [Message("/power", t, float64(x[k][0])), Message("/voltage", t + shift, float64(u[k][0]))]
+        messages += pair if rng.random() < 0.5 else pair[::-1]
+        t += STEP_NS + int(rng.integers(-2_000_000, 2_000_000)) + (5 * STEP_NS if rng.random() < 0.02 else 0)
+    messages.sort(key=lambda m: m.log_time)
+    return write([Topic("/power"), Topic("/voltage")], messages).save(path)
+
+
+# --- the promise --------------------------------------------------------------------------------------------
+
+
+def offline(model_path: Path, bag_path: Path) -> list[Verdict]:
+    """The verdict on every clock message of a recording, in order."""
+    model = UncertainLTI.load(model_path)
+    sampler, monitor = Sampler(model.signals), EnvelopeMonitor(model)
+    signals = model.signals
+    paths = {t: [FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics}
+    verdicts = []
+    for topic, log_time, message in Bag(bag_path).messages(signals.topics):
+        values = [path.read(message) for path in paths[topic]]
+        verdicts += [monitor.judge(s) for s in sampler.push(topic, log_time, header_stamp_ns(message), values)]
+    return verdicts
+
+
+def stamp_of(message: Any) -> int:
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
+def bits(values: Any) -> bytes:
+    return np.asarray(values, dtype=np.float64).tobytes()
+
+
+@dataclass
+class Outputs:
+    """What the node publishes, gathered in this process."""
+
+    topics: dict[str, Any]
+
+    @classmethod
+    def of(cls, world: World, *more: str) -> Outputs:
+        names = ("flags", "lower", "upper", "state", "utilisation", *more)
+        topics = {name: world.listen(JointState, f"/envelope_monitor/{name}") for name in names}
+        topics["violation"] = world.listen(Bool, "/envelope_monitor/violation")
+        for topic in topics.values():
+            topic.connected()
+        return cls(topics)
+
+    def hold_against(self, verdicts: list[Verdict], names: tuple[str, ...], stamps: bool = True) -> None:
+        """Every flag of every clock message, and every bit of what was judged."""
+        flags = self.topics["flags"].count(len(verdicts))
+        judged = [v for v in verdicts if v.judged]
+        assert len(judged) > 0.5 * len(verdicts) and any((v.flags == 1.0).any() for v in judged)
+        for verdict, message in zip(verdicts, flags, strict=True):
+            np.testing.assert_array_equal(message.position, verdict.flags)
+            expected = float(verdict.outside_domain) if verdict.judged else np.nan
+            np.testing.assert_array_equal(message.velocity, np.full(len(names), expected))
+            assert tuple(message.name) == names
+            if verdict.status is not Status.UNSTAMPED:  # without a stamp, the time of receipt stands in
+                assert stamp_of(message) == verdict.t_ns
+        for name in ("lower", "upper", "state", "utilisation"):
+            got = self.topics[name].count(len(judged))
+            assert [stamp_of(m) for m in got] == [v.t_ns for v in judged]
+            assert [bits(m.position) for m in got] == [bits(getattr(v, name)) for v in judged]
+        time.sleep(0.3)
+        assert len(self.topics["flags"].messages) == len(verdicts), "more flags than clock messages"
+        assert self.topics["violation"].messages[-1].data == verdicts[-1].alarm
+
+
+@pytest.mark.parametrize(("steps", "rate"), [(200, 1.0), (1500, 6.0)], ids=["real time", "six times as fast"])
+def test_header_time_gives_live_what_it_gives_offline(world: World, tmp_path: Path, steps: int, rate: float) -> None:
+    model = by_hand(alarm=Alarm(2, 5))
+    path = saved(model, tmp_path)
+    bag = header_bag(model, tmp_path / "run.mcap", steps)
+    verdicts = offline(path, bag)
+    assert {v.status for v in verdicts} >= ({Status.OK, Status.MISSING, Status.GAP} if steps > 1000 else {Status.OK})
+    world.monitor(path)
+    outputs = Outputs.of(world)
+    world.command("play", bag, "--rate", rate).succeed(60)
+    outputs.hold_against(verdicts, ("a", "b"))
+    status = world.status()
+    assert status["verdicts"] == sum(v.judged for v in verdicts)
+    assert sum(status["lost"].values()) == 0 and status["received"].keys() == {STATE, CONTROL}
+
+
+def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp_path: Path) -> None:
+    model = by_hand("log")
+    path = saved(model, tmp_path)
+    bag = log_bag(model, tmp_path / "run.mcap", 400)
+    verdicts = offline(path, bag)
+    assert {v.status for v in verdicts} >= {Status.OK, Status.GAP}
+    world.monitor(path, use_sim_time=True)
+    outputs = Outputs.of(world)
+    world.command("play", bag, "--clock", "--lockstep", "envelope_monitor").succeed(120)
+    outputs.hold_against(verdicts, ("a",))
+
+
+def test_a_looped_bag_starts_anew_and_gives_the_same_again(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    path = saved(model, tmp_path)
+    bag = header_bag(model, tmp_path / "run.mcap", 150)
+    once = offline(path, bag)
+    world.monitor(path)
+    outputs = Outputs.of(world)
+    for _ in range(2):
+        world.command("play", bag, "--rate", 3).succeed(60)
+    flags = outputs.topics["flags"].count(2 * len(once))
+    again = [m.position for m in flags[len(once) :]]
+    np.testing.assert_array_equal(again, [v.flags for v in once])
+    assert world.status()["counters"]["resets"] == 1
+
+
+@pytest.mark.slow
+def test_a_real_recording_gives_live_what_it_gives_offline(world: World, tmp_path: Path, recordings: Path) -> None:
+    """Two seconds of a quadruped, 500 Hz on each of two topics, at real time."""
+    whole = Bag(recordings / "go2" / "test_3.mcap")
+    start = min(info.first for info in whole.topics.values() if info.first is not None) + 5 * 10**9
+    topics = ("/go2/joint_states", "/go2/joint_command")
+    cut = [m for m in whole.raw_messages(topics) if start <= m.log_time_ns < start + 2 * 10**9]
+    bag = write(
+        [Topic(t, JOINT_STATE) for t in topics], [Message(m.topic, m.log_time_ns, m.data) for m in cut]
+    ).save(tmp_path / "go2.mcap")  # fmt: skip
+    signals = SignalMap(
+        (
+            Signal("angle", topics[0], "position[j2]", type=JOINT_STATE),
+            Signal("speed", topics[0], "velocity[j2]", type=JOINT_STATE),
+        ),
+        (Signal("command", topics[1], "position[j2]", type=JOINT_STATE, max_hold=0.05),),
+    )
+    step = 0.002
+    sampling = Sampling(
+        clock=topics[0],
+        clock_type=JOINT_STATE,
+        time=dict.fromkeys(topics, "header"),
+        dt_median=step,
+        max_gap=2.5 * step,
+    )
+    model = UncertainLTI(
+        [[0.0, 1.0], [-200.0, -10.0]], [[0.0], [200.0]], [[0.0, 0.5], [50.0, 5.0]], [[0.0], [50.0]], v=[1e-3, 0.1],
+        signals=signals, sampling=sampling,
+    )  # fmt: skip
+    path = saved(model, tmp_path)
+    verdicts = offline(path, bag)
+    world.monitor(path)
+    outputs = Outputs.of(world)
+    world.command("play", bag).succeed(60)
+    outputs.hold_against(verdicts, ("angle", "speed"))
+
+
+# --- behaviour ----------------------------------------------------------------------------------------------
+
+
+class Plant:
+    """Publishes samples of the model by hand, one at a time, from this process."""
+
+    def __init__(self, world: World, model: UncertainLTI, state: str = STATE, control: str = CONTROL) -> None:
+        self.model = model
+        self.state = world.publisher(JointState, state)
+        self.control = world.publisher(Vector3Stamped, control)
+        self.world = world
+        self.t_ns = EPOCH_NS
+        self.x = np.zeros(model.n)
+        self.u = np.full(model.m, 0.2)
+
+    def subscribed(self) -> Plant:
+        self.world.subscribed(self.state, self.control)
+        return self
+
+    def send(self, samples: int, off: float = 0.0) -> None:
+        """Samples on the centre of their bounds, or `off` half-widths beside it."""
+        point = self.model.operating_point
+        for _ in range(samples):
+            message = JointState(name=["a", "b"], position=point.recorded_x(self.x).tolist())
+            control = Vector3Stamped()
+            recorded = point.u_s + point.U * self.u
+            control.vector.x, control.vector.y = float(recorded[0]), float(recorded[1])
+            for m in (message, control):
+                m.header.stamp.sec, m.header.stamp.nanosec = divmod(self.t_ns, 10**9)
+            self.control.publish(control)
+            self.state.publish(message)
+            centre, half = self.model.centre_and_half(self.x, self.u, STEP_NS * 1e-9)
+            self.x = centre + off * half
+            self.t_ns += STEP_NS
+            time.sleep(0.005)
+
+
+def test_every_verdict_and_every_heartbeat_is_published(world: World, tmp_path: Path) -> None:
+    model = by_hand(alarm=Alarm(2, 3))
+    path = saved(model, tmp_path)
+    world.monitor(path, heartbeat=0.2)
+    late: list[Any] = []
+    from rclpy.event_handler import SubscriptionEventCallbacks
+
+    promised = QoSProfile(depth=5000, deadline=Duration(seconds=0.2))
+    events = SubscriptionEventCallbacks(deadline=late.append)
+    violation = world.listen(Bool, "/envelope_monitor/violation", promised, event_callbacks=events).connected()
+    violation.count(6)  # nothing has been judged, and the node is heard all the same
+    assert not any(m.data for m in violation.messages)
+    assert np.diff(violation.times[-5:]).max() < 0.2 and not late
+
+    plant = Plant(world, model).subscribed()
+    outputs = Outputs.of(world)
+    plant.send(5)
+    outputs.topics["flags"].count(5)
+    before = len(violation.messages)
+    plant.send(1, off=2.0)  # the transition judged at the next sample leaves its bounds
+    plant.send(1, off=2.0)
+    outputs.topics["flags"].count(7)
+    plant.send(1)
+    flags = outputs.topics["flags"].count(8)
+    assert [m.position[0] for m in flags[1:]] == [0.0] * 5 + [1.0] * 2  # the first sample has no verdict
+    assert np.isnan(flags[0].position).all() and np.isnan(flags[0].velocity).all()
+    assert len(flags[3].effort) == 0
+    raised = [m.data for m in violation.messages[before:]]
+    assert raised[0] is False and raised[-1] is True  # two of the last three
+    plant.send(2)
+    until(lambda: violation.messages[-1].data is False, "the alarm to end")
+    status = world.status()
+    assert status["violations"] == {"a": 2, "b": 2} and status["alarm"] is False
+
+
+def test_a_sample_outside_the_fitted_domain_is_marked_and_still_judged(world: World, tmp_path: Path) -> None:
+    domain = Domain(np.full(2, -1.0), np.full(2, 1.0), np.full(2, -0.5), np.full(2, 0.5))
+    model = by_hand(domain=domain)
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.2)
+    diagnostics = world.diagnostics()
+    outputs = Outputs.of(world)
+    plant = Plant(world, model).subscribed()
+    plant.send(3)
+    plant.u = np.full(2, 0.7)
+    plant.send(1)
+    plant.send(1, off=3.0)
+    plant.send(1)
+    flags = outputs.topics["flags"].count(6)
+    assert [m.velocity[1] for m in flags[1:]] == [0.0, 0.0, 0.0, 1.0, 1.0]
+    assert [m.position[1] for m in flags[1:]] == [0.0, 0.0, 0.0, 0.0, 1.0]
+    assert diagnostics.latest("envelope_monitor: monitor") is not None
+
+
+def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp_path: Path) -> None:
+    domain = Domain(np.full(2, -1.0), np.full(2, 1.0), np.full(2, -0.5), np.full(2, 0.5))
+    model = by_hand(domain=domain, alarm=Alarm(3, 5))
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=0.6, hardware_id="rig 1")
+    diagnostics = world.diagnostics()
+    status = diagnostics.reaches(STALE, saying="nothing ever received on")
+    assert STATE in status.message and CONTROL in status.message and status.hardware_id == "rig 1"
+    plant = Plant(world, model).subscribed()
+
+    plant.send(30)
+    status = diagnostics.reaches(OK)
+    state = diagnostics.latest("envelope_monitor: b")
+    assert state.level == bytes([OK])
+    values = Diagnostics.values(state)
+    assert float(values["lower"]) <= float(values["state"]) <= float(values["upper"])
+    values = Diagnostics.values(diagnostics.latest("envelope_monitor: monitor"))
+    assert int(values[f"received {STATE}"]) == 30 and int(values["verdicts"]) == 29
+    assert float(values[f"age {CONTROL}"]) < 5 and values[f"publishers {STATE}"] == "1"
+
+    plant.u = np.full(2, 0.7)
+    plant.send(20)
+    diagnostics.reaches(WARN, saying="outside the fitted domain")
+    plant.u = np.full(2, 0.2)
+    plant.send(20, off=2.0)
+    diagnostics.reaches(ERROR, saying="alarm: at least 3 of 5")
+    assert diagnostics.latest("envelope_monitor: a").level == bytes([ERROR])
+    plant.t_ns += 10 * STEP_NS
+    plant.send(5)
+    plant.t_ns -= STEP_NS
+    plant.send(1)
+    diagnostics.reaches(STALE, saying=f"no message on {STATE} for")
+    assert diagnostics.latest("envelope_monitor: a").level == bytes([STALE])
+    values = Diagnostics.values(diagnostics.latest("envelope_monitor: monitor"))
+    assert (values["gaps"], values["dropped"], values["alarms"]) == ("1", "1", "1")
+
+
+def test_a_control_that_never_comes_is_named_and_nothing_is_called_contained(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=0.4)
+    diagnostics = world.diagnostics()
+    outputs = Outputs.of(world)
+    plant = Plant(world, model)
+    world.subscribed(plant.state)
+    for k in range(100):
+        message = JointState(name=["a", "b"], position=[0.3, 0.3])
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(EPOCH_NS + k * STEP_NS, 10**9)
+        plant.state.publish(message)
+        time.sleep(0.01)
+    status = diagnostics.reaches(STALE, saying=f"nothing ever received on {CONTROL}")
+    assert "no verdict yet" in status.message
+    flags = outputs.topics["flags"].count(100)
+    assert np.isnan([m.position for m in flags]).all()
+    assert not outputs.topics["lower"].messages
+
+
+def test_a_model_is_swapped_as_a_whole_or_not_at_all(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    first = saved(model, tmp_path, "first")
+    wide = UncertainLTI(
+        model.A, model.B, 3 * model.dA, 3 * model.dB, v=3 * model.v, signals=model.signals, sampling=model.sampling
+    )
+    second = saved(wide, tmp_path, "second")
+    broken = tmp_path / "broken.model.json"
+    broken.write_text(second.read_text().replace("uncertain-lti/1", "uncertain-lti/9"))
+    world.monitor(first)
+    outputs = Outputs.of(world)
+    plant = Plant(world, model).subscribed()
+    plant.send(1)
+    plant.send(3, off=2.0)
+    plant.send(1, off=2.0)
+    assert [m.position[0] for m in outputs.topics["flags"].count(5)[1:]] == [0, 1, 1, 1]
+
+    accepted, reason = world.set(model=str(broken))
+    assert not accepted and "uncertain-lti/9" in reason
+    accepted, reason = world.set(model=str(tmp_path / "nowhere.model.json"))
+    assert not accepted and "no such model file" in reason
+    assert world.status()["model"] == str(first)
+    plant.send(1, off=2.0)
+    assert outputs.topics["flags"].count(6)[5].position[0] == 1.0  # goes on undisturbed
+
+    accepted, reason = world.set(model=str(second))
+    assert accepted, reason
+    plant.send(4, off=2.0)
+    flags = outputs.topics["flags"].count(10)[6:]
+    assert np.isnan(flags[0].position).all()  # the new model has seen no sample before
+    assert [m.position[0] for m in flags[1:]] == [0, 0, 0]
+    assert world.status()["received"] == {STATE: 10, CONTROL: 10}  # the subscriptions were kept
+
+
+def test_a_swapped_model_may_have_other_topics(world: World, tmp_path: Path) -> None:
+    first, second = saved(by_hand(), tmp_path, "first"), saved(by_hand("log"), tmp_path, "second")
+    world.monitor(first)
+    assert world.status()["received"].keys() == {STATE, CONTROL}
+    accepted, reason = world.set(model=str(second))
+    assert accepted, reason
+    assert world.status()["received"].keys() == {"/power", "/voltage"}
+    power = world.publisher(Float64, "/power")
+    world.subscribed(power)
+    flags = world.listen(JointState, "/envelope_monitor/flags").connected()
+    power.publish(Float64(data=1.0))
+    assert list(flags.count(1)[0].name) == ["a"]
+
+
+def test_the_alarm_rule_can_be_set_and_is_checked(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    world.monitor(saved(model, tmp_path))
+    outputs = Outputs.of(world)
+    plant = Plant(world, model).subscribed()
+    accepted, reason = world.set(violations=4, window=3)
+    assert not accepted and "violations is 4 of window 3" in reason
+    accepted, reason = world.set(margin=-1.0)
+    assert not accepted
+    accepted, reason = world.set(heartbeat=2.0)
+    assert not accepted and "read-only" in reason
+    assert world.set(violations=2, window=3, margin=2.0) == (True, "")
+    plant.send(1)
+    plant.send(4, off=1.5)
+    assert [m.position[0] for m in outputs.topics["flags"].count(5)[1:]] == [0, 0, 0, 0]  # within twice the width
+    assert world.set(margin=1.0) == (True, "")
+    plant.send(1, off=1.5)
+    plant.send(1, off=1.5)
+    assert [m.position[0] for m in outputs.topics["flags"].count(7)[5:]] == [1, 1]
+    until(lambda: outputs.topics["violation"].messages[-1].data, "the alarm")
+
+
+def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    process = world.run_node(
+        "envelope_monitor", {"model": str(saved(model, tmp_path)), "autostart": False, "diagnostics_period": 0.1}
+    )
+    diagnostics = world.diagnostics()
+    assert world.state() == "unconfigured"
+    diagnostics.reaches(STALE, saying="unconfigured: no verdicts")
+    assert not world.change("activate")
+    assert world.change("configure") and world.state() == "inactive"
+    violation = world.listen(Bool, "/envelope_monitor/violation").connected()
+    flags = world.listen(JointState, "/envelope_monitor/flags").connected()
+    diagnostics.reaches(STALE, name="envelope_monitor: a", saying="inactive: no verdicts")
+    time.sleep(1.2)
+    assert not violation.messages  # silent while inactive: the missed deadline tells
+    plant = Plant(world, model)
+    plant.send(5)
+    assert world.change("activate") and world.state() == "active"
+    plant.subscribed().send(5)
+    assert np.isnan(flags.count(5)[0].position).all() and violation.messages
+    assert world.change("deactivate") and world.state() == "inactive"
+    time.sleep(0.2)
+    heard = len(violation.messages)
+    plant.send(5)
+    assert world.change("activate")
+    plant.subscribed().send(2)
+    assert np.isnan(flags.count(7)[5].position).all(), "a sample from before was joined to one after"
+    assert len(violation.messages) > heard
+    assert world.change("deactivate") and world.change("cleanup") and world.state() == "unconfigured"
+    assert world.change("configure") and world.change("activate") and world.change("shutdown")
+    assert world.state() == "finalized"
+    process.signal(signal.SIGINT)
+    process.succeed()
+
+
+def test_what_cannot_be_configured_says_why_and_can_be_mended(world: World, tmp_path: Path) -> None:
+    foreign = by_hand()
+    signals = replace(
+        foreign.signals,
+        controls=tuple(replace(c, type="frost_interfaces/msg/UCommand") for c in foreign.signals.controls),
+    )
+    missing = saved(
+        UncertainLTI(foreign.A, foreign.B, foreign.dA, foreign.dB, signals=signals, sampling=foreign.sampling),
+        tmp_path, "missing",
+    )  # fmt: skip
+    arrays = saved(UncertainLTI([[-1.0]], [[1.0]], [[0.1]], [[0.1]]), tmp_path, "arrays")
+    field = by_hand()
+    wrong = replace(field.signals, states=tuple(replace(s, field="positions[0]") for s in field.signals.states))
+    unknown_field = saved(
+        UncertainLTI(field.A, field.B, field.dA, field.dB, signals=wrong, sampling=field.sampling), tmp_path, "field"
+    )
+    process = world.run_node("envelope_monitor", {"model": str(missing), "diagnostics_period": 0.1})
+    diagnostics = world.diagnostics()
+    diagnostics.reaches(ERROR, saying="the Python package frost_interfaces is not installed; install it")
+    assert world.state() == "unconfigured"
+    assert "Traceback" not in process.output and "not configured" in process.output
+    accepted, reason = world.set(model=str(arrays))
+    assert not accepted and "fitted to arrays" in reason and "'x1'" in reason
+    accepted, reason = world.set(model=str(unknown_field))
+    assert not accepted and "positions" in reason and "position[]" in reason
+    assert world.state() == "unconfigured"
+    accepted, reason = world.set(model=str(saved(foreign, tmp_path, "right")))
+    assert accepted, reason
+    assert world.state() == "active"
+    diagnostics.reaches(STALE, saying="no verdict yet")
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_node_with_status_0(world: World, tmp_path: Path, end: int) -> None:
+    diagnostics = world.diagnostics()
+    process = world.monitor(saved(by_hand(), tmp_path))
+    assert "runs on the events executor" in process.output
+    process.signal(end)
+    assert "Traceback" not in process.succeed(5)
+    until(lambda: diagnostics.latest("envelope_monitor: monitor").message.startswith("finalized"), "its last words")
+
+
+def test_best_effort_publishers_are_heard_and_followed_when_they_change(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
+    outputs = Outputs.of(world)
+    plant = Plant(world, model)
+    world.node.destroy_publisher(plant.state)
+    best_effort = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+    plant.state = world.publisher(JointState, STATE, best_effort)
+    plant.subscribed().send(5)
+    outputs.topics["flags"].count(5)
+    world.node.destroy_publisher(plant.state)
+    lasting = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    plant.state = world.publisher(JointState, STATE, lasting)
+    diagnostics = world.diagnostics()
+    until(
+        lambda: (
+            (status := diagnostics.latest("envelope_monitor: monitor"))
+            and Diagnostics.values(status)[f"qos {STATE}"] == "reliable volatile"
+        ),
+        "a reliable subscription",
+    )
+    plant.subscribed().send(5)
+    outputs.topics["flags"].count(10)
+    time.sleep(0.3)
+    assert len(outputs.topics["flags"].messages) == 10
+
+
+def test_what_was_published_before_by_a_transient_local_publisher_is_heard(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    control = world.publisher(Vector3Stamped, CONTROL, lasting)
+    command = Vector3Stamped()
+    command.vector.x = 0.25  # without a stamp: compared by time of receipt, and held
+    control.publish(command)
+    world.monitor(saved(model, tmp_path))
+    until(lambda: world.status()["received"][CONTROL] == 1, "the command from before")
+
+
+def test_quality_of_service_that_cannot_be_had_is_told(world: World, tmp_path: Path) -> None:
+    world.monitor(saved(by_hand(), tmp_path), **{"diagnostics_period": 0.1, "qos.reliability": "reliable"})
+    diagnostics = world.diagnostics()
+    world.publisher(JointState, STATE, QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    status = diagnostics.reaches(STALE, saying=f"{STATE}: a publisher cannot be heard")
+    assert "best effort is offered, reliable asked" in status.message
+    accepted, reason = world.set(**{"qos.reliability": "match"})
+    assert not accepted
+
+
+def test_a_publisher_of_another_type_is_told(world: World, tmp_path: Path) -> None:
+    world.publisher(TwistStamped, STATE)
+    world.monitor(saved(by_hand(), tmp_path), diagnostics_period=0.1)
+    diagnostics = world.diagnostics()
+    diagnostics.reaches(STALE, saying=f"{STATE}: a publisher sends geometry_msgs/msg/TwistStamped")
+
+
+def test_bounds_are_predicted_only_while_somebody_listens(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    path = saved(model, tmp_path)
+    world.monitor(path)
+    flags = world.listen(JointState, "/envelope_monitor/flags").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(3)
+    flags.count(3)
+    lower = world.listen(JointState, "/envelope_monitor/predicted_lower").connected()
+    upper = world.listen(JointState, "/envelope_monitor/predicted_upper").connected()
+    judged = world.listen(JointState, "/envelope_monitor/lower").connected()
+    plant.send(10)
+    flags.count(13)
+    low, high = lower.count(10), upper.count(10)
+    for a, b in zip(low, high, strict=True):
+        assert stamp_of(a) == stamp_of(b) and (np.array(a.position) < np.array(b.position)).all()
+    # the step is the median step and the control was known, so the prediction is what is judged one sample later
+    later = {stamp_of(m): bits(m.position) for m in judged.count(10)}
+    for message in low[:-1]:
+        assert bits(message.position) == later[stamp_of(message)]
+    world.node.destroy_subscription(upper.subscription)
+    world.node.destroy_subscription(lower.subscription)
+    assert len(lower.messages) == 10
+
+
+def test_topics_follow_remapping_and_namespaces(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    path = saved(model, tmp_path)
+    name = "/rig/watcher"
+    world.monitor(
+        path, "-r", "__ns:=/rig", "-r", "__node:=watcher", "-r", f"{STATE}:=/other/state", name=name,
+        diagnostics_period=0.1,
+    )  # fmt: skip
+    diagnostics = world.diagnostics()
+    flags = world.listen(JointState, f"{name}/flags").connected()
+    plant = Plant(world, model, state="/other/state").subscribed()
+    plant.send(5)
+    flags.count(5)
+    assert world.status(name)["received"] == {"/other/state": 5, CONTROL: 5}
+    until(lambda: diagnostics.latest("rig/watcher: a"), "the namespace in the diagnostics")
