@@ -102,7 +102,7 @@ def definition(type_name: str) -> str:
             written = {"boolean": "bool", "octet": "byte"}.get(element, _NUMBERS.get(element, element))
             written = re.sub(r"<(\d+)>", r"<=\1", written)  # a bounded string
             lines.append(f"{written}{array} {field}\n")
-        bodies[name] = "".join(lines)
+        bodies[name] = "".join(lines) or "uint8 structure_needs_at_least_one_member\n"
     first, *others = bodies.items()
     parts = [first[1]]
     for name, body in others:

@@ -1,0 +1,389 @@
+"""`play` and `record` through real topics: what comes out is what went in."""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_writer import JAZZY, Message, Topic, cdr, float64, header, ramp, write
+from rosbags.highlevel import AnyReader
+from rosbags.typesys.store import Typestore
+
+from uncertain_lti import Transient
+from uncertain_lti.bag import Bag
+from uncertain_lti.message_types import define
+from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, leibov2006, transient
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from ros_processes import World, open_world
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Empty, Float64, Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout, String
+
+from uncertain_lti_ros.messages import definition, live_fields, message_class
+
+ROOT = Path(__file__).resolve().parents[1]
+START_NS = 1_700_000_000_000_000_000
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+# --- definitions --------------------------------------------------------------------------------------------
+
+
+def installed_types() -> list[str]:
+    found = []
+    for name in sorted(JAZZY.types):
+        try:
+            message_class(name)
+        except Exception:
+            continue
+        found.append(name)
+    return found
+
+
+def test_definitions_written_from_classes_are_those_of_the_types() -> None:
+    """Every installed type: field by field, down to array bounds, what the published definition of ROS 2 says."""
+    types = installed_types()
+    assert len(types) > 100
+
+    def same(description: Any) -> str:
+        return str(description).replace("'char'", "'uint8'")  # a class says uint8 for both
+
+    for name in types:
+        made = define(name, "ros2msg", definition(name).encode())
+        assert not made.reason, f"{name}: {made.reason}"
+        for used, (_, fields) in made.types.items():
+            assert same(fields) == same(JAZZY.fielddefs[used][1]), f"{used} in {name}"
+
+
+def test_live_types_are_described_as_those_of_a_recording() -> None:
+    for name in installed_types():
+        recorded = define(name, "ros2msg", JAZZY.generate_msgdef(name, ros_version=2)[0].encode()).fields(name)
+        live = live_fields(name)
+        assert recorded.keys() == live.keys()
+        for field, there in recorded.items():
+            here = live[field]
+            assert (here.kind, here.array) == (there.kind, there.array), f"{name}.{field}"
+            if here.kind not in ("string", "number"):
+                assert here.type_name == there.type_name
+
+
+# --- record -------------------------------------------------------------------------------------------------
+
+
+def some_messages(number: int) -> dict[str, Any]:
+    """One message of each of several shapes: nested, arrays of messages, bytes, strings, nothing at all."""
+    stamp = Time(sec=1_700_000_000 + number, nanosec=number * 1000)
+    pose = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id="map"))
+    pose.pose.pose.orientation.z = 0.1 * number
+    pose.pose.covariance = np.arange(36) * 0.1 + number
+    status = DiagnosticStatus(
+        level=b"\x02", name="a", message="ü", hardware_id="", values=[KeyValue(key="k", value=str(number))]
+    )
+    array = Float64MultiArray(data=[float(number), float("nan"), float("inf")])
+    array.layout = MultiArrayLayout(dim=[MultiArrayDimension(label="x", size=3, stride=1)], data_offset=number)
+    joints = JointState(header=Header(stamp=stamp), name=["a", "b"], position=[1.0 / (number + 1), -2.0])
+    return {
+        "/pose": pose,
+        "/status": DiagnosticArray(header=Header(stamp=stamp), status=[status, status]),
+        "/array": array,
+        "/joints": joints,
+        "/twist": Twist(),
+        "/text": String(data="x" * number),
+        "/nothing": Empty(),
+    }
+
+
+def padded(data: bytes) -> bytes:
+    """As it travels: whole words of four bytes. What was recorded from topics has this form already."""
+    return bytes(data) + bytes(-len(data) % 4)
+
+
+def recorder(world: World, topics: Any, output: Path, *more: str) -> Any:
+    process = world.command("record", *topics, "--output", output, *more)
+    process.says("recording")
+    return process
+
+
+def test_what_was_published_is_what_the_file_holds(world: World, tmp_path: Path) -> None:
+    first = some_messages(0)
+    publishers = {topic: world.publisher(type(m), topic) for topic, m in first.items()}
+    output = tmp_path / "out.mcap"
+    process = recorder(world, publishers, output, "--note", "rig=number 7")
+    world.subscribed(*publishers.values())
+    sent = []
+    for number in range(20):
+        for topic, m in some_messages(number).items():
+            publishers[topic].publish(m)
+            sent.append((topic, m))
+            time.sleep(0.001)
+    time.sleep(0.5)
+    process.signal(signal.SIGINT)
+    assert f"{output}: {len(sent)} messages of 7 topics" in process.succeed()
+    assert not (tmp_path / "out.mcap.part").exists()
+
+    bag = Bag(output)
+    assert not bag.warnings
+    raw = list(bag.raw_messages())
+    read = [(m.topic, repr(deserialize_message(m.data, type(first[m.topic])))) for m in raw]
+    assert read == [(topic, repr(m)) for topic, m in sent]  # repr: a NaN differs from itself
+    assert all(a.log_time_ns <= b.log_time_ns for a, b in zip(raw, raw[1:], strict=False))
+    assert abs(raw[0].log_time_ns - time.time_ns()) < 60e9
+    decoded = {t: list(m for topic, _, m in bag.messages([t])) for t in ("/pose", "/joints", "/array", "/status")}
+    assert decoded["/pose"][3].pose.covariance.tolist() == some_messages(3)["/pose"].pose.covariance.tolist()
+    assert decoded["/joints"][4].position.tolist() == [0.2, -2.0]
+    assert decoded["/array"][2].layout.dim[0].label == "x" and np.isnan(decoded["/array"][2].data[1])
+    assert decoded["/status"][7].status[1].values[0].value == "7"
+
+    with AnyReader([output]) as reader:  # another reader, from the definitions in the file
+        assert {c.topic: c.msgtype for c in reader.connections} == {
+            t: f"{type(m).__module__.split('.')[0]}/msg/{type(m).__name__}" for t, m in first.items()
+        }
+        store: Typestore = reader.typestore
+        read = [(c.topic, store.deserialize_cdr(data, c.msgtype)) for c, _, data in reader.messages()]
+    assert [m.data for topic, m in read if topic == "/text"] == ["x" * number for number in range(20)]
+    contents = output.read_bytes()
+    assert b"rig" in contents and b"number 7" in contents and contents.startswith(b"\x89MCAP0\r\n")
+
+
+def test_recording_takes_the_quality_of_service_it_finds_and_writes_it_down(world: World, tmp_path: Path) -> None:
+    loose = world.publisher(Float64, "/loose", QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+    lasting = world.publisher(String, "/lasting", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    lasting.publish(String(data="said before anybody listened"))
+    output = tmp_path / "out.mcap"
+    process = recorder(world, ["/loose", "/lasting"], output)
+    world.subscribed(loose)
+    loose.publish(Float64(data=1.0))
+    time.sleep(0.5)
+    process.signal(signal.SIGTERM)
+    process.succeed()
+    by_topic = {m.topic: m for m in Bag(output).raw_messages()}
+    assert by_topic.keys() == {"/loose", "/lasting"}
+    said = {topic: m.channel.metadata["offered_qos_profiles"] for topic, m in by_topic.items()}
+    assert "reliability: best_effort" in said["/loose"] and "durability: transient_local" in said["/lasting"]
+    # and it is offered again, so that whoever comes late hears it as well
+    world.node.destroy_publisher(lasting)
+    player = world.command("play", output, "--topics", "/lasting", "--wait", 2)
+    player.says("nobody subscribes")
+    assert player.succeed()
+
+
+def test_recording_waits_for_topics_and_stops_after_the_duration(world: World, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    process = world.command("record", "/late", "--output", output, "--duration", "0.6")
+    process.says("waiting for /late")
+    late = world.publisher(Float64, "late")
+    world.subscribed(late)
+    for k in range(200):
+        late.publish(Float64(data=float(k)))
+        time.sleep(0.01)
+        if not process.running:
+            break
+    process.succeed()
+    values = [m.data for _, _, m in Bag(tmp_path / "out.mcap").messages(["/late"])]
+    assert values == [float(k) for k in range(len(values))] and 30 < len(values) < 120
+
+
+def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    numbers = world.publisher(Float64, "/numbers")
+    process = recorder(world, ["/numbers"], output)
+    world.subscribed(numbers)
+    end = time.monotonic() + 5.0
+    while time.monotonic() < end:
+        numbers.publish(Float64(data=1.0))
+        time.sleep(0.01)
+    process.kill()
+    assert not output.exists()
+    bag = Bag(tmp_path / "out.mcap.part")
+    assert bag.warnings and 150 < len(list(bag.messages(["/numbers"])))
+
+
+def test_what_cannot_be_recorded_is_said_in_a_sentence(world: World, tmp_path: Path) -> None:
+    (tmp_path / "there.mcap").write_bytes(b"old")
+    refused = [
+        (["/a", "-o", tmp_path / "there.mcap"], "is there already"),
+        (["/a", "-o", tmp_path / "no" / "x.mcap"], "cannot be written"),
+        (["/a", "/b", "-o", tmp_path / "x.mcap", "--wait", "0.5"], "/a, /b: not there after 0.5 s"),
+    ]
+    for arguments, sentence in refused:
+        process = world.command("record", *arguments)
+        assert process.wait() == 1 and sentence in process.output, process.output
+        assert "Traceback" not in process.output
+    assert (tmp_path / "there.mcap").read_bytes() == b"old"
+    silent = world.publisher(Float64, "/silent")
+    process = recorder(world, ["/silent"], tmp_path / "x.mcap")
+    world.subscribed(silent)
+    process.signal(signal.SIGINT)
+    assert process.wait() == 1 and "no message came on /silent" in process.output
+    assert sorted(p.name for p in tmp_path.glob("*.mcap*")) == ["there.mcap"]
+
+
+# --- play ---------------------------------------------------------------------------------------------------
+
+
+def mixed_bag(path: Path, number: int = 300, step_ns: int = 4_000_000) -> Path:
+    rng = np.random.default_rng(3)
+    messages = []
+    for k in range(number):
+        t = START_NS + k * step_ns
+        stamp = header(t - 7)
+        joints = cdr(
+            "sensor_msgs/msg/JointState", header=stamp, name=["a"], position=rng.normal(size=1),
+            velocity=np.empty(0), effort=np.empty(0),
+        )  # fmt: skip
+        messages.append(Message("/joints", t, joints))
+        messages.append(Message("/number", t + int(rng.integers(0, step_ns)), float64(float(k))))
+        if k % 10 == 0:
+            text = cdr("std_msgs/msg/String", little_endian=k % 20 == 0, data=f"text {k}")
+            messages.append(Message("/text", t, text))
+    messages.sort(key=lambda m: m.log_time)
+    topics = [Topic("/joints", "sensor_msgs/msg/JointState"), Topic("/number"), Topic("/text", "std_msgs/msg/String")]
+    return write(topics, messages).save(path)
+
+
+def test_played_and_recorded_again_every_message_has_the_same_bytes(world: World, tmp_path: Path) -> None:
+    bag = mixed_bag(tmp_path / "in.mcap")
+    output = tmp_path / "out.mcap"
+    topics = ("/joints", "/number", "/text")
+    before = list(Bag(bag).raw_messages())
+    span = (before[-1].log_time_ns - before[0].log_time_ns) * 1e-9
+    recording = world.command("record", *topics, "--output", output)
+    player = world.command("play", bag, "--rate", "2")
+    said = player.succeed()
+    took = float(re.search(r"in ([\d.]+) s", said)[1])
+    assert span / 2 <= took < span / 2 + 1.0 and f"played {len(before)} messages of 3 topics" in said
+    recording.signal(signal.SIGINT)
+    recording.succeed()
+    after = list(Bag(output).raw_messages())
+    assert [(m.topic, m.type, m.data) for m in after] == [(m.topic, m.type, padded(m.data)) for m in before]
+    # paced as recorded, not in bursts: the median distance between two messages of one topic is half of what it was
+    for topic in ("/joints", "/number"):
+        steps = [np.median(np.diff([m.log_time_ns for m in bag if m.topic == topic])) for bag in (before, after)]
+        assert steps[1] == pytest.approx(steps[0] / 2, rel=0.2)
+
+
+def test_messages_that_lie_close_together_arrive_all_the_same(world: World, tmp_path: Path) -> None:
+    """3000 messages within 3 microseconds of log time."""
+    bag = write([Topic("/burst")], ramp("/burst", range(START_NS, START_NS + 3000))).save(tmp_path / "in.mcap")
+    heard = world.listen(Float64, "/burst", 1000)
+    player = world.command("play", bag)
+    player.succeed()
+    assert [m.data for m in heard.count(3000)] == [float(k) for k in range(3000)]
+    assert "fell behind" in player.output
+
+
+def test_the_clock_goes_before_each_message(world: World, tmp_path: Path) -> None:
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 10**8))).save(tmp_path / "in.mcap")
+    clock, heard = world.listen(Clock, "/clock"), world.listen(Float64, "/x")
+    world.command("play", bag, "--clock").succeed()
+    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in clock.count(10)]
+    assert times == [m.log_time_ns for m in Bag(bag).raw_messages()]
+    heard.count(10)
+    assert all(a < b for a, b in zip(clock.times, heard.times, strict=True))
+
+
+def test_what_cannot_be_played_is_said(world: World, tmp_path: Path) -> None:
+    other = "float64 data\nfloat64 more\n"
+    topics = [
+        Topic("/good"),
+        Topic("/foreign", "frost_interfaces/msg/UCommand", schema="float64 fin\n"),
+        Topic("/other", "std_msgs/msg/Float64", schema=other),
+        Topic("/json", encoding="json"),
+    ]
+    messages = [Message(t.name, START_NS + k, float64(1.0)) for k, t in enumerate(topics)]
+    bag = write(topics, messages).save(tmp_path / "in.mcap")
+    player = world.command("play", bag, "--wait", "0.5")
+    said = player.succeed()
+    assert "/foreign is not played: frost_interfaces/msg/UCommand: the Python package frost_interfaces" in said
+    assert "/other is not played: std_msgs/msg/Float64 was recorded in another version" in said
+    assert "/json is not played: its messages are in json" in said
+    assert "nobody subscribes to /good after 0.5 s" in said and "played 1 messages of 1 topics" in said
+    refused = [
+        ([bag, "--topics", "/foreign"], "no topic of it can be played"),
+        ([bag, "--topics", "/nowhere"], "there is no topic /nowhere; topics there: /foreign, /good"),
+        ([tmp_path / "none.mcap"], "none.mcap"),
+        ([bag, "--lockstep", "nobody", "--wait", "0.5"], "/nobody/status: no such service after 0.5 s"),
+        ([bag, "--lockstep", "nobody", "--rate", "2"], "leave out --rate"),
+    ]
+    for arguments, sentence in refused:
+        process = world.command("play", *arguments)
+        assert process.wait() == 1 and sentence in process.output, process.output
+        assert "Traceback" not in process.output
+
+
+def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 60 * 10**9, 10**8))).save(tmp_path / "in.mcap")
+    heard = world.listen(Float64, "/x")
+    player = world.command("play", bag)
+    heard.count(3)
+    player.signal(signal.SIGINT)
+    assert "Traceback" not in player.succeed(5)
+
+
+# --- the plant ----------------------------------------------------------------------------------------------
+
+
+def arrays(bag: Bag) -> tuple[list[int], np.ndarray, list[int], np.ndarray]:
+    found: list[Any] = []
+    for topic in (STATE_TOPIC, CONTROL_TOPIC):
+        read = [m for _, _, m in bag.messages([topic])]
+        found += [
+            [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in read],
+            np.array([m.position for m in read]),
+        ]
+    return tuple(found)  # type: ignore[return-value]
+
+
+def drawn_as(bag: Bag, **how: Any) -> Transient:
+    """Hold a recording of the plant against the transient it was made from, bit by bit."""
+    state_ns, x, control_ns, u = arrays(bag)
+    expected = transient(start_ns=state_ns[0], **how)
+    assert state_ns == control_ns == expected.t_ns.tolist()
+    assert x.tobytes() == expected.x.tobytes() and u.tobytes() == expected.u.tobytes()
+    return expected
+
+
+def test_the_plant_is_recorded_to_the_last_bit(world: World, tmp_path: Path) -> None:
+    output = tmp_path / "plant.mcap"
+    recording = world.command("record", STATE_TOPIC, CONTROL_TOPIC, "--output", output)
+    world.run_node("plant", {"steps": 300, "seed": 5, "rate": 10.0}).succeed()
+    recording.signal(signal.SIGINT)
+    recording.succeed()
+    drawn_as(Bag(output), steps=300, seed=5)
+
+
+def test_the_plant_without_a_listener_says_so(world: World) -> None:
+    process = world.run_node("plant", {"steps": 10, "wait": 0.5})
+    assert process.wait() == 2 and "no subscriber of both topics within 0.5 s" in process.output
+
+
+def test_the_shipped_recordings_are_what_their_description_says() -> None:
+    model = leibov2006()
+    healthy = drawn_as(Bag(ROOT / "bags" / "leibov_fit.mcap"), steps=6000, seed=1)
+    check = drawn_as(Bag(ROOT / "bags" / "leibov_check.mcap"), steps=2400, seed=2, fault_at=1200)
+    for run, faulty in ((healthy, 6000), (check, 1200)):
+        x, u, dt = run.x[:-1], run.u[:-1], run.dt
+        lower, upper = model.bounds(x, u, dt)
+        outside = ((run.x[1:] < lower) | (run.x[1:] > upper)).any(axis=1)
+        assert not outside[:faulty].any()
+        assert len(outside) == faulty - 1 or outside[faulty:].mean() > 0.5
+    for name in ("leibov_fit", "leibov_check"):
+        assert (ROOT / "bags" / f"{name}.mcap").stat().st_size < 1_000_000
