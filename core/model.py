@@ -212,11 +212,12 @@ class UncertainLTI:
         flat_x = np.broadcast_to(x, (*lead, self.n)).reshape(count, self.n)
         flat_u = np.broadcast_to(u, (*lead, self.m)).reshape(count, self.m)
         flat_dt = np.broadcast_to(dt, lead).reshape(count)
-        centre, half = np.empty(flat_x.shape), np.empty(flat_x.shape)
-        for start in range(0, len(flat_dt), _BLOCK):
+        centre, half = np.empty((self.n, count)), np.empty((self.n, count))
+        for start in range(0, count, _BLOCK):
             part = slice(start, start + _BLOCK)
-            self._block(flat_x[part], flat_u[part], flat_dt[part], centre[part], half[part])
-        return centre.reshape(*lead, self.n), half.reshape(*lead, self.n)
+            z = np.vstack([flat_x[part].T, flat_u[part].T])
+            self.columns_centre_and_half(z, flat_dt[part], centre[:, part], half[:, part])
+        return centre.T.reshape(*lead, self.n), half.T.reshape(*lead, self.n)
 
     # Both paths below do the same operations on each element in the same order (and never BLAS, whose order
     # depends on shapes), so one sample and a million give the same bits.
@@ -234,13 +235,13 @@ class UncertainLTI:
         spread *= dt
         return x + rate, spread + self.v
 
-    def _block(self, x: Array, u: Array, dt: Array, centre: Array, half: Array) -> None:
-        z = np.vstack([x.T, u.T])
+    def columns_centre_and_half(self, z: Array, dt: Array, centre: Array, half: Array) -> None:
+        """`centre_and_half` for samples in columns, into given arrays: z (n + m, K), dt (K,), centre, half (n, K)."""
         size = np.abs(z)
         product = np.empty(len(dt))
         for i in range(self.n):
-            rate = z[0] * self._nominal[0][i]
-            spread = size[0] * self._spread[0][i]
+            rate = np.multiply(z[0], self._nominal[0][i], out=centre[i])
+            spread = np.multiply(size[0], self._spread[0][i], out=half[i])
             for j in range(1, self.n + self.m):
                 rate += np.multiply(z[j], self._nominal[j][i], out=product)
                 spread += np.multiply(size[j], self._spread[j][i], out=product)
@@ -248,8 +249,8 @@ class UncertainLTI:
             spread += self.dc[i]
             rate *= dt
             spread *= dt
-            np.add(z[i], rate, out=centre[:, i])
-            np.add(spread, self.v[i], out=half[:, i])
+            rate += z[i]  # x + Δt (...), to the bit: addition commutes
+            spread += self.v[i]
 
     def bounds(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0) -> tuple[Array, Array]:
         """One-step bounds, Leibov (2006), eqs. (6)(7) with the additive terms.
