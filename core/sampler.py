@@ -19,6 +19,8 @@ BUFFERED_MESSAGES = 10_000
 """Messages kept per topic that wait for a later sample; older ones go first."""
 REMEMBERED_SAMPLES = 100
 """Closed samples that a message is held against to see whether it came late."""
+KEPT_OVER_A_JUMP = 100
+"""Messages kept per topic, whatever has been chosen, once its time has stepped back and the clock's has not yet."""
 
 
 def to_ns(seconds: float) -> int:
@@ -78,13 +80,13 @@ class _Message:
 class _Topic:
     """Messages of one topic that may still be chosen, and how far it got."""
 
-    __slots__ = ("header", "kept", "last", "jumped", "closed", "unwrap", "previous", "steady")
+    __slots__ = ("header", "kept", "last", "ahead", "closed", "unwrap", "previous", "steady")
 
     def __init__(self, header: bool, unwrap: list[int], steady: list[float]) -> None:
         self.header = header
         self.kept: deque[_Message] = deque(maxlen=BUFFERED_MESSAGES)
         self.last: dict[bool, int] = {}  # instant of the last message with a stamp, and of the last one without
-        self.jumped = False  # stepped back since the last closing
+        self.ahead = False  # its time has stepped back, the clock's perhaps not yet
         self.closed: deque[tuple[_Message, _Message | None]] = deque(maxlen=REMEMBERED_SAMPLES)  # and what they chose
         self.unwrap = unwrap
         self.steady = steady
@@ -118,11 +120,15 @@ class _Topic:
         return chosen
 
     def close(self, sample: _Message, chosen: _Message | None, reset: bool) -> None:
-        """Forget what no later sample can choose: nothing where time jumps, as later samples are earlier then."""
-        if chosen is not None and not (reset or self.jumped):
+        """Forget what no later sample can choose.
+
+        Where time jumps, later samples are earlier: what came before them on the new time is kept.
+        """
+        jumps = reset or (self.ahead and len(self.kept) < KEPT_OVER_A_JUMP)
+        if chosen is not None and not jumps:
             self.kept = deque((m for m in self.kept if m is chosen or _behind(sample, m) < 0), BUFFERED_MESSAGES)
-        self.jumped = False
         if reset:
+            self.ahead = False
             self.closed.clear()  # nothing of this pass can be late for a sample of the one before
         else:
             self.closed.append((sample, chosen))
@@ -220,7 +226,7 @@ class Sampler:
         if state.steps_back(message, self.max_gap_ns):  # a looped bag: what was kept belongs to the last pass
             state.kept.clear()
             state.closed.clear()
-            state.jumped = True
+            state.ahead = True
             state.previous = list(state.steady)
         elif state.came_late(message):
             self.counters[f"late {topic}"] += 1
@@ -333,11 +339,27 @@ class Sampler:
 def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> int | None:
     """Median of the forward steps of clock instants over all recordings, ns; None where there is no step.
 
-    Equal stamps and steps back do not count, nor do steps under min_step_ns.
+    Equal stamps and steps back do not count; an instant less than min_step_ns after the one before is passed over,
+    as the sampler does.
     """
-    forward = [steps[(steps > 0) & (steps >= min_step_ns)] for steps in map(np.diff, instants)]
-    pooled = np.concatenate(forward) if forward else np.empty(0, np.int64)
+    pooled = np.concatenate([np.empty(0, np.int64), *(_forward_steps(i, min_step_ns) for i in instants)])
     return int(np.median(pooled)) if pooled.size else None
+
+
+def _forward_steps(instants: NDArray[np.int64], min_step_ns: int) -> NDArray[np.int64]:
+    steps = np.diff(instants)
+    forward = steps[steps > 0]
+    if (forward >= min_step_ns).all():
+        return forward
+    longer = []
+    last = int(instants[0])
+    for instant in instants.tolist()[1:]:
+        if instant - last >= min_step_ns:
+            longer.append(instant - last)
+        elif instant >= last:
+            continue
+        last = instant
+    return np.array(longer, dtype=np.int64)
 
 
 def resolve(

@@ -1,0 +1,588 @@
+"""The Sampler against the rules of DESIGN.md, worked out naively with every message in hand."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uncertain_lti.errors import SignalError
+from uncertain_lti.sampler import BUFFERED_MESSAGES, Sampler, Status, Step, median_step_ns, resolve, to_ns
+from uncertain_lti.signals import Signal, SignalMap
+
+TICK = 10_000_000  # ns
+NAN, INF = math.nan, math.inf
+
+
+class Sent(NamedTuple):
+    """A message on its way in; stamp None where it has none."""
+
+    topic: str
+    arrival: int
+    stamp: int | None
+    values: tuple[float, ...]
+
+
+# --- the reference: the rules of DESIGN.md, one after the other, over the whole list of messages -------------
+
+
+@dataclass
+class Sample:
+    """An accepted clock message: which one, what it is, and which message closed it."""
+
+    index: int
+    instant: int
+    status: Status
+    dt: float
+    closed_by: int | None = None
+    reset_by: int = 0  # number of resets so far: the pass it belongs to
+    chosen: dict[str, int | None] = field(default_factory=dict)
+    z: list[float] = field(default_factory=list)
+    missing: bool = False
+
+
+class Reference:
+    """What becomes of each clock message of a list.
+
+    forgets: a message that was passed over when a sample closed is not looked at again (memory is bounded), unless
+    time has jumped back; False is the letter of the rules, and the same as long as no time jumps and no topic has
+    some messages with a stamp and some without.
+    """
+
+    def __init__(self, signals: SignalMap, messages: Sequence[Sent], forgets: bool) -> None:
+        self.signals, self.sent, self.forgets = signals, messages, forgets
+        self.max_gap, self.min_step = to_ns(signals.max_gap), to_ns(signals.min_step)
+        self.n = len(signals.states)
+        self.counters: Counter[str] = Counter()
+        self.dropped: dict[int, tuple[Status, int]] = {}
+        self.others = [t for t in signals.topics if t != signals.clock]
+        self.samples = self._samples()
+        self.values = {t: self._values(t) for t in signals.topics}
+        for sample in self.samples:
+            if sample.closed_by is not None:
+                self._close(sample)
+        self._delay()
+        self._late()
+
+    def stamp(self, index: int) -> int | None:
+        stamp = self.sent[index].stamp
+        usable = self.signals.time[self.sent[index].topic] == "header" and stamp is not None and stamp > 0
+        return stamp if usable else None
+
+    def of(self, topic: str) -> list[int]:
+        return [i for i, m in enumerate(self.sent) if m.topic == topic]
+
+    def _samples(self) -> list[Sample]:
+        samples: list[Sample] = []
+        resets = 0
+        for index in self.of(self.signals.clock):
+            by_header = self.signals.time[self.signals.clock] == "header"
+            instant = self.stamp(index) if by_header else self.sent[index].arrival
+            if instant is None:
+                self._drop(index, Status.UNSTAMPED, self.sent[index].arrival)
+                continue
+            status, dt = Status.FIRST, NAN
+            if samples:
+                step = instant - samples[-1].instant
+                if step == 0:
+                    self._drop(index, Status.EQUAL, instant)
+                    continue
+                if step < 0 and -step <= self.max_gap:
+                    self._drop(index, Status.LATE, instant)
+                    continue
+                if step < 0:
+                    status = Status.RESET
+                    resets += 1
+                elif step < self.min_step:
+                    self._drop(index, Status.SHORT, instant)
+                    continue
+                else:
+                    status, dt = (Status.GAP if step > self.max_gap else Status.OK), step * 1e-9
+                samples[-1].closed_by = index
+            samples.append(Sample(index, instant, status, dt, reset_by=resets))
+        self.counters["samples"] = len(samples)
+        self.counters["gaps"] = sum(s.status is Status.GAP for s in samples)
+        self.counters["resets"] = resets
+        return samples
+
+    def _drop(self, index: int, status: Status, instant: int) -> None:
+        self.dropped[index] = (status, instant)
+        self.counters[status.value] += 1
+
+    def steps_back(self, topic: str) -> list[int]:
+        """Messages with which a topic's own time steps back by more than max_gap."""
+        found = []
+        for stamped in (True, False):
+            mine = [i for i in self.of(topic) if (self.stamp(i) is not None) == stamped]
+            instants = [self.stamp(i) if stamped else self.sent[i].arrival for i in mine]
+            found += [
+                i for i, now, last in zip(mine[1:], instants[1:], instants, strict=False) if last - now > self.max_gap
+            ]
+        return sorted(found)
+
+    def _values(self, topic: str) -> dict[int, list[float]]:
+        """Values of each message with angles unwrapped from where the stream starts anew."""
+        where = self.signals.on(topic)
+        clock = topic == self.signals.clock
+        starts = {s.index for s in self.samples if s.status.opens_segment} if clock else {*self.steps_back(topic)}
+        taken = [s.index for s in self.samples] if clock else self.of(topic)
+        values = {i: list(self.sent[i].values) for i in taken}
+        for column, position in enumerate(where):
+            signal = self.signals.signals[position]
+            if not signal.field.startswith("unwrap"):
+                continue
+            last = signal.steady
+            for i in taken:
+                if i in starts:
+                    last = signal.steady
+                if math.isfinite(values[i][column]):
+                    turns = round((last - values[i][column]) / (2 * math.pi))
+                    last = values[i][column] = values[i][column] + 2 * math.pi * turns
+        return values
+
+    def age(self, sample: Sample, index: int) -> int:
+        ours, theirs = self.stamp(sample.index), self.stamp(index)
+        if ours is None or theirs is None:
+            return self.sent[sample.index].arrival - self.sent[index].arrival
+        return ours - theirs
+
+    def jump(self, sample: Sample, topic: str) -> int:
+        """The last message with which the topic stepped back before the sample closed; -1 without any."""
+        return max([i for i in self.steps_back(topic) if i < sample.closed_by], default=-1)
+
+    def passed_over(self, topic: str, before: Sample) -> set[int]:
+        gone: set[int] = set()
+        for sample, closing in zip(self.samples, self.samples[1:], strict=False):
+            if sample is before:
+                break
+            reset = max(
+                [s.index for s in self.samples if s.status is Status.RESET and s.index < closing.index], default=-1
+            )
+            if closing.status is Status.RESET or self.jump(sample, topic) > reset:
+                continue
+            arrived = [i for i in self.of(topic) if self.jump(sample, topic) <= i < sample.closed_by]
+            gone |= {i for i in arrived if self.age(sample, i) >= 0} - {sample.chosen[topic]}
+        return gone
+
+    def _close(self, sample: Sample) -> None:
+        z = [NAN] * len(self.signals.signals)
+        for topic in self.signals.topics:
+            where = self.signals.on(topic)
+            if topic == self.signals.clock:
+                chosen, age = sample.index, 0
+            else:
+                candidates = [i for i in self.of(topic) if self.jump(sample, topic) <= i < sample.closed_by]
+                if self.forgets:
+                    gone = self.passed_over(topic, sample)
+                    candidates = [i for i in candidates if i not in gone]
+                ages = [(self.age(sample, i), -i) for i in candidates if self.age(sample, i) >= 0]
+                sample.chosen[topic] = None
+                if not ages:
+                    continue
+                age, chosen = min(ages)
+                chosen = sample.chosen[topic] = -chosen
+            for position, value in zip(where, self.values[topic][chosen], strict=True):
+                signal = self.signals.signals[position]
+                limit = self.signals.max_skew or self.signals.max_gap
+                if position >= self.n:
+                    limit = signal.max_hold
+                if limit is not None and age > to_ns(limit):
+                    self.counters[f"stale {signal.name}"] += 1
+                else:
+                    z[position] = value
+        sample.z = z
+
+    def _delay(self) -> None:
+        """u(t_k - delay) of the same segment in place of u(t_k)."""
+        closed = [s for s in self.samples if s.closed_by is not None]
+        before = [list(s.z) for s in closed]
+        for k, sample in enumerate(closed):
+            for j, control in enumerate(self.signals.controls, start=self.n):
+                source = k - control.delay
+                joined = source >= 0 and not any(s.status.opens_segment for s in closed[source + 1 : k + 1])
+                sample.z[j] = before[source][j] if joined else NAN
+            for signal, value in zip(self.signals.signals, sample.z, strict=True):
+                self.counters[f"missing {signal.name}"] += not math.isfinite(value)
+
+    def _late(self) -> None:
+        """Messages that came after a sample closed, and would have been chosen for it."""
+        for topic in self.others:
+            jumps = self.steps_back(topic)
+            for index in self.of(topic):
+                passed = sum(s.status is Status.RESET and s.index < index for s in self.samples)
+                for sample in self.samples:
+                    if sample.closed_by is None or sample.closed_by > index or sample.reset_by != passed:
+                        continue
+                    if any(sample.closed_by < j <= index for j in jumps):
+                        continue
+                    chosen, age = sample.chosen[topic], self.age(sample, index)
+                    if age >= 0 and (chosen is None or age <= self.age(sample, chosen)):
+                        self.counters[f"late {topic}"] += 1
+                        break
+
+    def steps(self) -> list[list[Step]]:
+        """Steps that each message decides."""
+        decided: list[list[Step]] = [[] for _ in self.sent]
+        n, m = self.n, len(self.signals.controls)
+        nothing = np.full(n + m, NAN)
+        for index, (status, instant) in self.dropped.items():
+            arrival = self.sent[index].arrival
+            decided[index].append(Step(status, instant, arrival, NAN, nothing[:n], nothing[n:], nothing[:n]))
+        one_topic = all(s.topic == self.signals.clock for s in self.signals.states)
+        for before, sample in zip([None, *self.samples], self.samples, strict=False):
+            index = sample.index if one_topic else sample.closed_by
+            if index is None:
+                continue
+            if one_topic:
+                row = [NAN] * (n + m)
+                for position, value in zip(
+                    self.signals.on(self.signals.clock), self.values[self.signals.clock][sample.index], strict=True
+                ):
+                    row[position] = value
+                x_next = np.array(row[:n])
+            else:
+                x_next = np.array(sample.z[:n])
+            z = nothing
+            if before is not None and sample.status is not Status.RESET:
+                z = np.array(before.z)
+            status = sample.status
+            if status is Status.OK and not (np.isfinite(z).all() and np.isfinite(x_next).all()):
+                status = Status.MISSING
+                self.counters["missing"] += 1
+            decided[index].append(
+                Step(status, sample.instant, self.sent[sample.index].arrival, sample.dt, z[:n], z[n:], x_next)
+            )
+        return decided
+
+
+def plain(step: Step) -> tuple[object, ...]:
+    """A step as something that can be compared: numbers by their bits."""
+    return (
+        step.status,
+        step.t_ns,
+        step.arrival_ns,
+        float(step.dt).hex(),
+        *([float(v).hex() for v in row] for row in (step.x, step.u, step.x_next)),
+    )
+
+
+def run(signals: SignalMap, messages: Sequence[Sent]) -> tuple[list[list[Step]], Sampler]:
+    sampler = Sampler(signals)
+    return [sampler.push(*message) for message in messages], sampler
+
+
+def only(steps: list[list[Step]]) -> list[Step]:
+    return [step for decided in steps for step in decided]
+
+
+# --- random maps and streams --------------------------------------------------------------------------------
+
+
+@st.composite
+def maps(draw: st.DrawFn) -> SignalMap:
+    """Clock /c; a second state on /c or on /s; controls on /c, /s, /u, /v."""
+    limits = st.sampled_from([None, 0.0, 0.02, 0.05, 1.0])
+    states = [
+        Signal("x1", "/c", draw(st.sampled_from(["data", "unwrap(data)"])), steady=draw(st.sampled_from([0.0, 7.0])))
+    ]
+    if draw(st.booleans()):
+        states.append(
+            Signal("x2", draw(st.sampled_from(["/c", "/s"])), draw(st.sampled_from(["data", "unwrap(data)"])))
+        )
+    controls = [
+        Signal(f"u{j}", topic, "data", max_hold=draw(limits), delay=draw(st.sampled_from([0, 0, 0, 1, 3])))
+        for j, topic in enumerate(draw(st.lists(st.sampled_from(["/c", "/s", "/u", "/u", "/v"]), max_size=3)))
+    ]
+    topics = dict.fromkeys(s.topic for s in [*states, *controls])
+    return SignalMap(
+        tuple(states),
+        tuple(controls),
+        clock="/c",
+        max_gap=draw(st.sampled_from([0.02, 0.05, 0.2])),
+        min_step=draw(st.sampled_from([0.0, 0.0, 0.02])),
+        max_skew=draw(st.sampled_from([None, None, 0.02, 1.0])),
+        time={t: draw(st.sampled_from(["header", "header", "log"])) for t in topics},
+    )
+
+
+VALUES = st.sampled_from([0.0, 1.0, -2.5, 3.0, -3.1, 3.1, 6.0, 100.0])
+BROKEN = st.sampled_from([NAN, INF, -INF])
+
+
+@st.composite
+def streams(draw: st.DrawFn, signals: SignalMap, tame: bool = False) -> list[Sent]:
+    """Messages in order of arrival.
+
+    tame: no zero stamps and no jumps, so that every rule applies to the letter.
+    """
+    lags = {t: draw(st.sampled_from([0, 0, 1, 3])) for t in signals.topics}
+    rough = draw(st.sampled_from([0, 0, 1, 3]))  # of ten messages, how many stray
+    values = draw(st.sampled_from([VALUES, VALUES, VALUES | BROKEN]))
+    messages = []
+    now, shift = 100, dict.fromkeys(signals.topics, 0)
+    for _ in range(draw(st.integers(0, 40))):
+        now += draw(st.sampled_from([0, 0, 1, 1, 1, 2, 2, 3, 25] if rough > 1 else [0, 1, 1, 1, 2]))
+        topic = draw(st.sampled_from([*signals.topics, "/c"]))
+        stray = draw(st.integers(0, 9)) < rough
+        if not tame and draw(st.integers(0, 14)) == 0:  # time jumps, for all topics or for one
+            jump = draw(st.sampled_from([-30, -8, -4, 40]))
+            for each in draw(st.sampled_from([list(signals.topics), [topic]])):
+                shift[each] += jump
+            if now >= 130 and draw(st.booleans()):
+                now -= 30  # as the node's clock does when a bag is played anew with /clock
+        stamp: int | None = now - lags[topic] + shift[topic]
+        if stray:
+            stamp -= draw(st.sampled_from([1, 2, 4, -1, -3]))
+        stamp = max(1, stamp) * TICK
+        if stray and not tame:
+            stamp = draw(st.sampled_from([stamp, stamp, None, 0, -stamp]))
+        messages.append(Sent(topic, now * TICK, stamp, tuple(draw(values) for _ in signals.on(topic))))
+    return messages
+
+
+@st.composite
+def cases(draw: st.DrawFn, tame: bool = False) -> tuple[SignalMap, list[Sent]]:
+    signals = draw(maps())
+    return signals, draw(streams(signals, tame))
+
+
+def hold_against(reference: Reference, signals: SignalMap, messages: list[Sent]) -> None:
+    got, sampler = run(signals, messages)
+    wanted = reference.steps()
+    for index, (mine, theirs) in enumerate(zip(got, wanted, strict=True)):
+        assert [plain(s) for s in mine] == [plain(s) for s in theirs], f"at message {index}: {messages[index]}"
+    assert +sampler.counters == +reference.counters
+
+
+@settings(max_examples=500)
+@given(cases(tame=True))
+def test_tame_streams_follow_the_letter_of_the_rules(case: tuple[SignalMap, list[Sent]]) -> None:
+    """Several topics, late and out of order, equal stamps, gaps, NaN, stale, delayed: nothing is left to memory."""
+    signals, messages = case
+    resets = any(s.status is Status.RESET for s in Reference(signals, messages, forgets=False).samples)
+    jumps = any(Reference(signals, messages, forgets=False).steps_back(t) for t in signals.topics)
+    hold_against(Reference(signals, messages, forgets=resets or jumps), signals, messages)
+
+
+@settings(max_examples=700)
+@given(cases())
+def test_wild_streams_follow_the_rules_too(case: tuple[SignalMap, list[Sent]]) -> None:
+    """With zero stamps, jumps of one topic or of all, a node clock that jumps back, in any combination."""
+    signals, messages = case
+    hold_against(Reference(signals, messages, forgets=True), signals, messages)
+
+
+# --- what a looped bag gives --------------------------------------------------------------------------------
+
+
+@st.composite
+def loops(draw: st.DrawFn) -> tuple[SignalMap, list[Sent]]:
+    """Two passes of one bag that overlap where they meet; the second arrives 100 ticks after the first."""
+    signals = draw(maps())
+    signals = replace(signals, time=dict.fromkeys(signals.topics, "header"))
+    merged = sorted(
+        (tick * TICK, topic)
+        for topic in signals.topics
+        for tick in range(draw(st.integers(1, 3)), 30, draw(st.sampled_from([1, 2, 3])))
+    )
+    first = [Sent(topic, t, t, tuple(draw(VALUES) for _ in signals.on(topic))) for t, topic in merged]
+    second = [m._replace(arrival=m.arrival + 100 * TICK) for m in first]
+    overlap = draw(st.integers(0, min(15, len(first))))
+    seam = first[-overlap:] + second[:overlap] if overlap else []
+    queues = {topic: [m for m in seam if m.topic == topic] for topic in signals.topics}
+    mixed = [queues[m.topic].pop(0) for m in draw(st.permutations(seam))]  # topics overtake each other
+    return signals, first[: len(first) - overlap] + mixed + second[overlap:]
+
+
+@settings(max_examples=150)
+@given(loops())
+def test_each_pass_of_a_looped_bag_is_as_on_its_own(case: tuple[SignalMap, list[Sent]]) -> None:
+    """However topics overtake each other where the passes meet; and nothing of a pass is late for the one before."""
+    signals, messages = case
+    both, _ = run(signals, messages)
+    (begin,) = [i for i, decided in enumerate(both) for step in decided if step.status is Status.RESET]
+    alone, _ = run(signals, [m for m in messages if m.arrival >= 100 * TICK])
+    steps = [plain(step) for step in only(both[begin:]) if not step.status.dropped]
+    wanted = [plain(step) for step in only(alone) if not step.status.dropped]
+    assert steps[0] == (Status.RESET, *wanted[0][1:])
+    assert steps[1:] == wanted[1:]
+
+
+# --- the rules one by one, as DESIGN.md states them ----------------------------------------------------------
+
+
+def two_topics(**options: object) -> SignalMap:
+    """State on /c, control on /u, both with header stamps, max_gap 5 ticks."""
+    said = dict(clock="/c", max_gap=0.05, time={"/c": "header", "/u": "header"})
+    control = Signal("u", "/u", "data", max_hold=options.pop("max_hold", None), delay=options.pop("delay", 0))
+    return SignalMap((Signal("x", "/c", "data"),), (control,), **(said | options))
+
+
+def at(topic: str, arrival: int, stamp: int | None, value: float = 1.0) -> Sent:
+    return Sent(topic, arrival * TICK, None if stamp is None else stamp * TICK, (value,))
+
+
+def controls_of(signals: SignalMap, *messages: Sent) -> list[float]:
+    """u of each accepted sample but the last."""
+    steps = [s for s in only(run(signals, messages)[0]) if not s.status.dropped]
+    return [float(s.u[0]) for s in steps[1:]]
+
+
+def test_a_control_that_arrives_just_after_the_state_with_an_equal_stamp_counts() -> None:
+    signals = two_topics()
+    assert controls_of(signals, at("/u", 1, 1, 5.0), at("/c", 2, 2), at("/u", 2, 2, 6.0), at("/c", 3, 3)) == [6.0]
+    assert controls_of(signals, at("/u", 1, 1, 5.0), at("/u", 2, 2, 6.0), at("/c", 2, 2), at("/c", 3, 3)) == [6.0]
+
+
+def test_of_equal_stamps_the_latest_arrival_counts_and_the_greatest_stamp_before_all() -> None:
+    signals = two_topics()
+    u = (at("/u", 1, 1, 5.0), at("/u", 1, 2, 6.0), at("/u", 2, 2, 7.0), at("/u", 2, 1, 8.0), at("/u", 2, 3, 9.0))
+    assert controls_of(signals, *u, at("/c", 3, 2), at("/c", 4, 4), at("/c", 5, 5)) == [7.0, 9.0]
+
+
+def test_a_message_without_a_stamp_compares_its_arrival_with_that_of_the_sample() -> None:
+    signals = two_topics(time={"/c": "header", "/u": "log"})  # stamps lie 1000 ticks before log time
+    stream = (at("/u", 1010, None, 5.0), at("/c", 1010, 10), at("/u", 1011, None, 6.0), at("/c", 1012, 12))
+    assert controls_of(signals, *stream) == [5.0]
+
+
+@pytest.mark.parametrize(("hold", "u"), [(0.02, 5.0), (0.019, NAN), (None, 5.0)])
+def test_a_control_older_than_max_hold_is_stale(hold: float | None, u: float) -> None:
+    signals = two_topics(max_hold=hold)
+    steps, sampler = run(signals, [at("/u", 1, 1, 5.0), at("/c", 3, 3), at("/c", 4, 4)])
+    assert np.array_equal(only(steps)[1].u, [u], equal_nan=True)
+    assert only(steps)[1].status is (Status.MISSING if math.isnan(u) else Status.OK)
+    assert sampler.counters["stale u"] == math.isnan(u)
+
+
+def test_delay_shifts_the_control_by_samples_and_starts_anew_after_a_gap() -> None:
+    signals = two_topics(delay=1)
+    times = [10, 11, 12, 30, 31, 32]
+    stream = [m for t in times for m in (at("/u", t, t, float(t)), at("/c", t, t))]
+    got = controls_of(signals, *stream)
+    assert np.array_equal(got, [NAN, 10.0, 11.0, NAN, 30.0], equal_nan=True)
+
+
+def test_the_verdict_of_a_transition_never_waits_for_the_next_control() -> None:
+    signals = two_topics()
+    decided, _ = run(signals, [at("/u", 1, 1), at("/c", 1, 1), at("/u", 2, 2), at("/c", 2, 2)])
+    assert [len(d) for d in decided] == [0, 1, 0, 1]
+    assert only(decided)[1].status is Status.OK
+
+
+def test_states_of_two_topics_are_judged_when_the_sample_closes() -> None:
+    signals = SignalMap(
+        (Signal("x", "/c", "data"), Signal("y", "/s", "data")),
+        clock="/c",
+        max_gap=0.05,
+        time={"/c": "header", "/s": "header"},
+    )
+    stream = [at("/c", 1, 1), at("/s", 1, 1, 2.0), at("/c", 2, 2), at("/s", 2, 2, 3.0), at("/c", 3, 3)]
+    decided, _ = run(signals, stream)
+    assert [len(d) for d in decided] == [0, 0, 1, 0, 1]
+    last = only(decided)[1]
+    assert (last.status, last.t_ns, last.x.tolist(), last.x_next.tolist()) == (
+        Status.OK,
+        2 * TICK,
+        [1.0, 2.0],
+        [1.0, 3.0],
+    )
+
+
+@settings(max_examples=100)
+@given(cases())
+def test_latest_changes_nothing_and_is_what_would_be_fixed_now(case: tuple[SignalMap, list[Sent]]) -> None:
+    signals, messages = case
+    quiet, watched, closing = Sampler(signals), Sampler(signals), Sampler(signals)
+    assert watched.latest() is None
+    seen: list[Step] = []
+    for message in messages:
+        steps = watched.push(*message)
+        assert [plain(s) for s in quiet.push(*message)] == [plain(s) for s in steps]
+        closing.push(*message)
+        seen = seen + [s for s in steps if not s.status.dropped]
+        latest = watched.latest()
+        if latest is None or not all(s.topic == "/c" for s in signals.states):
+            continue
+        assert seen[-1].t_ns == latest[0]
+        assert np.array_equal(seen[-1].x_next, latest[1], equal_nan=True)
+    if latest := watched.latest():
+        far = latest[0] + 10**12
+        values = [0.0] * len(signals.on("/c"))
+        step = closing.push("/c", far, far, values)[-1] if all(s.topic == "/c" for s in signals.states) else None
+        if step is not None:
+            assert np.array_equal(step.u, latest[2], equal_nan=True)
+    assert watched.counters == quiet.counters
+
+
+def test_memory_is_bounded_while_no_sample_closes() -> None:
+    signals = two_topics(max_gap=1e6)
+    sampler = Sampler(signals)
+    sampler.push("/c", 1, 1, [0.0])
+    for stamp in range(2, BUFFERED_MESSAGES + 1000):
+        sampler.push("/u", stamp, stamp, [float(stamp)])
+    assert len(sampler._topics["/u"].kept) == BUFFERED_MESSAGES
+    sampler.push("/c", 10**6, 10**6, [0.0])
+    (step,) = sampler.push("/c", 2 * 10**6, 2 * 10**6, [0.0])
+    assert step.u.tolist() == [BUFFERED_MESSAGES + 999.0]
+
+
+# --- what a signals file leaves open -------------------------------------------------------------------------
+
+
+@given(st.lists(st.lists(st.integers(0, 60), max_size=20), min_size=1, max_size=3), st.integers(0, 12))
+def test_the_median_step_is_that_of_the_samples(recordings: list[list[int]], min_step: int) -> None:
+    """Over the instants that a sampler without a limit on steps back keeps."""
+    steps: list[int] = []
+    for instants in recordings:
+        last = None
+        for instant in instants:
+            if last is not None and (instant == last or 0 < instant - last < min_step):
+                continue
+            if last is not None and instant > last:
+                steps.append(instant - last)
+            last = instant
+    found = median_step_ns([np.array(i, dtype=np.int64) for i in recordings], min_step)
+    assert found == (int(np.median(steps)) if steps else None)
+
+
+def test_min_step_thins_a_fast_stream_out() -> None:
+    """500 Hz thinned to 100 Hz: max_gap is then 2.5 x 10 ms, not of the steps that were dropped."""
+    signals = SignalMap((Signal("x", "/c", "data"),), min_step=0.01)
+    resolved = resolve(signals, {"/c": [np.arange(0, 10**9, 2_000_000)]}, {"/c": "log"})
+    assert resolved.max_gap == pytest.approx(0.025)
+
+
+def test_resolve_takes_the_slowest_state_topic_and_two_and_a_half_of_its_median_step() -> None:
+    signals = SignalMap((Signal("a", "/fast", "data"), Signal("b", "/slow", "data")), (Signal("u", "/slower", "data"),))
+    instants = {
+        "/fast": [np.arange(0, 100) * TICK],
+        "/slow": [np.array([0, 3, 6, 6, 9, 50]) * TICK, np.array([7, 4, 9]) * TICK],
+        "/slower": [np.arange(0, 100, 50) * TICK],
+    }
+    resolved = resolve(signals, instants, {"/fast": "header", "/slow": "log", "/slower": "log"})
+    assert resolved.clock == "/slow"
+    assert resolved.max_gap == pytest.approx(2.5 * 3 * TICK * 1e-9)
+    assert resolved.time == {"/fast": "header", "/slow": "log", "/slower": "log"}
+    said = replace(signals, clock="/fast", max_gap=7.0)
+    assert resolve(said, instants, resolved.time) == replace(said, time=resolved.time)
+
+
+def test_a_clock_that_stands_still_is_an_error_that_names_it() -> None:
+    signals = SignalMap((Signal("x", "/c", "data"),))
+    with pytest.raises(SignalError, match="/c: 3 messages without a forward step in time"):
+        resolve(signals, {"/c": [np.array([5, 5, 4])]}, {"/c": "header"})
+
+
+@pytest.mark.parametrize("missing", ["clock", "max_gap", "time"])
+def test_an_unresolved_map_is_refused(missing: str) -> None:
+    signals = replace(two_topics(), **{missing: {} if missing == "time" else None})
+    with pytest.raises(SignalError, match="resolved"):
+        Sampler(signals)
