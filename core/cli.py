@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -97,6 +98,22 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     check.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
     check.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
 
+    validate = command("validate", _validate, "tell how far to trust a model, by leaving out what it was fitted to")
+    validate.add_argument("model", metavar="MODEL", help="model file")
+    validate.add_argument(
+        "bags", metavar="BAG", nargs="*", help="MCAP files and folders (default: those the model was fitted to)"
+    )
+    validate.add_argument("--blocks", type=int, help="leave out blocks: so many per recording (a single one: 10)")
+    validate.add_argument("--gap", type=float, help="s beside a left-out block that are not fitted either")
+    validate.add_argument("--confidence", type=float, default=0.9, help="of every interval (default: 0.9)")
+    validate.add_argument(
+        "--false-alarms", type=float, metavar="PER_HOUR", help="find the alarm rule that stays below so many per hour"
+    )
+    validate.add_argument(
+        "--output", metavar="MODEL", help="write the model with this validation, and the alarm rule found, to this file"
+    )
+    validate.add_argument("--json", action="store_true", help="print JSON")
+
     info = command("info", _info, "show what is in a model file")
     info.add_argument("model", metavar="MODEL", help="model file")
     info.add_argument("--json", action="store_true", help="print the file as JSON")
@@ -177,7 +194,8 @@ def _topics(options: argparse.Namespace) -> int:
 
 def _fit(options: argparse.Namespace) -> int:
     from uncertain_lti import fit, read_transients
-    from uncertain_lti.report import fit_text, recording_text
+    from uncertain_lti.report import fit_text, left_out_text, recording_text
+    from uncertain_lti.validation import leave_out_cheaply
 
     transients = read_transients(options.bags, options.signals, _progress("reading"))
     if not options.json:
@@ -187,14 +205,21 @@ def _fit(options: argparse.Namespace) -> int:
     output = Path(options.output)
     if not output.parent.is_dir():
         raise BagError(f"{output}: the folder {output.parent} is not there; make it first")
+    began = time.perf_counter()
     model = fit(transients, options.criterion, additive=options.additive)
     sources = [{"file": name, "sha256": _sha256(name)} for t in transients for name in t.sources]
     model = model.with_(fit={**model.fit, "sources": sources})
+    left_out = leave_out_cheaply(transients, model, time.perf_counter() - began)
+    if left_out is not None:
+        model = model.with_(validation=left_out)
     model.save(output)
     if options.json:
-        _print_json({"model": str(output), "fit": model.to_dict()["fit"]})
+        data = model.to_dict()
+        _print_json({"model": str(output), "fit": data["fit"], "validation": data["validation"]})
     else:
         print(fit_text(model, transients))
+        if left_out is not None:
+            print(left_out_text(left_out))
         print(f"model written to {output}")
     return DONE
 
@@ -223,6 +248,45 @@ def _check(options: argparse.Namespace) -> int:
     if options.json:
         _print_json({"model": options.model, "alarm": any(r["alarm"] for r in results), "recordings": results})
     return ALARM if any(r["alarm"] for r in results) else DONE
+
+
+def _validate(options: argparse.Namespace) -> int:
+    from uncertain_lti import UncertainLTI
+    from uncertain_lti.bag import group_recordings
+    from uncertain_lti.calibration import calibrate
+    from uncertain_lti.reading import read_for_model
+    from uncertain_lti.report import validation_text
+    from uncertain_lti.validation import validate_model
+
+    model = UncertainLTI.load(options.model)
+    sources = model.fit.get("sources", [])
+    bags = options.bags or [s["file"] for s in sources]
+    if not bags:
+        raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
+    if options.output is not None and not Path(options.output).parent.is_dir():
+        raise BagError(f"{options.output}: the folder {Path(options.output).parent} is not there; make it first")
+    transients = [read_for_model(bag, model, _progress("reading")) for bag in group_recordings(bags)]
+    for transient in transients:
+        _say(transient.notes)
+    validation = validate_model(
+        model, transients, blocks=options.blocks, gap=options.gap, confidence=options.confidence
+    )
+    data = validation.to_dict()
+    if options.false_alarms is not None:
+        calibration = calibrate(validation, options.false_alarms)
+        data["calibration"] = calibration.to_dict()
+        if calibration.alarm is not None:
+            model = model.with_(alarm=calibration.alarm)
+    model = model.with_(validation=data)
+    if options.output is not None:
+        model.save(options.output)
+    if options.json:
+        _print_json({"model": options.output or options.model, "validation": model.to_dict()["validation"]})
+    else:
+        print(validation_text(data))
+        if options.output is not None:
+            print(f"model written to {options.output}")
+    return DONE
 
 
 def _info(options: argparse.Namespace) -> int:

@@ -243,3 +243,78 @@ def _length(t_ns: NDArray[np.int64], run: tuple[int, int]) -> dict[str, float]:
 
 def _list(row: Array) -> list[float | None]:
     return [v if math.isfinite(v) else None for v in row.tolist()]
+
+
+def validation_text(data: dict[str, Any]) -> str:
+    """Summary of `Validation.to_dict()`, with the calibration if there is one, for a person."""
+    what = "recording" if data["kind"] == "transients" else "block"
+    gap = f", {number(data['gap'])} s on both sides not fitted either" if data["kind"] == "blocks" else ""
+    lines = [
+        f"left out one {what} at a time ({data['parts']} {what}s{gap}): {data['verdicts']} verdicts, "
+        f"{number(data['hours'])} h",
+        table(
+            ("left out", "inside", f"{what}s inside", "mean width", "largest", "fitted: mean width", "largest"),
+            [
+                [
+                    name + (f" [{s['unit']}]" if s["unit"] else ""),
+                    "-" if s["inside"] is None else f"{s['inside']:.3%}",
+                    f"{s['parts_inside']}/{data['parts']}",
+                    number(s["mean_width_left_out"]),
+                    number(s["max_width_left_out"]),
+                    number(s["mean_width_full"]),
+                    number(s["max_width_full"]),
+                ]
+                for name, s in data["states"].items()
+            ],
+        ),
+    ]
+    if data["inside"] is not None:
+        percent = f"{data['confidence']:.0%}"
+        low, high = data["inside_interval"]
+        lines.append(
+            f"inside all bounds: {data['inside']:.3%} of the verdicts ({percent} interval {low:.3%} to {high:.3%})"
+        )
+        low, high = data["parts_inside_interval"]
+        lines.append(
+            f"whole {what}s inside all bounds: {data['parts_inside']} of {data['parts']} "
+            f"({percent} interval {low:.1%} to {high:.1%})"
+        )
+        lines.append(
+            table(
+                ("alarm rule", "alarms", "per hour", f"{percent} interval", "time in alarm"),
+                [
+                    [
+                        f"{a['violations']} of {a['window']}, margin {number(a['margin'])}",
+                        str(a["alarms"]),
+                        number(a["per_hour"]),
+                        _interval(*a["interval"]),
+                        f"{a['raised_share']:.3%}",
+                    ]
+                    for a in data["false_alarms"]
+                ],
+            )
+        )
+    lines.append(data["scenario"]["words"])
+    if "calibration" in data:
+        lines.append(data["calibration"]["words"])
+    return "\n".join(lines + [f"note: {note}" for note in data["notes"]])
+
+
+def left_out_text(data: dict[str, Any]) -> str:
+    """Short form of `validation_text`, one line, for a fit."""
+    what = "recording" if data["kind"] == "transients" else "block"
+    ratio = max((s["left_out_to_full"] for s in data["states"].values()), default=math.nan)
+    alarm = data["false_alarms"][0]
+    return (
+        f"left out one {what} of {data['parts']} at a time: {data['inside']:.3%} of the verdicts inside, "
+        f"{data['parts_inside']} whole {what}s, widths at most {ratio:.3g} times those above; "
+        f"{number(alarm['per_hour'])} false alarms per hour ({_interval(*alarm['interval'])}) at "
+        f"{alarm['violations']} of {alarm['window']}; more: uncertain-lti validate"
+    )
+
+
+def _interval(low: float, high: float | None) -> str:
+    """A lower limit that is next to nothing is nothing; no upper limit is said so."""
+    if high is None:
+        return "unknown"
+    return f"{number(low if low > 1e-4 * high else 0.0)} to {number(high)}"

@@ -1,0 +1,213 @@
+"""Calibration: the alarm rule that keeps to a wished rate of false alarms, learnt on what was left out of the fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.errors import FitError
+from uncertain_lti.intervals import cluster_size, rate_interval
+from uncertain_lti.model import Alarm
+from uncertain_lti.validation import Part, Validation, borrowed_margin, rising
+
+Array = NDArray[np.float64]
+
+RULES = ((1, 1), (3, 5), (5, 10))
+"""(violations, window) tried unless told otherwise."""
+MARGINS = tuple(float(m) for m in np.geomspace(4.0, 0.5, 106))
+"""Margins tried, from the largest: about 2 % apart."""
+FAULT_SIZE = 1.0
+"""The stated fault moves one state by so many mean widths more in every step."""
+STARTS = 8
+"""Instants per left-out part at which the stated fault is put in, with either sign."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One rule at the smallest margin that keeps to the wish; margin None where none does.
+
+    upper: one-sided confidence limit of its false alarms per hour. detected (n,): share of the stated faults that
+    raise the alarm before the part ends; delay (n,): median time to it, s, inf where most are missed.
+    """
+
+    violations: int
+    window: int
+    margin: float | None
+    alarms: int
+    upper: float
+    detected: Array
+    delay: Array
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The alarm that `calibrate` chose (None where no rule can be shown to keep to the wish), and all it tried."""
+
+    alarm: Alarm | None
+    wish: float
+    confidence: float
+    hours: float
+    needed_hours: float
+    candidates: tuple[Candidate, ...]
+    words: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for the model file."""
+        return {
+            "wish_per_hour": self.wish,
+            "confidence": self.confidence,
+            "hours": self.hours,
+            "needed_hours": self.needed_hours,
+            "reached": self.alarm is not None,
+            "words": self.words,
+            "fault": f"one state moved by {FAULT_SIZE:g} mean width more in every step",
+            "candidates": [
+                {
+                    "violations": c.violations,
+                    "window": c.window,
+                    "margin": c.margin,
+                    "alarms": c.alarms,
+                    "upper_per_hour": c.upper if math.isfinite(c.upper) else None,
+                    "detected": c.detected.tolist(),
+                    "delay": [d if math.isfinite(d) else None for d in c.delay.tolist()],
+                }
+                for c in self.candidates
+            ],
+        }
+
+
+def calibrate(
+    validation: Validation,
+    wish: float,
+    *,
+    rules: Sequence[tuple[int, int]] = RULES,
+    confidence: float | None = None,
+) -> Calibration:
+    """Find the rule and margin whose false alarms stay below a wish, and which then see a stated fault soonest.
+
+    For each rule, margins are tried from the largest down, as long as the upper confidence limit of the false alarms
+    on the left-out parts stays at or below the wish; going in a fixed order and stopping at the first failure, the
+    confidence of one test holds for the whole search. The error is shared equally among the rules, so that choosing
+    among them costs no confidence. Chosen is the rule that detects the largest share of the stated faults, then the
+    one that does so soonest, then the one with the smallest margin.
+
+    Parameters
+    ----------
+    validation : Validation
+    wish : float
+        False alarms per hour at most.
+    rules : sequence of (violations, window)
+    confidence : float, optional
+        That the true rate is below the wish; default that of the validation.
+
+    Raises
+    ------
+    FitError
+        The wish is not positive, or a rule is none.
+    """
+    if not (math.isfinite(wish) and wish > 0):
+        raise FitError(f"the wished false alarms per hour are {wish}; give a positive number")
+    if not rules:
+        raise FitError("no alarm rule to choose from; give at least one (violations, window)")
+    for m, n in rules:
+        if not 1 <= m <= n:
+            raise FitError(f"alarm rule {m} of {n}: it takes 1 <= violations <= window")
+    confidence = validation.confidence if confidence is None else confidence
+    each = 1.0 - (1.0 - confidence) / len(rules)
+    parts = validation.parts
+    hours = sum(p.hours for p in parts)
+    candidates = tuple(_candidate(parts, m, n, wish, each, hours) for m, n in rules)
+    needed = rate_interval(np.zeros(len(parts)), 1.0, each, one_sided=True)[1] / wish
+    found = [c for c in candidates if c.margin is not None]
+    if not found:
+        return Calibration(None, wish, confidence, hours, needed, candidates, _refusal(candidates, wish, hours, needed))
+    best = max(found, key=lambda c: (float(c.detected.min()), -float(c.delay.max()), -(c.margin or 0.0)))
+    assert best.margin is not None
+    names = validation.model.state_names
+    slow = int(np.argmax(best.delay))
+    missed = 1.0 - float(best.detected[slow])
+    words = (
+        f"alarm at {best.violations} of {best.window} verdicts outside {best.margin:.3g} times the half-widths: at "
+        f"most {wish:g} false alarms per hour with {confidence:.0%} confidence ({best.alarms} in {hours:.3g} h left "
+        f"out, limit {best.upper:.3g} per hour); a fault that moves one state by {FAULT_SIZE:g} mean width more in "
+        f"every step is seen "
+        + (
+            f"after {best.delay[slow]:.3g} s (median; slowest state: {names[slow]}; {missed:.0%} missed)"
+            if math.isfinite(best.delay[slow])
+            else f"in {best.detected[slow]:.0%} of the cases only (worst state: {names[slow]})"
+        )
+    )
+    return Calibration(
+        Alarm(best.violations, best.window, best.margin), wish, confidence, hours, needed, candidates, words
+    )
+
+
+def _candidate(parts: Sequence[Part], m: int, n: int, wish: float, confidence: float, hours: float) -> Candidate:
+    levels = [p.level(m, n) for p in parts]
+    counts = np.array(
+        [[rising(level > margin, p.starts) for p, level in zip(parts, levels, strict=True)] for margin in MARGINS]
+    )
+    peaks = [float(level.max(initial=0.0)) for level in levels]
+    chosen, count, limit = None, 0, math.inf
+    for margin, row in zip(MARGINS, counts, strict=True):
+        nearby = int(np.argmax(np.array([*MARGINS, 0.0]) <= borrowed_margin(peaks, margin)))
+        typical = cluster_size(counts[min(nearby, len(counts) - 1)])
+        upper = rate_interval(row, hours, confidence, typical, one_sided=True)[1]
+        if upper > wish:
+            if chosen is None:
+                count, limit = int(row.sum()), upper
+            break
+        chosen, count, limit = margin, int(row.sum()), upper
+    if chosen is None:
+        nothing = np.full(parts[0].utilisation.shape[1], np.nan)
+        return Candidate(m, n, None, count, limit, nothing, nothing)
+    detected, delay = detection(parts, Alarm(m, n, chosen))
+    return Candidate(m, n, chosen, count, limit, detected, delay)
+
+
+def detection(parts: Sequence[Part], rule: Alarm, size: float = FAULT_SIZE) -> tuple[Array, Array]:
+    """Share of stated faults that raise the alarm, and the median time to it in s, each (n,).
+
+    The fault: from one verdict on, one state moves by `size` mean widths of its bounds more in every step than
+    recorded, in either direction, the step still starting from the measured state. It is put into the left-out parts
+    at STARTS instants each; one that is not seen before the part ends counts as missed (infinite time).
+    """
+    n = parts[0].utilisation.shape[1]
+    times: list[list[float]] = [[] for _ in range(n)]
+    for part in parts:
+        K = part.judged
+        if K == 0:
+            continue
+        clock = np.cumsum(part.dt)
+        for start in sorted({int(s) for s in np.linspace(0, max(K - 1, 0), STARTS + 1)[:-1]}):
+            for i in range(n):
+                for sign in (1.0, -1.0):
+                    moved = part.utilisation.copy()
+                    # size mean widths are 2 size mean half-widths; half_k follows from the sample's own width
+                    moved[start:, i] += sign * 2.0 * size * part.narrowness[start:, i]
+                    level = part.level(rule.violations, rule.window, np.abs(moved).max(axis=1))
+                    seen = np.flatnonzero(level[start:] > rule.margin)
+                    before = clock[start] - part.dt[start]
+                    times[i].append(float(clock[start + seen[0]] - before) if len(seen) else math.inf)
+    detected = np.array([np.mean(np.isfinite(t)) if t else np.nan for t in times])
+    delay = np.array([np.median(t) if t else np.nan for t in times])
+    return detected, delay
+
+
+def _refusal(candidates: Sequence[Candidate], wish: float, hours: float, needed: float) -> str:
+    if hours < needed:
+        return (
+            f"no alarm rule can be shown to stay below {wish:g} false alarms per hour: the left-out recordings cover "
+            f"{hours:.3g} h, and even without a single alarm {needed:.3g} h are needed; record more, or wish for less"
+        )
+    best = min(candidates, key=lambda c: c.upper)
+    return (
+        f"no alarm rule can be shown to stay below {wish:g} false alarms per hour: even at {MARGINS[0]:g} times the "
+        f"half-widths, {best.violations} of {best.window} verdicts raise {best.alarms} alarms in {hours:.3g} h left "
+        f"out (limit {best.upper:.3g} per hour); look at what leaves the envelope so far, or wish for less"
+    )

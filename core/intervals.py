@@ -1,0 +1,138 @@
+"""Confidence intervals for what was counted on whole transients, whose samples depend on one another."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def cluster_size(counts: ArrayLike) -> float:
+    """Σc² / Σc of the events c_g counted on transient g: how many come at once, weighted by events; 1 without any."""
+    c = np.asarray(counts, dtype=np.float64)
+    return float(np.sum(c**2) / np.sum(c)) if c.any() else 1.0
+
+
+def rate_interval(
+    counts: ArrayLike, exposure: float, confidence: float, size: float | None = None, *, one_sided: bool = False
+) -> tuple[float, float]:
+    """Interval for the expected number of events per unit of exposure.
+
+    Events of one transient come in clusters; clusters of different transients are independent (a compound Poisson
+    count). The total then varies as `size` times a Poisson count of total / size, for which the exact (Garwood)
+    limits hold. As `size` is estimated from G transients, the tails are those of Student's t with G - 1 degrees of
+    freedom in place of the normal's.
+
+    Parameters
+    ----------
+    counts : array (G,)
+        Events on each transient.
+    exposure : float
+        Total over all transients, in the unit wanted (h, verdicts).
+    confidence : float
+        Of the interval; with `one_sided`, of its upper limit alone.
+    size : float, optional
+        Cluster size; at least that of `counts` is used. Counts that are all 0 tell none: give one seen elsewhere.
+
+    Returns
+    -------
+    lower, upper : float
+        (0, inf) for fewer than two transients or no exposure.
+    """
+    from scipy.stats import gamma, norm, t
+
+    c = np.asarray(counts, dtype=np.float64)
+    if len(c) < 2 or exposure <= 0:
+        return 0.0, math.inf
+    tail = 1.0 - confidence if one_sided else (1.0 - confidence) / 2.0
+    tail = float(norm.sf(t.isf(tail, len(c) - 1)))
+    size = max(cluster_size(c), size or 1.0)
+    clusters = float(c.sum()) / size
+    lower = float(gamma.ppf(tail, clusters)) * size / exposure if clusters and not one_sided else 0.0
+    return lower, float(gamma.isf(tail, clusters + 1.0)) * size / exposure
+
+
+def share_interval(hits: int, trials: int, confidence: float) -> tuple[float, float]:
+    """Exact binomial (Clopper-Pearson) interval for the share of whole transients."""
+    from scipy.stats import beta
+
+    tail = (1.0 - confidence) / 2.0
+    lower = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
+    upper = float(beta.isf(tail, hits + 1, trials - hits)) if hits < trials else 1.0
+    return lower, upper
+
+
+def scenario_interval(support: int, transients: int, confidence: float) -> tuple[float, float]:
+    """Interval for the probability that a fresh whole transient leaves the envelope of this very model.
+
+    Garatti and Campi, "Risk and complexity in scenario optimization" (Mathematical Programming 191, 2022), theorem 2:
+    with N transients drawn independently from one distribution and a convex problem whose solution is unique and not
+    degenerate, of which `support` transients would change the solution if left out, the probability lies in
+    [1 - t_2, 1 - t_1] with at least this confidence, whatever the distribution. t_1 < t_2 are the roots of
+
+        C(N,k) t^(N-k) - β/2N Σ_{i=k}^{N-1} C(i,k) t^(i-k) - β/6N Σ_{i=N+1}^{4N} C(i,k) t^(i-k) = 0,
+
+    k = support, β = 1 - confidence.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import gammaln, logsumexp
+
+    N, k, b = transients, support, 1.0 - confidence
+    low, high = np.arange(k, N), np.arange(N + 1, 4 * N + 1)
+
+    def choose(i: ArrayLike) -> Array:
+        i = np.asarray(i, dtype=np.float64)
+        return np.asarray(gammaln(i + 1) - gammaln(i - k + 1) - gammaln(k + 1))
+
+    def excess(s: float) -> float:
+        """log of the two sums less log of the first term, at t = e^s: 0 at the roots, negative between them."""
+        sums = [math.log(b / (6 * N)) + float(logsumexp(choose(high) + (high - k) * s))]
+        if len(low):
+            sums.append(math.log(b / (2 * N)) + float(logsumexp(choose(low) + (low - k) * s)))
+        return float(logsumexp(sums)) - float(choose(N)) - (N - k) * s
+
+    if k == N:
+        root = brentq(excess, -60.0, 10.0) if excess(-60.0) < 0 < excess(10.0) else 0.0
+        return max(0.0, 1.0 - math.exp(root)), 1.0
+    grid = np.linspace(-30.0 / (N - k), 3.0, 4001)  # log t; the stretch where the excess is negative holds 1 - k/N
+    centre = math.log(max(1.0 - k / N, 1e-12))
+    if excess(centre) >= 0:
+        values = np.array([excess(s) for s in grid])
+        centre = float(grid[int(np.argmin(values))])
+    below, above = centre - 1.0, centre + 1.0
+    while excess(below) < 0:
+        below -= 5.0
+    while excess(above) < 0:
+        above += 1.0
+    t1, t2 = math.exp(brentq(excess, below, centre)), math.exp(brentq(excess, centre, above))
+    return max(0.0, 1.0 - t2), 1.0 - t1
+
+
+def discarding_bound(variables: int, discarded: int, transients: int, confidence: float) -> float:
+    """Upper bound on the probability that a fresh transient leaves the envelope, after discarding some.
+
+    Campi and Garatti, "A sampling-and-discarding approach to chance-constrained optimization" (JOTA 148, 2011):
+    C(k+d-1, k) P[Binomial(N, ε) <= k+d-1] = 1 - confidence, with d decision variables and k discarded of N
+    independent transients, whichever rule discards them. 1 where there are too few. discarded = 0 is the plain
+    bound before looking at the solution.
+    """
+    from scipy.optimize import brentq
+    from scipy.special import gammaln
+    from scipy.stats import binom
+
+    worst = discarded + variables - 1
+    if worst >= transients:
+        return 1.0
+    ways = gammaln(worst + 1) - gammaln(discarded + 1) - gammaln(variables)
+    aim = math.log(1.0 - confidence)
+    low, high = 1e-12, 1.0 - 1e-12
+
+    def excess(share: float) -> float:
+        return float(ways + binom.logcdf(worst, transients, share) - aim)
+
+    if excess(high) > 0:
+        return 1.0
+    return float(brentq(excess, low, high))

@@ -1,0 +1,546 @@
+"""Validation: how a fitted envelope does on recordings, or parts of one, that were left out of the fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uncertain_lti.errors import FitError
+from uncertain_lti.identification import fit
+from uncertain_lti.intervals import (
+    cluster_size,
+    discarding_bound,
+    rate_interval,
+    scenario_interval,
+    share_interval,
+)
+from uncertain_lti.model import Alarm, UncertainLTI
+from uncertain_lti.monitor import EnvelopeMonitor
+from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.transient import Transient
+
+Array = NDArray[np.float64]
+
+BLOCKS = 10
+"""Parts that a single recording is cut into, unless told otherwise."""
+VOID = 0.9
+"""A bound on the probability of leaving the envelope that is above this says nothing."""
+NEARBY = 0.75
+"""Down to this share of the margin, alarms are taken to come in clusters as they do at the margin."""
+REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
+"""Alarm rules whose false alarms are counted beside the model's own."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A recording, or a block of one, judged by the model that was fitted without it.
+
+    utilisation (K, n): (x_next - centre) / half of every judged transition; narrowness (K, n): mean half-width over
+    half-width; dt (K,) s; starts: positions at which the alarm starts anew (0, and after
+    every step back in time). violations (n,), violated: verdicts at margin 1, by state and of any state;
+    outside_domain: verdicts from outside the domain fitted without this part; unseen: violated ones inside it.
+    mean_width, max_width (n,): of the left-out model's bounds on this part, in recorded units; relative_width (n,):
+    the mean over that of the full model on the same samples.
+    """
+
+    name: str
+    dt: Array
+    utilisation: Array
+    narrowness: Array
+    starts: tuple[int, ...]
+    violations: NDArray[np.intp]
+    violated: int
+    outside_domain: int
+    unseen: int
+    mean_width: Array
+    max_width: Array
+    relative_width: Array
+
+    @property
+    def judged(self) -> int:
+        """Number of verdicts."""
+        return len(self.dt)
+
+    @property
+    def hours(self) -> float:
+        """Time under verdict, h."""
+        return float(self.dt.sum()) / 3600.0
+
+    @property
+    def severity(self) -> Array:
+        """(K,): the largest |utilisation| of the states; a verdict is violated where it exceeds the margin."""
+        return np.asarray(np.abs(self.utilisation).max(axis=1))
+
+    def level(self, violations: int, window: int, severity: Array | None = None) -> Array:
+        """(K,): the margin below which the alarm is raised: the m-th largest severity of the last n verdicts."""
+        severity = self.severity if severity is None else severity
+        level = np.empty(len(severity))
+        for start, stop in zip(self.starts, [*self.starts[1:], len(severity)], strict=True):
+            padded = np.concatenate([np.full(window - 1, -np.inf), severity[start:stop]])
+            if stop > start:
+                windows = np.lib.stride_tricks.sliding_window_view(padded, window)
+                level[start:stop] = np.partition(windows, window - violations, axis=1)[:, window - violations]
+        return level
+
+    def alarms(self, rule: Alarm) -> int:
+        """How often the alarm is raised (rising edges)."""
+        return rising(self.level(rule.violations, rule.window) > rule.margin, self.starts)
+
+
+def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:
+    """Rising edges of an alarm that starts anew, lowered, at each of `starts`."""
+    before = np.concatenate([[False], raised[:-1]])
+    before[[s for s in starts if s < len(raised)]] = False
+    return int(np.count_nonzero(raised & ~before))
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What `validate` found. `kind` is "transients" or "blocks"; gap, s, is left between a block and its training."""
+
+    model: UncertainLTI
+    parts: tuple[Part, ...]
+    kind: str
+    gap: float
+    confidence: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: coverage beside widths, false alarms per hour with intervals, scenario bound in words."""
+        return summary(self)
+
+
+def validate(
+    transients: Sequence[Transient] | Transient,
+    *,
+    operating_point: OperatingPoint | None = None,
+    weights: ArrayLike | Sequence[ArrayLike] | None = None,
+    alarm: Alarm | None = None,
+    blocks: int | None = None,
+    gap: float | None = None,
+    confidence: float = 0.9,
+    full: UncertainLTI | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Validation:
+    """Leave out one recording at a time, fit to the others, and judge the one left out.
+
+    Parameters
+    ----------
+    transients : Transient or sequence of Transient
+    operating_point, weights, alarm : as in `fit`
+        Weights per sample go with their samples.
+    blocks : int, optional
+        Cut every recording into so many contiguous blocks and leave out one block at a time. Default: whole
+        recordings where there are two or more, else BLOCKS blocks.
+    gap : float, optional
+        s on both sides of a left-out block that are not fitted either, because they resemble it. Default: three
+        times the slowest time constant of the nominal model, at most half a block.
+    confidence : float
+        Of every interval.
+    full : UncertainLTI, optional
+        The fit to all recordings, where it is there already.
+    progress : callable, optional
+        Called with one line of text per fit.
+    **options
+        Further arguments of `fit`.
+
+    Raises
+    ------
+    FitError
+        There is too little to leave out, an option is out of range, or a left-out fit fails (names the part).
+    """
+    transients = [transients] if isinstance(transients, Transient) else list(transients)
+    if not 0.5 <= confidence < 1.0:
+        raise FitError(f"confidence is {confidence:g}; it must be at least 0.5 and below 1")
+    if blocks is not None and blocks < 2:
+        raise FitError(f"blocks is {blocks}; at least 2 are needed to leave one out")
+    if full is None:
+        full = fit(transients, weights=weights, operating_point=operating_point, alarm=alarm, **options)
+    elif alarm is not None:
+        full = full.with_(alarm=alarm)
+    if blocks is None and len(transients) == 1:
+        blocks = BLOCKS
+    if blocks is None:
+        if gap is not None:
+            raise FitError("gap is given and whole recordings are left out; it goes with blocks")
+        cuts = [(t, 0, len(t)) for t in transients]
+        gap = 0.0
+    else:
+        if gap is not None and not (math.isfinite(gap) and gap >= 0):
+            raise FitError(f"gap is {gap}; it must be 0 s or more")
+        cuts = [(t, *span) for t in transients for span in _blocks(t, blocks)]
+        gap = _gap(full, cuts) if gap is None else gap
+    parts = []
+    own = _split_weights(weights, transients, full.n)
+    for number, (left, start, stop) in enumerate(cuts):
+        name = left.name if blocks is None else f"{left.name} from {left.t[start]:.6g} to {left.t[stop - 1]:.6g} s"
+        if progress is not None:
+            progress(f"fit {number + 1} of {len(cuts)}: without {name}")
+        pieces, kept = [], []
+        for transient, weight in zip(transients, own, strict=True):
+            for a, b in _rest(transient, start, stop, gap) if transient is left else [(0, len(transient))]:
+                if b - a >= 2:
+                    pieces.append(transient if (a, b) == (0, len(transient)) else cut(transient, a, b))
+                    kept.append(None if weight is None else weight[a : b - 1])
+        chosen = kept if own[0] is not None else weights
+        try:
+            model = fit(pieces, weights=chosen, operating_point=full.operating_point, **options)  # type: ignore[arg-type]
+        except FitError as error:
+            raise FitError(f"without {name} no model can be fitted: {error}") from None
+        tested = left if (start, stop) == (0, len(left)) else cut(left, start, stop)
+        parts.append(judge(model, full, tested, name))
+    return Validation(full, tuple(parts), "transients" if blocks is None else "blocks", float(gap), confidence)
+
+
+def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str) -> Part:
+    """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1.
+
+    full gives the widths that the left-out ones are compared with.
+    """
+    verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
+    judged = verdicts.judged
+    steps = transient.transitions()
+    width = (verdicts.upper - verdicts.lower)[judged]
+    point = full.operating_point
+    low, high = full.bounds(point.normalise_x(steps.x), point.normalise_u(steps.u), steps.dt)
+    whole = (high - low) * point.X
+    flags = verdicts.flags[judged] == 1.0
+    resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
+    starts = sorted({0, *(int(np.count_nonzero(judged[:r])) for r in resets)})
+    n = model.n
+    empty = not len(width)
+    utilisation = verdicts.utilisation[judged]
+    # what lies on the edge is judged by the flags: there rounding decides
+    size = np.where(flags, np.maximum(np.abs(utilisation), np.nextafter(1.0, 2.0)), np.minimum(np.abs(utilisation), 1))
+    return Part(
+        name,
+        steps.dt,
+        np.copysign(size, utilisation),
+        np.ones(width.shape) if empty else width.mean(axis=0) / np.maximum(width, 1e-300),
+        tuple(starts),
+        flags.sum(axis=0),
+        int(flags.any(axis=1).sum()),
+        int(verdicts.outside_domain.sum()),
+        int((flags.any(axis=1) & ~verdicts.outside_domain[judged]).sum()),
+        np.full(n, np.nan) if empty else width.mean(axis=0),
+        np.full(n, np.nan) if empty else width.max(axis=0),
+        np.full(n, np.nan) if empty else width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
+    )
+
+
+def cut(transient: Transient, start: int, stop: int) -> Transient:
+    """Samples start..stop-1 as a transient of their own."""
+    part = slice(start, stop)
+    return Transient(
+        transient.t_ns[part],
+        transient.x[part],
+        transient.u[part],
+        name=transient.name,
+        signals=transient.signals,
+        state_names=transient.state_names,
+        control_names=transient.control_names,
+        max_gap=transient.max_gap,
+        min_step=transient.min_step,
+        sources=transient.sources,
+    )
+
+
+def _blocks(transient: Transient, blocks: int) -> list[tuple[int, int]]:
+    """[start, stop) of contiguous blocks with equal numbers of usable transitions; neighbours share one sample."""
+    usable = np.flatnonzero(transient.usable)
+    if len(usable) < 2 * blocks:
+        raise FitError(
+            f"{transient.name}: {len(usable)} usable transitions are too few for {blocks} blocks; use fewer blocks"
+        )
+    edges = [int(part[0]) for part in np.array_split(usable, blocks)] + [int(usable[-1]) + 1]
+    return [(a, b + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def _gap(model: UncertainLTI, cuts: Sequence[tuple[Transient, int, int]]) -> float:
+    """Three of the slowest stable time constants, at most half of the shortest block, s."""
+    stable = [-v.real for v in model.eigenvalues() if v.real < 0]
+    shortest = min(float(t.t[stop - 1] - t.t[start]) for t, start, stop in cuts)
+    return min(3.0 / min(stable) if stable else math.inf, 0.5 * shortest)
+
+
+def _rest(transient: Transient, start: int, stop: int, gap: float) -> list[tuple[int, int]]:
+    """What is left of a transient without samples start..stop-1 and `gap` s on both sides, as [start, stop)."""
+    if (start, stop) == (0, len(transient)):
+        return []
+    t = transient.t
+    before = int(np.count_nonzero(t[: start + 1] <= t[start] - gap))
+    after = stop - 1 + int(np.count_nonzero(t[stop - 1 :] < t[stop - 1] + gap))
+    return [(0, min(before, start + 1)), (min(after, len(t)), len(t))]
+
+
+def _split_weights(
+    weights: ArrayLike | Sequence[ArrayLike] | None, transients: Sequence[Transient], n: int
+) -> list[Array | None]:
+    """Weights per step of each transient; None where they are the same in every step."""
+    if weights is None:
+        return [None] * len(transients)
+    if isinstance(weights, (list, tuple)) and all(np.ndim(w) >= 2 for w in weights):
+        return [np.asarray(w, dtype=np.float64) for w in weights]
+    stacked = np.asarray(weights, dtype=np.float64)
+    if stacked.ndim == 1 and stacked.shape == (n,):
+        return [None] * len(transients)
+    lengths = np.cumsum([max(len(t) - 1, 0) for t in transients])
+    return list(np.split(stacked, lengths[:-1]))
+
+
+# --- what it means ------------------------------------------------------------------------------------------
+
+
+def summary(validation: Validation) -> dict[str, Any]:
+    """Everything `validate` found as plain data; the fields are described in docs/validation.md."""
+    v, model, parts = validation, validation.model, validation.parts
+    judged = sum(p.judged for p in parts)
+    hours = sum(p.hours for p in parts)
+    violated = [p.violated for p in parts]
+    inside = sum(p.violated == 0 for p in parts)
+    held_width = _average(parts, [p.mean_width for p in parts])
+    full_mean, full_max = full_widths(model)
+    states = {}
+    for i, name in enumerate(model.state_names):
+        bad = sum(int(p.violations[i]) for p in parts)
+        states[name] = {
+            "inside": 1.0 - bad / judged if judged else None,
+            "parts_inside": sum(int(p.violations[i]) == 0 for p in parts),
+            "mean_width_left_out": float(held_width[i]),
+            "max_width_left_out": float(np.nanmax([p.max_width[i] for p in parts])),
+            "mean_width_full": full_mean[i],
+            "max_width_full": full_max[i],
+            "left_out_to_full": float(_average(parts, [p.relative_width for p in parts])[i]),
+            "unit": model.signals.states[i].unit,
+        }
+    low, high = rate_interval(violated, judged, v.confidence) if judged else (0.0, math.inf)
+    rules = [model.alarm, *(Alarm(m, n, model.alarm.margin) for m, n in REFERENCE_RULES)]
+    alarms = [false_alarms(parts, rule, v.confidence) for rule in dict.fromkeys(rules)]
+    return {
+        "kind": v.kind,
+        "parts": len(parts),
+        "gap": v.gap,
+        "confidence": v.confidence,
+        "verdicts": judged,
+        "hours": hours,
+        "inside": 1.0 - sum(violated) / judged if judged else None,
+        "inside_interval": [max(0.0, 1.0 - high), 1.0 - low],
+        "parts_inside": inside,
+        "parts_inside_share": inside / len(parts),
+        "parts_inside_interval": list(share_interval(inside, len(parts), v.confidence)),
+        "outside_domain": sum(p.outside_domain for p in parts),
+        "violated_inside_domain": sum(p.unseen for p in parts),
+        "states": states,
+        "false_alarms": alarms,
+        "scenario": scenario(v),
+        "part": [
+            {"name": p.name, "verdicts": p.judged, "violated": p.violated, "outside_domain": p.outside_domain}
+            for p in parts
+        ],
+        "notes": _notes(v),
+    }
+
+
+def false_alarms(parts: Sequence[Part], rule: Alarm, confidence: float) -> dict[str, Any]:
+    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to so many parts."""
+    counts = [p.alarms(rule) for p in parts]
+    hours = sum(p.hours for p in parts)
+    raised = sum(float(p.dt[p.level(rule.violations, rule.window) > rule.margin].sum()) for p in parts) / 3600.0
+    low, high = rate_interval(counts, hours, confidence, typical_cluster(parts, rule))
+    return {
+        "violations": rule.violations,
+        "window": rule.window,
+        "margin": rule.margin,
+        "alarms": sum(counts),
+        "parts_with_alarm": sum(c > 0 for c in counts),
+        "raised_share": raised / hours if hours else None,
+        "per_hour": sum(counts) / hours if hours else None,
+        "interval": [low, high if math.isfinite(high) else None],
+    }
+
+
+def typical_cluster(parts: Sequence[Part], rule: Alarm) -> float:
+    """Alarms that come at once, where few or none are counted: those of the same rule at a smaller margin.
+
+    The margin is that at which three parts alarm, but not below NEARBY times the rule's: far below, alarms are of
+    another kind.
+    """
+    levels = [p.level(rule.violations, rule.window) for p in parts]
+    margin = borrowed_margin([float(level.max(initial=0.0)) for level in levels], rule.margin)
+    return cluster_size([rising(level > margin, p.starts) for p, level in zip(parts, levels, strict=True)])
+
+
+def borrowed_margin(peaks: Sequence[float], margin: float) -> float:
+    """The margin at which to see how many alarms come at once; peaks: largest level of each part."""
+    third = sorted(peaks, reverse=True)[min(2, len(peaks) - 1)]
+    # a little below the third peak: an alarm that only just starts is always alone
+    return min(margin, max(0.95 * third, NEARBY * margin))
+
+
+def scenario(validation: Validation) -> dict[str, Any]:
+    """The scenario bound on leaving the envelope anywhere in a whole fresh transient, or why there is none."""
+    v = validation
+    G = len(v.parts)
+    discarded = _discarded(v.model)
+    condition = (
+        "holds if the recordings were drawn independently of one another from one and the same distribution, and the "
+        "machine will be run like that again; counted by whole recordings, margin 1"
+    )
+    if v.kind == "blocks":
+        return {"words": "no scenario bound: blocks of one recording are not independent of one another"}
+    if discarded:
+        variables = _variables(v.model)
+        upper = discarding_bound(variables, discarded, G, v.confidence)
+        if upper > VOID:
+            return {
+                "words": f"not enough transients for a scenario bound: {G} with {variables} unknowns and at most "
+                f"{discarded} with discarded transitions"
+            }
+        return {
+            "interval": [0.0, upper],
+            "discarded": discarded,
+            "variables": variables,
+            "words": f"a fresh recording leaves the envelope with a probability of at most {upper:.1%} "
+            f"(confidence {v.confidence:.0%}); {condition}, and each recording with a discarded transition counted as "
+            f"discarded",
+        }
+    support = sum(p.violated > 0 for p in v.parts)
+    low, high = scenario_interval(support, G, v.confidence)
+    if high > VOID:
+        return {
+            "support": support,
+            "words": f"not enough transients for a scenario bound: {support} of {G} are needed to hold the envelope "
+            f"in its place; record more of them",
+        }
+    return {
+        "support": support,
+        "interval": [low, high],
+        "words": f"a fresh recording leaves the envelope somewhere with a probability between {low:.1%} and "
+        f"{high:.1%} (confidence {v.confidence:.0%}, {support} of {G} recordings hold the envelope in its place); "
+        f"{condition}",
+    }
+
+
+def _variables(model: UncertainLTI) -> int:
+    nominal = model.n * (model.n + model.m)
+    return 2 * nominal + sum(int(a.any()) * model.n for a in (model.c, model.dc, model.v))
+
+
+def _discarded(model: UncertainLTI) -> int:
+    """Recordings at most that lost a transition to the budget of outliers."""
+    listed = model.fit.get("discarded", [])
+    return len(listed) if isinstance(listed, (list, tuple)) else 0
+
+
+def full_widths(model: UncertainLTI) -> tuple[list[float], list[float]]:
+    """Mean and largest width of the full fit on its own samples, recorded units."""
+    return (
+        [float(w) for w in model.fit["mean_width_recorded"]],
+        [float(w) for w in model.fit["max_width_recorded"]],
+    )
+
+
+def _average(parts: Sequence[Part], values: Sequence[Array]) -> Array:
+    """Mean over parts by their verdicts, (n,)."""
+    weight = np.array([p.judged for p in parts], dtype=np.float64)
+    stacked = np.array(values)
+    used = weight > 0
+    if not used.any():
+        return np.full(stacked.shape[1], np.nan)
+    return np.asarray(weight[used] @ stacked[used] / weight[used].sum())
+
+
+def _notes(validation: Validation) -> list[str]:
+    v = validation
+    G = len(v.parts)
+    what = "recordings" if v.kind == "transients" else "blocks"
+    notes = [
+        f"the numbers are those of models fitted to {G - 1} of the {G} {what}: the model of all {G} is a little "
+        f"better, so they err on the safe side"
+    ]
+    if G < 6:
+        notes.append(f"{G} {what} say little: an interval from so few is wide, and rests on them being typical")
+    if v.kind == "blocks":
+        notes.append(
+            "blocks show how the model does on the same run at another time; another run, load or day can differ by "
+            "more than blocks of one run do: record several"
+        )
+    left = sum(p.outside_domain for p in v.parts)
+    judged = sum(p.judged for p in v.parts)
+    if judged and left > 0.01 * judged:
+        notes.append(
+            f"{left / judged:.1%} of the left-out verdicts lie outside the domain fitted without them, so the "
+            f"{what} do not repeat one another: nothing fitted vouches for the bounds there"
+        )
+    return notes
+
+
+def validate_model(
+    model: UncertainLTI,
+    transients: Sequence[Transient],
+    *,
+    blocks: int | None = None,
+    gap: float | None = None,
+    confidence: float = 0.9,
+) -> Validation:
+    """Validate a fitted model, or one from a file, with the recordings it was fitted to and the options it names.
+
+    Raises
+    ------
+    FitError
+        Beside those of `validate`: the model does not say how it was fitted, or the recordings do not give it again.
+    """
+    again = fit(transients, operating_point=model.operating_point, **_options(model))
+    if not _same(again, model):
+        raise FitError(
+            "these recordings do not give this model again, so what was left out of them would say nothing of it; "
+            "name the recordings it was fitted to, or fit it anew"
+        )
+    return validate(
+        transients,
+        operating_point=model.operating_point,
+        alarm=model.alarm,
+        blocks=blocks,
+        gap=gap,
+        confidence=confidence,
+        full=again,
+        **_options(model),
+    )
+
+
+def _options(model: UncertainLTI) -> Mapping[str, Any]:
+    """Options of `fit` that a model says it was fitted with; see `validate_model`."""
+    facts = model.fit
+    for key in ("criterion", "additive"):
+        if key not in facts:
+            raise FitError(f"the model does not say by which {key} it was fitted; fit it again")
+    if facts.get("weights", "ones") != "ones":
+        raise FitError("the model was fitted with weights, which its file does not hold; use validate() from Python")
+    return {"criterion": facts["criterion"], "additive": facts["additive"]}
+
+
+def _same(one: UncertainLTI, other: UncertainLTI) -> bool:
+    """The same widths from as many transitions; another numpy may round otherwise, so not to the bit."""
+    if one.fit["transitions"] != other.fit.get("transitions"):
+        return False
+    return np.allclose(one.fit["mean_width"], np.asarray(other.fit["mean_width"]), rtol=1e-6, atol=0.0)
+
+
+def leave_out_cheaply(
+    transients: Sequence[Transient], model: UncertainLTI, seconds: float, budget: float = 5.0
+) -> dict[str, Any] | None:
+    """The summary of `validate` beside a fit that took so many seconds; None where it would take over `budget` s."""
+    parts = len(transients) if len(transients) > 1 else BLOCKS
+    if parts * seconds > budget or model.fit.get("weights", "ones") != "ones":
+        return None
+    try:
+        return validate(
+            transients, operating_point=model.operating_point, alarm=model.alarm, full=model, **_options(model)
+        ).to_dict()
+    except FitError:  # too little is left when a part is left out: the fit itself stands
+        return None
