@@ -291,7 +291,8 @@ class SignalMap:
     the longest step that is still a transition (None: 2.5 x the median step); min_step (s) the shortest;
     max_skew (s) the greatest age of a state from another topic than the clock (None: max_gap); time says per
     topic whether its instant is the header stamp or the log time (not said: header where the type has one
-    and stamps are not zero). additive is the term that a fit uses where it is not told another.
+    and stamps are not zero). additive is the term that a fit uses where it is not told another, and
+    structure the rules on single elements that it keeps (`identification.structure`).
 
     Raises
     ------
@@ -307,6 +308,7 @@ class SignalMap:
     max_skew: float | None = None
     time: Mapping[str, TimeSource] = field(default_factory=dict)
     additive: Literal["none", "disturbance", "noise", "both"] | None = None
+    structure: Any = None
     source: str = "signals"
 
     def __post_init__(self) -> None:
@@ -409,7 +411,9 @@ class SignalMap:
         need_topics: every signal must name its topic; a model fitted to arrays has none.
         """
         top = _keys(
-            data, source, {"clock", "max_gap", "min_step", "max_skew", "additive", "topics", "states", "controls"}
+            data,
+            source,
+            {"clock", "max_gap", "min_step", "max_skew", "additive", "structure", "topics", "states", "controls"},
         )
         time: dict[str, TimeSource] = {}
         for topic, options in _keys(top.get("topics") or {}, f"{source}: topics", None).items():
@@ -432,6 +436,7 @@ class SignalMap:
             max_skew=_number(top.get("max_skew"), f"{source}: max_skew"),
             time=time,
             additive=additive,
+            structure=top.get("structure"),
             source=source,
         )
 

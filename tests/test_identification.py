@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
 from uncertain_lti.errors import FitError
 from uncertain_lti.identification import formulation
-from uncertain_lti.identification.problem import assemble, moments
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.problem import assemble
+from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import SUBSAMPLE
 from uncertain_lti.plants.leibov import leibov2006
 
@@ -384,7 +386,7 @@ def test_moments_are_plain_sums():
     transient = drawn(small_plant(61), 200, 61, jitter=0.3)
     weights = np.random.default_rng(0).uniform(0.5, 2, (200, 2))
     problem = assemble([transient], OperatingPoint.identity(2, 1), weights, "both")
-    sums = moments(problem)
+    sums, (first, second) = Fleet([problem]).moments(stride=7)
     s = transient.transitions()
     psi = np.column_stack([np.abs(s.x), np.abs(s.u), np.ones(200), 1 / s.dt]) * s.dt[:, None]
     for i in range(2):
@@ -392,3 +394,160 @@ def test_moments_are_plain_sums():
     phi = np.column_stack([s.x, s.u, np.ones(200)]) * s.dt[:, None]
     assert sums.centre == pytest.approx(phi.T @ phi)
     assert sums.target == pytest.approx(phi.T @ (s.x_next - s.x))
+    assert sums.width_sum == pytest.approx(psi.sum(axis=0))
+    assert first.index.tolist() == second.index.tolist() == list(range(0, 200, 7))
+    assert second.rate == pytest.approx(((s.x_next - s.x) / s.dt[:, None])[::7, 1])
+    assert second.root_weight == pytest.approx(np.sqrt(weights[::7, 1]))
+
+
+# --- structure ---
+
+
+def with_structure(transient, additive="none", criterion="qp", **given):
+    n, m = transient.x.shape[1], transient.u.shape[1]
+    return fit(transient, criterion, additive=additive, structure=Structure(n, m, **given))
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_structure_is_kept_and_costs(criterion):
+    transient = drawn(small_plant(71, 3, 2), 300, 71, noise=1e-3, rest=0)
+    free = fit(transient, criterion, additive="noise")
+    nan = np.nan
+    A = [[nan, 0.0, nan], [0.0, nan, nan], [nan, nan, nan]]
+    dA = [[nan, 0.0, nan], [nan, nan, 0.0], [nan, nan, nan]]
+    lower = {"B": np.zeros((3, 2)), "dB": [[0.1, nan], [nan, nan], [nan, nan]]}
+    model = with_structure(
+        transient, "noise", criterion, fixed={"A": A, "dA": dA}, lower=lower, upper={"v": [nan, 0.5, nan]}
+    )
+    assert count_outside(model, [transient]) == 0
+    assert model.A[0, 1] == 0 and model.A[1, 0] == 0 and (model.B >= 0).all() and model.v[1] <= 0.5 * (1 + 1e-9)
+    assert model.dA[0, 1] < 1e-12 and model.dA[1, 2] < 1e-12  # rounding apart
+    assert model.dB[0, 0] >= 0.1
+    ratio = np.asarray(model.fit["objective"]) / np.asarray(free.fit["objective"])
+    assert (ratio >= 1 - 1e-8).all()
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_structure_reaches_the_optimum_of_the_bounded_problem(criterion):
+    transient = drawn(small_plant(72), 150, 72, noise=1e-3)
+    A = np.array([[np.nan, 0.3], [0.0, np.nan]])
+    dA = np.array([[np.nan, 0.2], [np.nan, np.nan]])
+    model = with_structure(transient, "noise", criterion, fixed={"A": A, "dA": dA}, upper={"B": [[1.0], [-0.5]]})
+    s = transient.transitions()
+    z = np.hstack([s.x, s.u])
+    for i in range(2):
+        theta, d, v = cp.Variable(3), cp.Variable(3, nonneg=True), cp.Variable(nonneg=True)
+        centre, half = 0.025 * z @ theta, 0.025 * np.abs(z) @ d + v
+        increment = (s.x_next - s.x)[:, i]
+        given = [theta[j] == A[i, j] for j in range(2) if not np.isnan(A[i, j])]
+        given += [d[j] == dA[i, j] for j in range(2) if not np.isnan(dA[i, j])]
+        given += [theta[2] <= [1.0, -0.5][i], centre - half <= increment, increment <= centre + half]
+        goal = cp.sum_squares(2 * half) if criterion == "qp" else cp.max(2 * half)
+        expected = cp.Problem(cp.Minimize(goal), given).solve(cp.CLARABEL, **CLARABEL)
+        width = widths(model, transient)[:, i]
+        assert (np.sum(width**2) if criterion == "qp" else width.max()) == pytest.approx(expected, rel=1e-6)
+
+
+def test_known_kinematics_leave_only_the_noise():
+    """position' = velocity exactly: the row is given, the rest is fitted; measured with noise it needs v."""
+    rng = np.random.default_rng(0)
+    dt, count = 0.01, 400
+    u = np.repeat(rng.uniform(-1, 1, (count // 20 + 1, 1)), 20, axis=0)[: count + 1]
+    x = np.zeros((count + 1, 2))
+    for k in range(count):
+        x[k + 1] = x[k] + dt * np.array([x[k, 1], -2 * x[k, 1] + (3 + 0.5 * rng.uniform(-1, 1)) * u[k, 0]])
+    rows = {"A": [[0.0, 1.0], [np.nan, np.nan]], "B": [[0.0], [np.nan]], "dA": [[0.0, 0.0], [np.nan, np.nan]]}
+    rows["dB"] = [[0.0], [np.nan]]
+    exact = Transient(np.arange(count + 1) * dt, x, u, state_names=["position", "velocity"])
+    model = with_structure(exact, fixed=rows)
+    assert count_outside(model, [exact]) == 0
+    assert model.A[0].tolist() == [0.0, 1.0] and model.fit["max_width"][0] < 1e-12
+    noisy = Transient(exact.t_ns, x + 1e-4 * rng.standard_normal(x.shape), u, state_names=["position", "velocity"])
+    for criterion in ("qp", "lp"):
+        with pytest.raises(FitError, match="'position' cannot contain the step from sample .* additive"):
+            with_structure(noisy, criterion=criterion, fixed=rows)
+        model = with_structure(noisy, "noise", criterion, fixed=rows)
+        assert count_outside(model, [noisy]) == 0 and 1e-4 < model.v[0] < 1e-3
+
+
+def test_contradictions_of_a_structure_are_named():
+    transient = drawn(small_plant(1), 50, 1)
+    nan = np.nan
+    cases = [
+        (dict(fixed={"dA": [[-1.0, nan], [nan, nan]]}), r"dA\[0, 0\] is a half-width"),
+        (dict(lower={"A": [[2.0, nan], [nan, nan]]}, upper={"A": [[1.0, nan], [nan, nan]]}), r"A\[0, 0\] is to be"),
+        (dict(fixed={"E": [[0.0]]}), "there is no 'E'"),
+        (dict(fixed={"A": [[0.0]]}), r"A has shape \(1, 1\)"),
+        (dict(fixed={"c": [1.0, nan]}), "c is not 0, and the fit has no such term"),
+        (dict(upper={"dA": np.zeros((2, 2)), "dB": np.zeros((2, 1))}), "cannot contain the step from sample"),
+    ]
+    for elements, words in cases:
+        with pytest.raises(FitError, match=words):
+            with_structure(transient, **elements)
+
+
+def test_structure_rules_of_a_signals_file():
+    names = (["p", "v"], ["f"])
+    structure = Structure.from_rules(
+        [
+            {"state": "p", "from": "*", "nominal": 0, "half_width": 0},
+            {"state": "p", "from": "v", "nominal": 1},
+            {"state": "v", "from": "f", "nominal": {"min": 0}, "half_width": {"max": 2.5}},
+            {"state": "*", "from": "noise", "half_width": 0.1},
+        ],
+        *names,
+    )
+    assert structure.lower["A"].tolist() == [[0, 1], [-np.inf, -np.inf]]
+    assert structure.upper["dB"].tolist() == [[0], [2.5]] and structure.lower["B"].tolist() == [[0], [0]]
+    assert structure.lower["v"].tolist() == structure.upper["v"].tolist() == [0.1, 0.1]
+    for rules, words in (
+        ({"state": "p"}, "a list of rules"),
+        ([{"state": "p"}], "keys state, from"),
+        ([{"state": "q", "from": "v", "nominal": 1}], "there is no 'q'; there are p, v"),
+        ([{"state": "p", "from": "g", "nominal": 1}], "there is no 'g'; there are p, v, f"),
+        ([{"state": "p", "from": "v", "nominal": "one"}], "write a number"),
+        ([{"state": "p", "from": "noise", "nominal": 1}], "noise has no nominal"),
+    ):
+        with pytest.raises(FitError, match=words):
+            Structure.from_rules(rules, *names)
+
+
+# --- discards ---
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize("budget", [3, 0.012])
+def test_discards_find_the_outliers(criterion, budget):
+    clean = drawn(small_plant(81), 260, 81, noise=1e-3)
+    x = clean.x.copy()
+    x[90, 0] += 0.5  # spoils the steps into and out of sample 90
+    x[200:, 1] += 0.7  # spoils one step
+    spoiled = Transient(clean.t_ns, x, clean.u, name="run.mcap")
+    model = fit(spoiled, criterion, additive="noise", discard=budget)
+    assert [(d["file"], d["k"]) for d in sorted(model.fit["discarded"], key=lambda d: d["k"])] == [
+        ("run.mcap", 89),
+        ("run.mcap", 90),
+        ("run.mcap", 199),
+    ]
+    assert model.fit["transitions"] == 257 and all(d["effect"] > 0 for d in model.fit["discarded"])
+    everything = fit(spoiled, criterion, additive="noise")
+    assert (model.fit["mean_width"] < 0.5 * everything.fit["mean_width"]).all()
+    assert model.fit["with_discarded"]["mean_width"] == pytest.approx(everything.fit["mean_width"], rel=1e-6)
+    kept = Transient(clean.t_ns, x, clean.u)
+    assert count_outside(model, [kept]) <= 6
+
+
+def test_discards_are_the_best_single_ones():
+    """Against trying every transition: the first discard lowers the objective most."""
+    transient = drawn(small_plant(82), 60, 82, noise=5e-3)
+    problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
+    best = min(range(60), key=lambda k: formulation.solve(problem.without(np.array([k])), "qp", cp.CLARABEL)[2][0])
+    (chosen,) = fit(transient, additive="noise", discard=1).fit["discarded"]
+    assert chosen["k"] == best
+
+
+def test_discards_out_of_range_are_refused():
+    transient = drawn(small_plant(1), 50, 1)
+    for budget in (-1, 1.5, np.nan, True):
+        with pytest.raises(FitError, match="discard is"):
+            fit(transient, additive="noise", discard=budget)

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.errors import FitError
-from uncertain_lti.identification.problem import Moments, Problem
+from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.transient import Transient
 
@@ -136,9 +137,9 @@ def _least_squares_box(problem: Problem, moments: Moments) -> Array:
     theta = np.zeros(moments.target.shape)
     theta[free] = np.linalg.lstsq(moments.centre[np.ix_(free, free)], moments.target[free], rcond=None)[0]
     largest = np.zeros(problem.n)
-    for part in problem.blocks():
-        residual = np.abs(problem.rate(part) - problem.phi(part) @ theta) * problem.dt[part, None]
-        largest = np.maximum(largest, residual.max(axis=0))
+    for block in problem.blocks():
+        residual = np.abs(block.rate() - theta.T @ block.phi(problem.columns)) * block.dt
+        largest = np.maximum(largest, residual.max(axis=1))
     return 2.0 * largest
 
 

@@ -13,9 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.errors import FitError
 from uncertain_lti.identification import formulation
 from uncertain_lti.identification.diagnosis import check_solvable, describe
-from uncertain_lti.identification.problem import Additive, Moments, Problem, assemble, moments
-from uncertain_lti.identification.repair import outside, repair
-from uncertain_lti.identification.working_set import Solution, WorkingSet
+from uncertain_lti.identification.discard import choose_discards
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble
+from uncertain_lti.identification.repair import repair
+from uncertain_lti.identification.structure import Structure
+from uncertain_lti.identification.working_set import InfeasibleError, Solution, WorkingSet
 from uncertain_lti.model import Alarm, Domain, Sampling, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.signals import Signal, SignalMap
@@ -31,6 +35,8 @@ def fit(
     additive: Additive | None = None,
     operating_point: OperatingPoint | None = None,
     *,
+    structure: Structure | None = None,
+    discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
     alarm: Alarm | None = None,
     progress: Callable[[str], None] | None = None,
@@ -55,6 +61,11 @@ def fit(
         Default: what the signals file says, else none.
     operating_point : OperatingPoint, optional
         Steady state and scales; default: those of the transients' signals, or values used as they are.
+    structure : Structure, optional
+        Elements that are known, or bounded. Default: the rules of the signals file, if it has any.
+    discard : int or float
+        Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
+        their effect on the objective and listed in `fit["discarded"]`, beside the widths with them.
     method : {"working-set", "cvxpy"}
         cvxpy states the whole problem as written (OSQP, HiGHS); slow, without tie-breaks, for comparison.
     alarm : Alarm, optional
@@ -90,43 +101,134 @@ def fit(
             f"the transients {n} and {m}"
         )
     signals = _at(signals, operating_point)
+    if structure is None and signals.structure:
+        structure = Structure.from_rules(
+            signals.structure,
+            [s.name for s in signals.states],
+            [s.name for s in signals.controls],
+            f"{signals.source}: structure",
+        )
+    if structure is not None:
+        if (structure.n, structure.m) != (n, m):
+            raise FitError(f"structure is for {structure.n} states and {structure.m} controls, not {n} and {m}")
+        if method == "cvxpy":
+            raise FitError("method cvxpy takes no structure; use the working-set method")
     if additive is None:
         additive = signals.additive or "none"
     problem = assemble(transients, operating_point, weights, additive)
-    names = [s.name for s in signals.states]
-    check_solvable(problem, transients, names)
-    sums = moments(problem)
-    solution = _solve(problem, sums, criterion, method, progress)
+    check_solvable(problem, transients, [s.name for s in signals.states])
 
-    def build(theta: Array, d: Array) -> UncertainLTI:
-        return _model(problem, signals, theta, d, alarm)
+    def name(error: InfeasibleError) -> FitError:
+        return _contradiction(error, problem, transients, signals)
 
-    model, d = repair(build, problem, sums, solution.theta, solution.d, solution.violation)
-    mean_width, max_width, weighted = _widths(problem, d)
-    objective = _objective(problem, sums, d) if criterion == "qp" else weighted
-    # (11): δ of the programme and the widest repaired sample; (10): the working set's own objective
-    reference = _lower_bound(problem, sums, solution, criterion)
-    scale = np.maximum(np.abs(objective), 1e-300)
-    gap = float(np.max((np.asarray(objective) - reference) / scale, initial=0.0))
-    found, messages = describe(model, problem, sums, mean_width, max_width)
-    X = operating_point.X
-    facts: dict[str, Any] = {
-        "criterion": criterion,
+    discarded: list[dict[str, Any]] = []
+    if budget := _budget(discard, problem.N):
+        chosen = choose_discards(problem, criterion, structure, budget)
+        before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure, describe_on=None)
+        for index, effect in chosen:
+            transient, k = transients[problem.source[index]], int(problem.k[index])
+            discarded.append(
+                {
+                    "file": transient.name,
+                    "k": k,
+                    "t": float(transient.t[k]),
+                    "t_ns": int(transient.t_ns[k]),
+                    "effect": effect,
+                }
+            )
+        problem = problem.without(np.array([index for index, _ in chosen], dtype=np.intp))
+    try:
+        model = fit_fleet(
+            Fleet([problem]),
+            signals,
+            criterion,
+            structure=structure,
+            method=method,
+            alarm=alarm,
+            progress=progress,
+            dt_median=float(np.median(problem.dt)),
+            describe_on=problem,
+        )
+    except InfeasibleError as error:
+        raise name(error) from None
+    facts = {
+        **model.fit,
         "additive": additive,
         "weights": "ones" if weights is None else {1: "per state", 2: "per sample", 3: "full"}[problem.weights.ndim],
-        "objective": float(objective[0]) if criterion == "qp" else objective,
-        "gap": max(gap, 0.0),
-        "transitions": problem.N,
         "transients": len(transients),
         "segments": sum(t.segments for t in transients),
+        "sources": [{"file": t.name} for t in transients],
+    }
+    if budget:
+        facts["discarded"] = discarded
+        facts["with_discarded"] = {key: before.fit[key] for key in ("objective", "mean_width", "max_width")}
+    return model.with_(fit=facts)
+
+
+def fit_fleet(
+    fleet: Fleet,
+    signals: SignalMap,
+    criterion: str,
+    *,
+    structure: Structure | None = None,
+    method: str = "working-set",
+    alarm: Alarm | None = None,
+    progress: Callable[[str], None] | None = None,
+    dt_median: float | None = None,
+    describe_on: Problem | None = None,
+) -> UncertainLTI:
+    """`fit` on transitions that are already normalised, wherever they lie.
+
+    Parameters
+    ----------
+    fleet : Fleet
+    signals : SignalMap
+        With the operating point of the normalisation.
+    criterion, structure, method, alarm, progress
+        As in `fit`; method cvxpy takes a fleet of one `Problem`.
+    dt_median : float, optional
+        s.
+    describe_on : Problem, optional
+        What the messages in words are made from: the data, or a part of it.
+
+    Raises
+    ------
+    FitError
+        As in `fit`; InfeasibleError where the structure contradicts a transition.
+    """
+    engine = WorkingSet(fleet, structure, progress=progress)
+    sums = engine.sums
+    if method == "working-set":
+        solution = engine.quadratic() if criterion == "qp" else engine.linear()
+    else:
+        solution = _as_written(engine, criterion)
+
+    def build(theta: Array, d: Array) -> UncertainLTI:
+        return _model(fleet.columns, signals, sums, theta, d, dt_median, alarm)
+
+    model, d = repair(build, fleet, sums, solution.theta, solution.d, solution.violation)
+    max_width, weighted = fleet.widest(d)
+    mean_width = 2.0 * (sums.width_sum @ d) / sums.count
+    if criterion == "qp":
+        weights = engine.weights
+        objective = np.array([_objective(sums, d, weights)])
+        reference = np.array([_objective(sums, solution.d, weights)])
+    else:
+        assert solution.delta is not None
+        objective, reference = weighted, solution.delta
+    gap = float(np.max((objective - reference) / np.maximum(np.abs(objective), 1e-300), initial=0.0))
+    X = model.operating_point.X
+    facts: dict[str, Any] = {
+        "criterion": criterion,
+        "objective": float(objective[0]) if criterion == "qp" else objective,
+        "gap": max(gap, 0.0),
+        "transitions": sums.count,
         "mean_width": mean_width,
         "max_width": max_width,
         "mean_width_recorded": mean_width * X,
         "max_width_recorded": max_width * X,
-        "violations": int(outside(model, problem).sum()),
-        "rank": found,
-        "spectral_radius": model.spectral_radius(),
-        "messages": messages,
+        "violations": 0,  # `repair` has counted them, by the verdict's own arithmetic
+        "spectral_radius": model.spectral_radius() if dt_median is not None else None,
         "solver": {
             "method": method,
             "names": sorted(solution.solvers),
@@ -134,24 +236,40 @@ def fit(
             "passes": solution.passes,
             "working_set": solution.working,
         },
-        "sources": [{"file": t.name} for t in transients],
         "versions": _versions(),
     }
+    if describe_on is not None:
+        facts["rank"], facts["messages"] = describe(model, describe_on, sums, mean_width, max_width)
     return model.with_(fit=facts)
 
 
-def _solve(
-    problem: Problem, sums: Moments, criterion: str, method: str, progress: Callable[[str], None] | None
-) -> Solution:
-    if method == "working-set":
-        engine = WorkingSet(problem, sums, progress)
-        return engine.quadratic() if criterion == "qp" else engine.linear()
+def _as_written(engine: WorkingSet, criterion: str) -> Solution:
+    """Solve the whole problem by cvxpy, and measure what it left outside."""
+    (problem,) = engine.fleet.partitions
+    assert isinstance(problem, Problem)
     theta, d, objective = formulation.solve(problem, criterion)
-    engine = WorkingSet(problem, sums, progress)
-    engine.solution.theta, engine.solution.d = theta, d
-    violation = engine.violation()
-    delta = objective if criterion == "lp" else None
-    return Solution(theta, d, objective, violation, delta, solvers={"cvxpy"})
+    return Solution(theta, d, engine.violation(theta, d), objective if criterion == "lp" else None, solvers={"cvxpy"})
+
+
+def _contradiction(
+    error: InfeasibleError, problem: Problem, transients: Sequence[Transient], signals: SignalMap
+) -> FitError:
+    transient, k = transients[problem.source[error.index]], int(problem.k[error.index])
+    signal = signals.states[error.row]
+    distance = error.distance * float(signal.scale)
+    return FitError(
+        f"structure: '{signal.name}' cannot contain the step from sample {k} of {transient.name} "
+        f"(t = {transient.t[k]:.6g} s), which stays {distance:.3g} {signal.unit} outside at "
+        f"best; free a half-width of this row, or use an additive term"
+    )
+
+
+def _budget(discard: float, transitions: int) -> int:
+    """Number of transitions that may be discarded: a whole number, or a share below 1."""
+    whole = isinstance(discard, (int, np.integer)) and not isinstance(discard, bool)
+    if isinstance(discard, bool) or not (np.isfinite(discard) and discard >= 0) or (not whole and discard >= 1):
+        raise FitError(f"discard is {discard!r}; give a whole number of transitions, or a share below 1")
+    return int(discard) if whole else int(discard * transitions)
 
 
 def _common_signals(transients: Sequence[Transient]) -> SignalMap:
@@ -192,10 +310,17 @@ def _at(signals: SignalMap, point: OperatingPoint) -> SignalMap:
     )
 
 
-def _model(problem: Problem, signals: SignalMap, theta: Array, d: Array, alarm: Alarm | None) -> UncertainLTI:
-    n, p, columns = problem.n, problem.p, problem.columns
+def _model(
+    columns: Columns,
+    signals: SignalMap,
+    sums: Moments,
+    theta: Array,
+    d: Array,
+    dt_median: float | None,
+    alarm: Alarm | None,
+) -> UncertainLTI:
+    n, p = len(signals.states), len(sums.low)
     zeros = np.zeros(n)
-    x, u = problem.z[:, :n], problem.z[:, n:]
     clock_types = [s.type for s in signals.states if s.topic == signals.clock]
     return UncertainLTI(
         theta[:n].T,
@@ -210,47 +335,29 @@ def _model(problem: Problem, signals: SignalMap, theta: Array, d: Array, alarm: 
             clock=signals.clock or "",
             clock_type=clock_types[0] if clock_types else "",
             time=dict(signals.time),
-            dt_median=float(np.median(problem.dt)),
-            dt_min=float(problem.dt.min()),
-            dt_max=float(problem.dt.max()),
+            dt_median=dt_median,
+            dt_min=sums.dt_min,
+            dt_max=sums.dt_max,
             max_gap=signals.max_gap,
             min_step=signals.min_step,
             max_skew=signals.max_skew,
         ),
-        domain=Domain(x.min(axis=0), x.max(axis=0), u.min(axis=0), u.max(axis=0)),
+        domain=Domain(sums.low[:n], sums.high[:n], sums.low[n:], sums.high[n:]),
         alarm=alarm,
     )
 
 
-def _objective(problem: Problem, sums: Moments, d: Array) -> Array:
-    """Value of (10), (1,)."""
+def _objective(sums: Moments, d: Array, weights: Array | None) -> float:
+    """Value of (10); weights (n,) where they are constant in time."""
     if sums.coupled is not None:
         flat = d.T.ravel()
-        return np.array([4.0 * flat @ sums.coupled @ flat])
-    total = 0.0
-    for i in range(problem.n):
-        gram = sums.gram[i] if len(sums.gram) > 1 else sums.gram[0] * problem.weights[i]
-        total += 4.0 * float(d[:, i] @ gram @ d[:, i])
-    return np.array([total])
-
-
-def _widths(problem: Problem, d: Array) -> tuple[Array, Array, Array]:
-    """Mean and largest width per step, and largest √w_ii x width, each (n,), normalised."""
-    total, largest = np.zeros(problem.n), np.zeros(problem.n)
-    weighted = np.zeros(problem.n)
-    for part in problem.blocks():
-        width = 2.0 * problem.dt[part, None] * (problem.psi(part) @ d)
-        total += width.sum(axis=0)
-        largest = np.maximum(largest, width.max(axis=0))
-        weighted = np.maximum(weighted, (width * np.sqrt(problem.row_weights(part))).max(axis=0))
-    return total / problem.N, largest, weighted
-
-
-def _lower_bound(problem: Problem, sums: Moments, solution: Solution, criterion: str) -> Array:
-    if criterion == "qp":
-        return _objective(problem, sums, solution.d)
-    assert solution.delta is not None
-    return solution.delta
+        return float(4.0 * flat @ sums.coupled @ flat)
+    n = d.shape[1]
+    grams = [
+        sums.gram[i] if sums.gram is not None else sums.plain_gram * (weights[i] if weights is not None else 1.0)
+        for i in range(n)
+    ]
+    return float(sum(4.0 * d[:, i] @ grams[i] @ d[:, i] for i in range(n)))
 
 
 def _versions() -> dict[str, str]:

@@ -39,10 +39,8 @@ def solve(problem: Problem, criterion: str, solver: str | None = None, **options
     """
     import cvxpy as cp
 
-    everything = slice(None)
     dt = problem.dt[:, None]
-    phi, psi = problem.phi(everything) * dt, problem.psi(everything) * dt
-    increment = problem.rate(everything) * dt
+    phi, psi, increment = problem.phi() * dt, problem.psi() * dt, problem.rate() * dt
     # columns of order one: the same problem, and the difference between an answer and none for first-order solvers
     unit_phi, unit_psi, unit_y = (_unit(a) for a in (phi, psi, increment))
     phi, psi, increment = phi / unit_phi, psi / unit_psi, increment / unit_y
@@ -58,7 +56,7 @@ def solve(problem: Problem, criterion: str, solver: str | None = None, **options
             terms = [cp.sum([cp.multiply(chol[:, j, i], width[:, j]) for j in range(i, n)]) for i in range(n)]
             objective = cp.sum([cp.sum_squares(t) for t in terms])
         else:
-            root = np.sqrt(problem.row_weights(everything)) * unit_y
+            root = np.sqrt(problem.row_weights()) * unit_y
             objective = cp.sum_squares(cp.multiply(root, width))
         scale = float(np.mean(unit_y) ** 2)
         programme = cp.Problem(cp.Minimize(objective / scale), contained)
@@ -68,7 +66,7 @@ def solve(problem: Problem, criterion: str, solver: str | None = None, **options
         _run(programme, solver, options)
         values = np.array([programme.value * scale])
     elif criterion == "lp":
-        root = np.sqrt(problem.row_weights(everything))
+        root = np.sqrt(problem.row_weights())
         delta = cp.Variable(n, nonneg=True)
         limited = [cp.multiply(root[:, i], width[:, i]) <= delta[i] for i in range(n)]
         programme = cp.Problem(cp.Minimize(cp.sum(delta)), contained + limited)  # rows do not meet

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from uncertain_lti.transient import Transient
 Array = NDArray[np.float64]
 Additive = Literal["none", "disturbance", "noise", "both"]
 
-BLOCK = 16384
+BLOCK = 8192
 """Transitions per pass block: their regressors stay in the cache."""
 
 
@@ -42,25 +42,108 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Problem:
-    """All usable transitions of all recordings, normalised, in the form
+class Block:
+    """Some transitions in columns: z (p, K) = [x; u], x_next (n, K), dt (K,); weights (n,), (K, n) or (K, n, n)."""
+
+    start: int
+    z: Array
+    x_next: Array
+    dt: Array
+    weights: Array
+
+    def __len__(self) -> int:
+        return len(self.dt)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.x_next)
+
+    def rate(self) -> Array:
+        """(x_next - x) / Δt, 1/s, (n, K)."""
+        rate = self.x_next - self.z[: self.n]
+        rate /= self.dt
+        return rate
+
+    def phi(self, columns: Columns) -> Array:
+        """Regressors of the nominal row, (p [+1], K): z, and 1 for the drift."""
+        return np.vstack([self.z, np.ones(len(self))]) if columns.drift else self.z
+
+    def psi(self, columns: Columns) -> Array:
+        """Regressors of the half-width, (p [+1] [+1], K): |z|, 1 for dc, 1/Δt for v."""
+        p = len(self.z)
+        psi = np.empty((p + columns.disturbance + columns.noise, len(self)))
+        np.abs(self.z, out=psi[:p])
+        if columns.disturbance:
+            psi[p] = 1.0
+        if columns.noise:
+            np.divide(1.0, self.dt, out=psi[-1])
+        return psi
+
+    def root_weights(self) -> Array:
+        """√w_ii(t_{k+1}), (n, K) or (n, 1)."""
+        if self.weights.ndim == 1:
+            return np.sqrt(self.weights)[:, None]
+        diagonal = np.diagonal(self.weights, axis1=1, axis2=2) if self.weights.ndim == 3 else self.weights
+        return np.sqrt(diagonal).T
+
+
+class Partition(Protocol):
+    """Usable transitions, normalised, wherever they lie; what the passes over all data need.
+
+    They are in the form
 
         |rate_i - (z·θ_i + c_i)| <= |z|·d_i + dc_i + v_i / Δt       for every transition and row i,
 
-    which is (8)(9) of Leibov (2006) divided by Δt_k. θ_i is row i of [A B], d_i of [ΔA ΔB].
-
-    where rate = (x_next - x) / Δt. z (N, p) = [x u]; x_next (N, n); dt (N,); source (N,) and k (N,) say which
-    transient and sample a transition comes from. weights: (n,), (N, n) or (N, n, n).
+    where rate = (x_next - x) / Δt, which is (8)(9) of Leibov (2006) divided by Δt_k. θ_i is row i of [A B], d_i of
+    [ΔA ΔB].
     """
 
-    z: Array
-    x_next: Array
+    @property
+    def columns(self) -> Columns:
+        """Terms that are unknown."""
+        ...
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        ...
+
+    @property
+    def p(self) -> int:
+        """Number of states and controls."""
+        ...
+
+    @property
+    def weights(self) -> Array:
+        """(n,), or per transition."""
+        ...
+
+    @property
+    def N(self) -> int:
+        """Number of transitions."""
+        ...
+
+    def blocks(self) -> Iterator[Block]:
+        """All transitions, in blocks that stay in the cache."""
+        ...
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A `Partition` in memory, of all recordings.
+
+    z_columns (p, N), next_columns (n, N): samples in columns; dt (N,); weights (n,), (N, n) or (N, n, n). source (N,)
+    and k (N,) say which transient and sample a transition comes from.
+    """
+
+    z_columns: Array
+    next_columns: Array
     dt: Array
     source: NDArray[np.intp]
     k: NDArray[np.intp]
     weights: Array
     columns: Columns
-    n: int
 
     @property
     def N(self) -> int:
@@ -68,57 +151,68 @@ class Problem:
         return len(self.dt)
 
     @property
-    def p(self) -> int:
-        """Number of states and controls."""
-        return int(self.z.shape[1])
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.next_columns)
 
     @property
-    def constant_dt(self) -> bool:
-        """All steps are equal to a part in 1e6."""
-        return is_constant(self.dt)
+    def p(self) -> int:
+        """Number of states and controls."""
+        return len(self.z_columns)
 
-    def rate(self, part: slice | NDArray[np.intp]) -> Array:
-        """(x_next - x) / Δt, 1/s, (K, n)."""
-        return np.asarray((self.x_next[part] - self.z[part, : self.n]) / self.dt[part, None])
+    @property
+    def z(self) -> Array:
+        """[x u] with samples in rows, (N, p)."""
+        return self.z_columns.T
 
-    def phi(self, part: slice | NDArray[np.intp]) -> Array:
-        """Regressors of the nominal row, (K, p [+1]): z, and 1 for the drift."""
-        z = self.z[part]
-        return np.column_stack([z, np.ones(len(z))]) if self.columns.drift else z
+    @property
+    def x_next(self) -> Array:
+        """Next states with samples in rows, (N, n)."""
+        return self.next_columns.T
 
-    def psi(self, part: slice | NDArray[np.intp]) -> Array:
-        """Regressors of the half-width, (K, p [+1] [+1]): |z|, 1 for dc, 1/Δt for v."""
-        size = np.abs(self.z[part])
-        extra = []
-        if self.columns.disturbance:
-            extra.append(np.ones(len(size)))
-        if self.columns.noise:
-            extra.append(1.0 / self.dt[part])
-        return np.column_stack([size, *extra]) if extra else size
+    def block(self, part: slice) -> Block:
+        """Transitions of a slice, without a copy."""
+        weights = self.weights if self.weights.ndim == 1 else self.weights[part]
+        return Block(part.start or 0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights)
 
-    def blocks(self) -> Iterator[slice]:
-        """Slices that cover all transitions."""
+    def blocks(self) -> Iterator[Block]:
+        """All transitions, in blocks that stay in the cache."""
         for start in range(0, self.N, BLOCK):
-            yield slice(start, min(start + BLOCK, self.N))
+            yield self.block(slice(start, min(start + BLOCK, self.N)))
 
-    def row_weights(self, part: slice | NDArray[np.intp]) -> Array:
-        """w_ii(t_{k+1}), (K, n)."""
-        if self.weights.ndim == 1:
-            return np.broadcast_to(self.weights, (len(self.dt[part]), self.n))
-        chosen = self.weights[part]
-        return np.asarray(np.diagonal(chosen, axis1=1, axis2=2) if chosen.ndim == 3 else chosen)
+    def rate(self, part: slice = slice(None)) -> Array:
+        """(x_next - x) / Δt with samples in rows, 1/s, (K, n)."""
+        return ((self.next_columns[:, part] - self.z_columns[: self.n, part]) / self.dt[part]).T
 
-    def subset(self, index: NDArray[np.intp]) -> Problem:
-        """The same problem on some transitions."""
+    def phi(self, part: slice = slice(None)) -> Array:
+        """Regressors of the nominal row with samples in rows, (K, r)."""
+        return self._rows(part).phi(self.columns).T
+
+    def psi(self, part: slice = slice(None)) -> Array:
+        """Regressors of the half-width with samples in rows, (K, q)."""
+        return self._rows(part).psi(self.columns).T
+
+    def row_weights(self, part: slice = slice(None)) -> Array:
+        """w_ii(t_{k+1}) with samples in rows, (K, n)."""
+        return np.broadcast_to(self._rows(part).root_weights().T ** 2, (len(self.dt[part]), self.n))
+
+    def _rows(self, part: slice) -> Block:
+        weights = self.weights if self.weights.ndim == 1 else self.weights[part]
+        return Block(0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights)
+
+    def without(self, index: NDArray[np.intp]) -> Problem:
+        """The same problem without some transitions."""
+        keep = np.ones(self.N, dtype=bool)
+        keep[index] = False
+        weights = self.weights if self.weights.ndim == 1 else self.weights[keep]
         return Problem(
-            self.z[index],
-            self.x_next[index],
-            self.dt[index],
-            self.source[index],
-            self.k[index],
-            self.weights if self.weights.ndim == 1 else self.weights[index],
+            self.z_columns[:, keep],
+            self.next_columns[:, keep],
+            self.dt[keep],
+            self.source[keep],
+            self.k[keep],
+            weights,
             self.columns,
-            self.n,
         )
 
 
@@ -160,17 +254,25 @@ def assemble(
         )
     dt = np.concatenate([s.dt for s in steps])
     p = n + len(point.u_s)
-    z = np.empty((len(dt), p))
-    x_next = np.empty((len(dt), n))
+    z = np.empty((p, len(dt)))
+    x_next = np.empty((n, len(dt)))
     start = 0
     for s in steps:
         part = slice(start, start + len(s.dt))
         start = part.stop
-        z[part, :n] = point.normalise_x(s.x)
-        z[part, n:] = point.normalise_u(s.u)
-        x_next[part] = point.normalise_x(s.x_next)
+        _normalise(s.x, point.x_s, point.X, z[:n, part])
+        _normalise(s.u, point.u_s, point.U, z[n:, part])
+        _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
     columns = Columns.of(additive, is_constant(dt))
-    return Problem(z, x_next, dt, source, k, _weights(weights, transients, k, source, n), columns, n)
+    return Problem(z, x_next, dt, source, k, _weights(weights, transients, k, source, n), columns)
+
+
+def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> None:
+    """(recorded - steady) / scale as `OperatingPoint` does it, into columns; (K, n) to (n, K)."""
+    for row, values, a, b in zip(out, recorded.T, steady, scale, strict=True):
+        np.subtract(values, a, out=row)
+        if b != 1.0:
+            row /= b
 
 
 def _weights(
@@ -226,70 +328,3 @@ def _weights(
     elif (chosen <= 0).any():
         raise FitError("weights: every weight must be positive; leave samples out of the transient instead")
     return chosen
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Sums over all transitions that the objectives need, whatever N is.
-
-    gram: (n, q, q), Σ w_ii (Δt ψ)(Δt ψ)ᵀ per row, or (1, q, q) where all rows share it (constant weights left out);
-    coupled: (n q, n q) for full weights, else None. centre: (r, r) and target (r, n), the normal equations of the
-    unweighted squared distance of the bounds' centre. phi_scale (r,), psi_scale (q,), rate_scale (n,): scales that
-    make columns and rows of order one; 0 where a column is all zero.
-    """
-
-    gram: Array
-    plain_gram: Array
-    coupled: Array | None
-    centre: Array
-    target: Array
-    phi_scale: Array
-    psi_scale: Array
-    rate_scale: Array
-
-
-def moments(problem: Problem) -> Moments:
-    """One pass over the data for everything in `Moments`."""
-    columns, n = problem.columns, problem.n
-    r = problem.p + columns.drift
-    q = problem.p + columns.disturbance + columns.noise
-    weighted = problem.weights.ndim == 2
-    plain = np.zeros((q, q))
-    gram = np.zeros((n, q, q)) if weighted else plain[None]
-    coupled = np.zeros((n, n, q, q)) if problem.weights.ndim == 3 else None
-    centre, target = np.zeros((r, r)), np.zeros((r, n))
-    rate_square = np.zeros(n)
-    for part in problem.blocks():
-        dt = problem.dt[part, None]
-        psi = problem.psi(part) * dt
-        phi = problem.phi(part) * dt
-        rate = problem.rate(part) * dt
-        plain += psi.T @ psi
-        if weighted:
-            for i in range(n):
-                gram[i] += (psi * problem.weights[part, i, None]).T @ psi
-        if coupled is not None:
-            for i in range(n):
-                for j in range(i, n):
-                    coupled[i, j] += (psi * problem.weights[part, i, j, None]).T @ psi
-        centre += phi.T @ phi
-        target += phi.T @ rate
-        rate_square += np.einsum("ki,ki->i", rate, rate)
-    flat = None
-    if coupled is not None:
-        for i in range(n):
-            for j in range(i):
-                coupled[i, j] = coupled[j, i]
-        flat = coupled.transpose(0, 2, 1, 3).reshape(n * q, n * q)
-        flat = 0.5 * (flat + flat.T)
-    scale = np.sqrt(np.maximum(rate_square, 0.0) / problem.N)
-    return Moments(
-        gram,
-        plain,
-        flat,
-        centre,
-        target,
-        np.sqrt(np.diagonal(centre) / problem.N),
-        np.sqrt(np.diagonal(plain) / problem.N),
-        np.where(scale > 0, scale, 1.0),
-    )

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.errors import FitError
-from uncertain_lti.identification.problem import Moments, Problem
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.passes import Moments
 from uncertain_lti.model import UncertainLTI
 
 Array = NDArray[np.float64]
@@ -16,25 +17,15 @@ _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 40
 
 
-def outside(model: UncertainLTI, problem: Problem) -> NDArray[np.intp]:
-    """Training transitions outside each row's bounds (6)(7), (n,), by `UncertainLTI.bounds` itself."""
-    count = np.zeros(problem.n, dtype=np.intp)
-    for part in problem.blocks():
-        z = problem.z[part]
-        lower, upper = model.bounds(z[:, : problem.n], z[:, problem.n :], problem.dt[part])
-        count += np.count_nonzero(~((lower <= problem.x_next[part]) & (problem.x_next[part] <= upper)), axis=0)
-    return count
-
-
 def repair(
     build: Callable[[Array, Array], UncertainLTI],
-    problem: Problem,
-    moments: Moments,
+    fleet: Fleet,
+    sums: Moments,
     theta: Array,
     d: Array,
     violation: Array,
 ) -> tuple[UncertainLTI, Array]:
-    """Lift d until `outside` is zero in every row.
+    """Lift d until `Fleet.count_outside` is zero in every row.
 
     A solver leaves a violation of at most `violation` x (scaled size of the sample), and the size is linear in |z|,
     so lifting each element by violation x its unit covers it in every sample. What is left is rounding: a few ulps
@@ -44,7 +35,7 @@ def repair(
     ----------
     build : callable
         (theta (r, n), d (q, n)) -> UncertainLTI.
-    problem, moments : of the fit
+    fleet, sums : of the fit
     theta, d : array (r, n), (q, n)
     violation : array (n,)
 
@@ -59,27 +50,26 @@ def repair(
     FitError
         Samples stay outside however far the half-widths are lifted.
     """
-    n, p = problem.n, problem.p
-    free = moments.psi_scale > 0
-    unit = np.zeros(len(moments.psi_scale))
-    unit[free] = 1.0 / moments.psi_scale[free]
-    lifted = d + np.outer(unit, np.maximum(violation, 0.0) * moments.rate_scale)
+    n, p = fleet.n, fleet.p
+    free = sums.psi_scale > 0
+    unit = np.zeros(len(sums.psi_scale))
+    unit[free] = 1.0 / sums.psi_scale[free]
+    lifted = d + np.outer(unit, np.maximum(violation, 0.0) * sums.rate_scale)
     nominal = np.zeros(d.shape)
     nominal[:p] = np.abs(theta[:p])
-    if problem.columns.disturbance:
+    if fleet.columns.disturbance:
         nominal[p] = np.abs(theta[p])
     own = np.zeros(d.shape)
-    own[np.arange(n), np.arange(n)] = 1.0 / problem.dt.min()
+    own[np.arange(n), np.arange(n)] = 1.0 / sums.dt_min
     base = lifted
     todo = np.ones(n, dtype=bool)
     for attempt in range(_ROUNDS):
+        ulps = 2.0 ** (attempt + 2) * _EPS * (nominal + base + own) * free[:, None]
+        lifted = np.where(todo, base + ulps, lifted)
         model = build(theta, lifted)
-        todo = outside(model, problem) > 0
+        todo = fleet.count_outside(model) > 0
         if not todo.any():
             return model, lifted
-        ulps = 2.0**attempt * _EPS * (nominal + base + own) * free[:, None]
-        relative = base * (2.0**attempt * _EPS)
-        lifted = np.where(todo, base + ulps + relative, lifted)
     raise FitError(
         f"containment could not be repaired in row {int(np.argmax(todo))}: the signals differ too much in scale; "
         f"give steady and scale that bring them to order one"

@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.errors import FitError
-from uncertain_lti.identification.problem import BLOCK, Moments, Problem
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.passes import Candidate, Moments, Samples
 from uncertain_lti.identification.solvers import Simplex, solve_qp
+from uncertain_lti.identification.structure import Structure
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SUBSAMPLE = 10_000
-"""Transitions of the first solve; full passes only correct it."""
+"""Transitions of the first solve; up to twice as many are held as a whole."""
 TOLERANCE = 1e-11
 """Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
 TIE_BREAK = 1e-8
@@ -29,296 +31,458 @@ stated tie-break asks for.
 WIDTH_SLACK = 1e-9
 """Relative room above δ of (11) in which its ties are broken; a solver needs some."""
 BOUNDED_TIE_BREAK = 1e-5
-"""The same among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
+"""The same as TIE_BREAK among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
 MAX_ROUNDS = 200
+_JOIN = 48  # samples that join a working set per round
 
 
 @dataclass
 class Solution:
-    """theta (r, n) and d (q, n), unscaled columns per row i of the model, and how they were found.
+    """theta (r, n) and d (q, n), one column per row of the model, and how they were found.
 
-    objective (n,): of the working set before the repair, so at most the optimum over all samples; violation (n,):
-    largest violation left, in scaled units; delta (n,): optimum of (11) where that is the criterion.
+    violation (n,): largest violation left, in scaled units; delta (n,): optimum of (11) on the working set, a lower
+    bound of the optimum over all samples; None for (10).
     """
 
     theta: Array
     d: Array
-    objective: Array
     violation: Array
     delta: Array | None = None
     rounds: int = 0
-    passes: int = 0
+    passes: int = 1
     working: list[int] = field(default_factory=list)
     solvers: set[str] = field(default_factory=set)
 
 
+class Row:
+    """One row of the model in scaled unknowns ξ = [θ d], with the samples held for it and the working set among them.
+
+    Elements that the structure fixes, and columns that are 0 in every sample, are no unknowns.
+    """
+
+    def __init__(self, i: int, sums: Moments, bounds: tuple[Array, Array, Array, Array]) -> None:
+        self.i = i
+        self.scale = float(sums.rate_scale[i])
+        theta_low, theta_high, d_low, d_high = (b[:, i] for b in bounds)
+        dead_phi, dead_psi = sums.phi_scale == 0, sums.psi_scale == 0
+        fixed_phi, fixed_psi = theta_low == theta_high, d_low == d_high
+        self.theta = np.where(fixed_phi, theta_low, np.clip(0.0, theta_low, theta_high))
+        self.d = np.where(fixed_psi, d_low, np.where(dead_psi, d_low, 0.0))
+        self.free_phi = np.flatnonzero(~dead_phi & ~fixed_phi)
+        self.free_psi = np.flatnonzero(~dead_psi & ~fixed_psi)
+        with np.errstate(divide="ignore"):
+            unit_phi, unit_psi = 1.0 / sums.phi_scale, 1.0 / sums.psi_scale
+        self.unit_phi, self.unit_psi = unit_phi[self.free_phi], unit_psi[self.free_psi]
+        self.size_unit = np.where(dead_psi, 0.0, unit_psi)
+        self.r, self.q = len(self.free_phi), len(self.free_psi)
+        self.fixed_theta, self.fixed_d = self.theta.copy(), self.d.copy()
+        self.fixed_theta[self.free_phi] = 0.0
+        self.fixed_d[self.free_psi] = 0.0
+        to_phi, to_psi = self.scale * self.unit_phi, self.scale * self.unit_psi
+        self.lower = np.concatenate([theta_low[self.free_phi] / to_phi, d_low[self.free_psi] / to_psi])
+        self.upper = np.concatenate([theta_high[self.free_phi] / to_phi, d_high[self.free_psi] / to_psi])
+        inside = np.ix_(self.free_phi, self.free_phi)
+        self.centre = sums.centre[inside] * np.outer(self.unit_phi, self.unit_phi) / sums.count
+        target = sums.target[:, i] - sums.centre @ self.fixed_theta
+        self.target = target[self.free_phi] * self.unit_phi / (sums.count * self.scale)
+        self.plain, self.plain_linear = self._gram(sums.plain_gram, sums.count)
+        self.gram, self.linear = (
+            (self.plain, self.plain_linear) if sums.gram is None else self._gram(sums.gram[i], sums.count)
+        )
+        self.samples = Samples.join([], len(sums.low))
+        self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
+        self.limit: float | None = None  # δ of (11) in units of scale
+        self._simplex: Simplex | None = None
+        self._known: Index = np.empty(0, dtype=np.intp)
+
+    def _gram(self, gram: Array, count: int) -> tuple[Array, Array]:
+        """Squared widths as ½ dᵀ G d + gᵀ d in scaled units; G has order one."""
+        unit = self.unit_psi
+        inside = gram[np.ix_(self.free_psi, self.free_psi)] * np.outer(unit, unit) / count
+        linear = (gram @ self.fixed_d)[self.free_psi] * unit / (count * self.scale)
+        largest = float(np.diagonal(inside).max(initial=0.0)) or 1.0
+        return inside / largest, linear / largest
+
+    @property
+    def unknown(self) -> bool:
+        """Something is left to solve for."""
+        return self.r + self.q > 0
+
+    def start(self) -> None:
+        """Least squares, and no half-width."""
+        answer = np.linalg.lstsq(self.centre + 1e-12 * np.eye(self.r), self.target, rcond=None)[0].astype(np.float64)
+        self.store(np.concatenate([np.clip(answer, self.lower[: self.r], self.upper[: self.r]), np.zeros(self.q)]))
+
+    def store(self, answer: Array) -> None:
+        """Take scaled unknowns as the row's elements."""
+        self.theta[self.free_phi] = answer[: self.r] * self.unit_phi * self.scale
+        d = np.maximum(answer[self.r :], np.maximum(self.lower[self.r :], 0.0))
+        self.d[self.free_psi] = d * self.unit_psi * self.scale
+
+    def hold(self, samples: Samples, columns_drift: bool, disturbance: bool, noise: bool) -> None:
+        """Hold these samples, beside the working set so far."""
+        p = len(samples.z)
+        kept = self.samples[self.pool]
+        self.samples = samples = Samples.join([samples, kept], p)
+        self.pool = np.searchsorted(samples.index, kept.index)
+        ones = np.ones(len(samples))
+        phi = np.vstack([samples.z, ones]) if columns_drift else samples.z
+        extra = ([ones] if disturbance else []) + ([1.0 / samples.dt] if noise else [])
+        psi = np.vstack([np.abs(samples.z), *extra])
+        size = self.size_unit @ psi
+        size[size == 0.0] = 1.0
+        # rows of the programme: each sample divided by its own size, so that one near rest weighs as any other
+        self.phi = ((phi[self.free_phi] * self.unit_phi[:, None]) / size).T
+        self.psi = ((psi[self.free_psi] * self.unit_psi[:, None]) / size).T
+        self.y = (samples.rate - self.fixed_theta @ phi) / (size * self.scale)
+        self.half = (self.fixed_d @ psi) / (size * self.scale)
+        self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
+
+    def slack(self) -> Array:
+        """Slack of every held sample, (K,); see `passes.scan`."""
+        theta = self.theta[self.free_phi] / (self.unit_phi * self.scale)
+        d = self.d[self.free_psi] / (self.unit_psi * self.scale)
+        half = self.psi @ d + self.half
+        slack = half - np.abs(self.y - self.phi @ theta)
+        if self.limit is not None:
+            slack = np.minimum(slack, self.limit / self.width - half)
+        return np.asarray(slack)
+
+    def widen_pool(self, tolerance: float = TOLERANCE, most: int = _JOIN) -> bool:
+        """Let the most violated held samples join the working set; False where there is none to join."""
+        slack = self.slack()
+        slack[self.pool] = np.inf
+        outside = np.flatnonzero(slack < -tolerance)
+        if len(outside) > most:
+            outside = outside[np.argpartition(slack[outside], most)[:most]]
+        self.pool = np.concatenate([self.pool, outside])
+        return len(outside) > 0
+
+    def containment(self, pool: Index) -> tuple[Array, Array]:
+        """G ξ >= h: (8) and (9) for samples of the pool."""
+        phi, psi = self.phi[pool], self.psi[pool]
+        y, half = self.y[pool], self.half[pool]
+        return np.vstack([np.hstack([phi, psi]), np.hstack([-phi, psi])]), np.concatenate([y - half, -y - half])
+
+    def hessian(self, gram: Array, linear: Array, tie_break: float) -> tuple[Array, Array]:
+        """Squared widths, plus the tie-break on the centre."""
+        H = np.zeros((self.r + self.q, self.r + self.q))
+        diagonal = np.diagonal(gram)
+        weight = tie_break * float(diagonal.min(initial=1.0))
+        H[: self.r, : self.r] = weight * (self.centre + 1e-10 * np.eye(self.r))
+        H[self.r :, self.r :] = gram + 1e-13 * np.diag(diagonal)
+        return H, np.concatenate([-weight * self.target, linear])
+
+    # --- programmes of this row on its working set ---
+
+    def solve_quadratic(self) -> str:
+        """(10)."""
+        H, f = self.hessian(self.gram, self.linear, TIE_BREAK)
+        answer, solver = solve_qp(H, f, *self.containment(self.pool), self.lower, self.upper)
+        self.store(answer)
+        return solver
+
+    def solve_linear(self) -> str:
+        """(11)."""
+        if self._simplex is None:
+            cost = np.append(np.zeros(self.r + self.q), 1.0)  # minimise δ
+            self._simplex = Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
+        index = self.samples.index[self.pool]
+        fresh = self.pool[~np.isin(index, self._known)]
+        if len(fresh):
+            G, h = self.containment(fresh)
+            self._simplex.add(np.hstack([G, np.zeros((len(G), 1))]), h)
+            width = self.width[fresh]
+            unit = np.minimum(1.0, 1.0 / width)[:, None]  # δ - width x (ψ d + half) >= 0, scaled to order one
+            rows = np.hstack(
+                [np.zeros((len(fresh), self.r)), -width[:, None] * self.psi[fresh], np.ones((len(fresh), 1))]
+            )
+            self._simplex.add(rows * unit, width * self.half[fresh] * unit[:, 0])
+            self._known = index
+        answer = self._simplex.solve()
+        self.store(answer[:-1])
+        self.limit = max(float(answer[-1]), 0.0)
+        return "HiGHS simplex"
+
+    def solve_bounded(self) -> str:
+        """Least squared widths, then the centre, among the optima of (11)."""
+        assert self.limit is not None
+        H, f = self.hessian(self.plain, self.plain_linear, BOUNDED_TIE_BREAK)
+        G, h = self.containment(self.pool)
+        width, limit = self.width[self.pool], self.limit
+        if limit > 0:
+            width, limit = width / limit, 1.0
+        G = np.vstack([G, np.hstack([np.zeros((len(width), self.r)), -width[:, None] * self.psi[self.pool]])])
+        answer, solver = solve_qp(
+            H, f, G, np.concatenate([h, width * self.half[self.pool] - limit]), self.lower, self.upper
+        )
+        self.store(answer)
+        return solver
+
+    def contradiction(self) -> tuple[int, float] | None:
+        """(index of a sample, distance) that no elements within the structure can contain; None where there is none."""
+        cost = np.append(np.zeros(self.r + self.q), 1.0)
+        simplex = Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
+        G, h = self.containment(self.pool)
+        simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
+        answer = simplex.solve()
+        if answer[-1] <= 1e-9:
+            return None
+        short = h - G @ answer[:-1]
+        worst = self.pool[int(np.argmax(short)) % len(self.pool)]
+        size = self.width[worst] / (2.0 * self.samples.root_weight[worst])
+        return int(self.samples.index[worst]), float(answer[-1] * size * self.scale)
+
+
+class InfeasibleError(FitError):
+    """Row `row` cannot contain transition `index`, which stays `distance` outside at best."""
+
+    def __init__(self, row: int, index: int, distance: float) -> None:
+        super().__init__(f"row {row} cannot contain transition {index}")
+        self.row, self.index, self.distance = row, index, distance
+
+
 class WorkingSet:
-    """Candidate on a pool of samples, one pass over all samples, the most violated join the pool, until none is left.
+    """Candidate on a working set, slack of all samples in one pass, the least slack joins, until none is negative.
+
+    A pass also brings every sample whose slack is small. How far slack can change is bounded by how far the scaled
+    unknowns change (the size of a sample is linear in |z|), so while they change less than the slack that was
+    brought, no other sample can leave its bounds, and the proof of optimality needs no further pass.
 
     Parameters
     ----------
-    problem : Problem
-    moments : Moments
+    fleet : Fleet
+    structure : Structure, optional
+    excluded : array of int, optional
+        Transitions that need not be contained.
     progress : callable, optional
-        Called with one line of text per full pass.
+        Called with one line of text per pass.
     """
 
-    def __init__(self, problem: Problem, moments: Moments, progress: Callable[[str], None] | None = None) -> None:
-        self.problem, self.moments = problem, moments
+    def __init__(
+        self,
+        fleet: Fleet,
+        structure: Structure | None = None,
+        excluded: Index | None = None,
+        progress: Callable[[str], None] | None = None,
+    ) -> None:
+        self.fleet = fleet
         self.progress = progress or (lambda text: None)
-        self.free_phi = np.flatnonzero(moments.phi_scale > 0)
-        self.free_psi = np.flatnonzero(moments.psi_scale > 0)
-        self.phi_unit = 1.0 / moments.phi_scale[self.free_phi]
-        self.psi_unit = 1.0 / moments.psi_scale[self.free_psi]
-        self.r, self.q = len(self.free_phi), len(self.free_psi)
-        n = problem.n
-        self.coupled = moments.coupled is not None
-        self.groups: list[tuple[int, ...]] = [(i,) for i in range(n)]
-        self.pools: list[Index] = [np.empty(0, dtype=np.intp) for _ in range(n)]
-        self.solution = Solution(
-            np.zeros((len(moments.phi_scale), n)),
-            np.zeros((len(moments.psi_scale), n)),
-            np.zeros(n),
-            np.zeros(n),
-        )
-        unit = self.phi_unit
-        self._centre = moments.centre[np.ix_(self.free_phi, self.free_phi)] * np.outer(unit, unit) / problem.N
-        self._target = moments.target[self.free_phi] * unit[:, None] / (problem.N * moments.rate_scale)
-        unit = self.psi_unit
-        within = np.ix_(self.free_psi, self.free_psi)
-        self._plain = moments.plain_gram[within] * np.outer(unit, unit) / problem.N
-        self._gram = [g[within] * np.outer(unit, unit) / problem.N for g in moments.gram]
-        self._limit: Array | None = None  # δ of (11) per row while widths are bounded
-
-    # --- the two criteria ---
+        self.excluded = np.empty(0, dtype=np.intp) if excluded is None else excluded
+        self.whole = fleet.N <= 2 * SUBSAMPLE
+        stride = 1 if self.whole else fleet.N // SUBSAMPLE
+        self.sums, self._first = fleet.moments(stride)
+        columns = fleet.columns
+        self._terms = (columns.drift, columns.disturbance, columns.noise)
+        structure = structure or Structure(fleet.n, fleet.p - fleet.n)
+        bounds = structure.stacked(*self._terms)
+        self.rows = [Row(i, self.sums, bounds) for i in range(fleet.n)]
+        self.solvers: set[str] = set()
+        self.rounds, self.passes = 0, 1
 
     def quadratic(self) -> Solution:
         """Criterion (10)."""
-        if self.coupled:
-            self.groups = [tuple(range(self.problem.n))]
-        self._start()
-        self._iterate(self._solve_quadratic)
-        return self.solution
+        coupled = self.sums.coupled is not None
+        self._run(self._settle_coupled if coupled else lambda rows: self._settle(rows, Row.solve_quadratic))
+        return self._solution()
 
     def linear(self) -> Solution:
         """Criterion (11), then least sum of squared widths among its optima, then the centre."""
-        self._start()
-        self._limit = np.full(self.problem.n, np.inf)
-        self._simplex: list[tuple[Simplex, Index]] = []
-        self._iterate(self._solve_linear)
-        delta = self._limit.copy()
-        self.solution.delta = delta
-        self._limit = delta * (1.0 + WIDTH_SLACK)
-        self._iterate(self._solve_bounded)
-        self.solution.objective = delta
-        return self.solution
+        deltas = np.zeros(self.fleet.n)
 
-    def violation(self) -> Array:
-        """Largest violation of the solution as it stands, in scaled units, (n,): one pass."""
-        return self._violators(None, 1)[1]
+        def settle(rows: list[Row]) -> None:
+            for row in rows:
+                row.limit = None if row.limit is None else float(deltas[row.i]) / row.scale
+            self._settle(rows, Row.solve_linear)
+            for row in rows:
+                if row.limit is None:  # nothing unknown: the widths are what the structure says
+                    row.limit = float((row.width * row.half).max(initial=0.0))
+                deltas[row.i] = row.limit * row.scale
+                row.limit *= 1.0 + WIDTH_SLACK
+            self._settle(rows, Row.solve_bounded)
 
-    # --- one row, or all rows where weights couple them, on the pool ---
+        self._run(settle)
+        return self._solution(deltas)
 
-    def _rows(self, i: int, samples: Index) -> tuple[Array, Array, Array]:
-        """Scaled φ (K, r), ψ (K, q) and increment (K,) of row i, each divided by the sample's scaled size."""
-        dt = self.problem.dt[samples, None]
-        phi = self.problem.phi(samples)[:, self.free_phi] * dt * self.phi_unit
-        psi = self.problem.psi(samples)[:, self.free_psi] * dt * self.psi_unit
-        size = psi.sum(axis=1)
-        y = self.problem.rate(samples)[:, i] * dt[:, 0] / self.moments.rate_scale[i]
-        size = np.where(size > 0, size, 1.0)
-        return phi / size[:, None], psi / size[:, None], y / size
+    @property
+    def weights(self) -> Array | None:
+        """Weights (n,) that are constant in time; None where they are not."""
+        return self.fleet.weights
 
-    def _containment(self, i: int, samples: Index) -> tuple[Array, Array]:
-        """G ξ >= h for ξ = [θ d] of row i: (8) and (9)."""
-        phi, psi, y = self._rows(i, samples)
-        return np.vstack([np.hstack([phi, psi]), np.hstack([-phi, psi])]), np.concatenate([y, -y])
+    def violation(self, theta: Array, d: Array) -> Array:
+        """Largest violation of given elements over all transitions, in scaled units, (n,): one pass."""
+        for row in self.rows:
+            row.theta, row.d, row.limit = theta[:, row.i], d[:, row.i], None
+        found = self.fleet.scan(self._candidate(np.full(self.fleet.n, np.inf), 1))
+        for row, (samples, _) in zip(self.rows, found, strict=True):
+            self._hold(row, samples)
+        return self._solution().violation
 
-    def _width_rows(self, i: int, samples: Index) -> Array:
-        """a with a·d = √w_ii x (width) in units of rate_scale, (K, q)."""
-        dt = self.problem.dt[samples, None]
-        psi = self.problem.psi(samples)[:, self.free_psi] * dt * self.psi_unit
-        return np.asarray(2.0 * np.sqrt(self.problem.row_weights(samples)[:, i, None]) * psi)
-
-    def _store(self, i: int, theta: Array, d: Array) -> None:
-        scale = self.moments.rate_scale[i]
-        self.solution.theta[self.free_phi, i] = theta * self.phi_unit * scale
-        self.solution.d[self.free_psi, i] = np.maximum(d, 0.0) * self.psi_unit * scale
-
-    def _hessian(self, group: tuple[int, ...], gram: Array, tie_break: float) -> tuple[Array, Array]:
-        """Squared widths, plus the tie-break on the centre; variables [θ d] row after row."""
-        block = self.r + self.q
-        H = np.zeros((block * len(group), block * len(group)))
-        f = np.zeros(block * len(group))
-        for position, i in enumerate(group):
-            theta = slice(position * block, position * block + self.r)
-            for other in range(len(group)):
-                d_a = slice(position * block + self.r, (position + 1) * block)
-                d_b = slice(other * block + self.r, (other + 1) * block)
-                H[d_a, d_b] = gram[position * self.q : (position + 1) * self.q, other * self.q : (other + 1) * self.q]
-            diagonal = np.diagonal(gram)[position * self.q : (position + 1) * self.q]
-            weight = tie_break * float(diagonal.min(initial=1.0))
-            H[theta, theta] = weight * (self._centre + 1e-10 * np.eye(self.r))
-            f[theta] = -weight * self._target[:, i]
-        ridge = np.zeros(len(f))
-        for position in range(len(group)):
-            d = slice(position * block + self.r, (position + 1) * block)
-            ridge[d] = 1e-13 * np.diagonal(H)[d]
-        H[np.diag_indices(len(f))] += ridge
-        return H, f
-
-    def _bounds(self, rows: int) -> tuple[Array, Array]:
-        lower = np.tile(np.concatenate([np.full(self.r, -np.inf), np.zeros(self.q)]), rows)
-        return lower, np.full(len(lower), np.inf)
-
-    def _solve_quadratic(self, group: tuple[int, ...]) -> None:
-        scale = self.moments.rate_scale[list(group)]
-        if self.coupled:
-            assert self.moments.coupled is not None
-            q_all = len(self.moments.psi_scale)
-            keep = (np.array(group)[:, None] * q_all + self.free_psi).ravel()
-            unit = (scale[:, None] * self.psi_unit).ravel()
-            gram = self.moments.coupled[np.ix_(keep, keep)] * np.outer(unit, unit) / self.problem.N
-            gram /= np.diagonal(gram).max(initial=1e-300)
-        else:
-            gram = self._gram[group[0] if len(self._gram) > 1 else 0]
-        H, f = self._hessian(group, gram, TIE_BREAK)
-        block = self.r + self.q
-        parts = [self._containment(i, self.pools[i]) for i in group]
-        G = np.zeros((sum(len(h) for _, h in parts), block * len(group)))
-        start = 0
-        for position, (rows, _) in enumerate(parts):
-            G[start : start + len(rows), position * block : (position + 1) * block] = rows
-            start += len(rows)
-        answer, solver = solve_qp(H, f, G, np.concatenate([h for _, h in parts]), *self._bounds(len(group)))
-        self.solution.solvers.add(solver)
-        for position, i in enumerate(group):
-            part = answer[position * block : (position + 1) * block]
-            self._store(i, part[: self.r], part[self.r :])
-
-    def _solve_linear(self, group: tuple[int, ...]) -> None:
-        (i,) = group
-        assert self._limit is not None
-        simplex, known = self._simplex_of(i)
-        fresh = np.setdiff1d(self.pools[i], known)
-        if len(fresh):
-            G, h = self._containment(i, fresh)
-            simplex.add(np.hstack([G, np.zeros((len(G), 1))]), h)
-            widths = self._width_rows(i, fresh)
-            size = np.maximum(widths.max(axis=1, keepdims=True, initial=0.0), 1.0)
-            simplex.add(np.hstack([np.zeros((len(fresh), self.r)), -widths / size, 1.0 / size]), np.zeros(len(fresh)))
-            self._simplex[i] = (simplex, self.pools[i])
-        answer = simplex.solve()
-        self.solution.solvers.add("HiGHS simplex")
-        self._store(i, answer[: self.r], answer[self.r : -1])
-        self._limit[i] = max(answer[-1], 0.0) * self.moments.rate_scale[i]
-
-    def _simplex_of(self, i: int) -> tuple[Simplex, Index]:
-        while len(self._simplex) < self.problem.n:
-            cost = np.zeros(self.r + self.q + 1)
-            cost[-1] = 1.0
-            lower, upper = self._bounds(1)
-            simplex = Simplex(cost, np.append(lower, 0.0), np.append(upper, np.inf))
-            self._simplex.append((simplex, np.empty(0, dtype=np.intp)))
-        return self._simplex[i]
-
-    def _solve_bounded(self, group: tuple[int, ...]) -> None:
-        (i,) = group
-        assert self._limit is not None
-        H, f = self._hessian(group, self._plain, BOUNDED_TIE_BREAK)
-        G, h = self._containment(i, self.pools[i])
-        limit = self._limit[i] / self.moments.rate_scale[i]
-        widths = self._width_rows(i, self.pools[i])
-        if limit > 0:
-            widths, limit = widths / limit, 1.0
-        G = np.vstack([G, np.hstack([np.zeros((len(widths), self.r)), -widths])])
-        h = np.concatenate([h, np.full(len(widths), -limit)])
-        answer, solver = solve_qp(H, f, G, h, *self._bounds(1))
-        self.solution.solvers.add(solver)
-        self._store(i, answer[: self.r], answer[self.r :])
-
-    # --- the loop ---
-
-    def _start(self) -> None:
-        """Pools of the samples farthest from the least-squares centre, relative to their size."""
-        ridge = 1e-12 * np.eye(self.r)
-        theta: Array = np.linalg.lstsq(self._centre + ridge, self._target, rcond=None)[0].astype(np.float64)
-        for i in range(self.problem.n):
-            self._store(i, theta[:, i], np.zeros(self.q))
-        blocks = -(-self.problem.N // BLOCK)
-        for i, found in enumerate(self._violators(None, max(2, 4 * (self.r + self.q) // blocks))[0]):
-            self.pools[i] = found
-
-    def _iterate(self, solve: Callable[[tuple[int, ...]], None]) -> None:
-        count = self.problem.N
-        if count > 2 * SUBSAMPLE:
-            stride = np.linspace(0, count - 1, SUBSAMPLE).astype(np.intp)
-            self._until_contained(solve, np.unique(np.concatenate([stride, *self.pools])))
-        self._until_contained(solve, None)
-
-    def _until_contained(self, solve: Callable[[tuple[int, ...]], None], among: Index | None) -> None:
-        todo = list(self.groups)
-        per_block = 64 if among is not None or self.problem.N <= 8 * SUBSAMPLE else 12
-        for _ in range(MAX_ROUNDS):
-            for group in todo:
-                solve(group)
-            self.solution.rounds += 1
-            found, worst = self._violators(among, per_block)
-            self.solution.violation = worst
-            if among is None:
-                left = sum(map(len, found))
-                self.progress(f"pass {self.solution.passes}: {left} samples outside, working set {self._sizes()}")
-            added = []
-            for i, samples in enumerate(found):
-                fresh = np.setdiff1d(samples, self.pools[i])
-                if len(fresh):
-                    self.pools[i] = np.concatenate([self.pools[i], fresh])
-                    added.append(i)
-            todo = [g for g in self.groups if any(i in added for i in g)]
-            if not todo:
-                self.solution.working = [len(pool) for pool in self.pools]
-                return
-        raise FitError(
-            f"the working set did not settle in {MAX_ROUNDS} rounds ({self._sizes()} samples); "
-            f"scale the signals to order one"
+    def _solution(self, delta: Array | None = None) -> Solution:
+        for row in self.rows:  # a solver may stop close to what cannot be
+            if -float(row.slack().min(initial=0.0)) > 1e-8 and (found := row.contradiction()):
+                raise InfeasibleError(row.i, *found)
+        return Solution(
+            np.column_stack([row.theta for row in self.rows]),
+            np.column_stack([row.d for row in self.rows]),
+            np.array([max(0.0, -float(row.slack().min(initial=0.0))) for row in self.rows]),
+            delta,
+            self.rounds,
+            self.passes,
+            [len(row.pool) for row in self.rows],
+            self.solvers,
         )
 
-    def _sizes(self) -> str:
-        return "/".join(str(len(pool)) for pool in self.pools)
+    # --- all samples ---
 
-    def _violators(self, among: Index | None, per_block: int) -> tuple[list[Index], Array]:
-        """The most violated samples of each row, and the largest violation (n,), in one pass over the data."""
-        problem, scale = self.problem, self.moments.rate_scale
-        psi_unit = np.zeros(len(self.moments.psi_scale))
-        psi_unit[self.free_psi] = self.psi_unit
-        theta, d = self.solution.theta, self.solution.d
-        found: list[list[Index]] = [[] for _ in range(problem.n)]
-        worst = np.zeros(problem.n)
-        if among is None:
-            self.solution.passes += 1
-            parts: list[slice | Index] = list(problem.blocks())
-        else:
-            parts = [among]
-        for part in parts:
-            psi = problem.psi(part)
-            size = psi @ psi_unit
-            size[size == 0.0] = np.inf  # rest without an additive term: nothing can be contained there but rest
-            half = psi @ d
-            excess = np.abs(problem.rate(part) - problem.phi(part) @ theta)
-            excess -= half
-            excess /= size[:, None]
-            excess /= scale
-            if self._limit is not None and np.isfinite(self._limit).all():
-                width = 2.0 * half * problem.dt[part, None] * np.sqrt(problem.row_weights(part))
-                over = width / np.maximum(self._limit, 1e-300) - 1.0
-                excess = np.maximum(excess, over)
-            peaks = excess.max(axis=0)
-            worst = np.maximum(worst, peaks)
-            for i in np.flatnonzero(peaks > TOLERANCE):
-                column = excess[:, i]
-                outside = np.flatnonzero(column > TOLERANCE)
-                if len(outside) > per_block:
-                    outside = outside[np.argpartition(column[outside], -per_block)[-per_block:]]
-                found[i].append(outside + part.start if isinstance(part, slice) else part[outside])
-        empty = np.empty(0, dtype=np.intp)
-        return [np.concatenate(f) if f else empty for f in found], worst
+    def _run(self, settle: Callable[[list[Row]], None]) -> None:
+        for row, samples in zip(self.rows, self._first, strict=True):
+            self._hold(row, samples)
+            row.start()
+            row.widen_pool(most=4 * (row.r + row.q))
+        settle(self.rows)
+        if self.whole:
+            return
+        most = 2 * SUBSAMPLE + self.fleet.N // 500
+        for _ in range(MAX_ROUNDS):
+            share = 0.7 * most / self.fleet.N
+            reach = np.array([max(float(np.quantile(row.slack(), share)), 10 * TOLERANCE) for row in self.rows])
+            # the samples held after a pass are those of least slack, so the next reach would shrink: keep the first
+            reach = np.maximum(reach, getattr(self, "_reach", reach))
+            self._reach = reach
+            found = self.fleet.scan(self._candidate(reach, most))
+            self.passes += 1
+            before = [(row.theta.copy(), row.d.copy()) for row in self.rows]
+            todo = []
+            left = 0
+            for row, (samples, _) in zip(self.rows, found, strict=True):
+                self._hold(row, samples)
+                left += int((row.slack() < -TOLERANCE).sum())
+                if row.widen_pool():
+                    todo.append(row)
+            self.progress(f"pass {self.passes}: {left} samples outside, working set {self._sizes()}")
+            if not todo:
+                return
+            settle(self.rows if self.sums.coupled is not None else todo)
+            moved = [self._moved(row, *old) for row, old in zip(self.rows, before, strict=True)]
+            if all(change < held for change, (_, held) in zip(moved, found, strict=True)):
+                return
+        raise FitError(f"the working set did not settle in {MAX_ROUNDS} passes; scale the signals to order one")
+
+    def _candidate(self, reach: Array, most: int) -> Candidate:
+        limits = [row.limit for row in self.rows]
+        limit = None
+        if all(value is not None for value in limits):
+            limit = np.array([float(value or 0.0) * row.scale for value, row in zip(limits, self.rows, strict=True)])
+        return Candidate(
+            np.column_stack([row.theta for row in self.rows]),
+            np.column_stack([row.d for row in self.rows]),
+            self.rows[0].size_unit,
+            self.sums.rate_scale,
+            limit,
+            reach,
+            most,
+        )
+
+    def _moved(self, row: Row, theta: Array, d: Array) -> float:
+        """Largest change of any sample's slack, in scaled units, since theta and d."""
+        p = self.fleet.p
+        with np.errstate(divide="ignore", invalid="ignore"):
+            per_column = np.abs(row.d - d) * np.where(row.size_unit > 0, 1.0 / row.size_unit, 0.0)
+            per_column[:p] += np.abs(row.theta - theta)[:p] * np.where(
+                row.size_unit[:p] > 0, 1.0 / row.size_unit[:p], 0.0
+            )
+        drift, disturbance, noise = self._terms
+        if drift:  # |c| <= size x ..., by the term of the size that is constant in time
+            change = abs(float(row.theta[p] - theta[p]))
+            if disturbance:
+                per_column[p] += change / row.size_unit[p]
+            elif noise:
+                per_column[-1] += change * self.sums.dt_max / row.size_unit[-1]
+        return float(per_column.max(initial=0.0)) / row.scale * (1.0 + 1e-9)
+
+    def _hold(self, row: Row, samples: Samples) -> None:
+        if len(self.excluded):
+            samples = samples[~np.isin(samples.index, self.excluded)]
+        row.hold(samples, *self._terms)
+
+    def _sizes(self) -> str:
+        return "/".join(str(len(row.pool)) for row in self.rows)
+
+    # --- held samples ---
+
+    def _settle(self, rows: list[Row], solve: Callable[[Row], str]) -> None:
+        for row in rows:
+            for _ in range(MAX_ROUNDS):
+                if row.unknown:
+                    self._guarded(row, solve)
+                self.rounds += 1
+                if not row.widen_pool() or not row.unknown:
+                    break
+            else:
+                raise FitError(f"row {row.i}: no working set after {MAX_ROUNDS} rounds; scale the signals to order one")
+            if not row.unknown:
+                self._known_row(row)
+
+    def _guarded(self, row: Row, solve: Callable[[Row], str]) -> None:
+        try:
+            self.solvers.add(solve(row))
+        except FitError:
+            found = row.contradiction()
+            if found is None:
+                raise
+            raise InfeasibleError(row.i, *found) from None
+
+    def _known_row(self, row: Row) -> None:
+        """A row that the structure fixes altogether must contain every sample but for rounding."""
+        slack = row.slack() if row.limit is None else row.half - np.abs(row.y)
+        worst = int(np.argmin(slack)) if len(slack) else 0
+        if len(slack) and slack[worst] < -1e-9:
+            size = row.width[worst] / (2.0 * row.samples.root_weight[worst])
+            raise InfeasibleError(row.i, int(row.samples.index[worst]), float(-slack[worst] * size * row.scale))
+
+    def _settle_coupled(self, rows: list[Row]) -> None:
+        for _ in range(MAX_ROUNDS):
+            self._solve_coupled()
+            self.rounds += 1
+            if not any([row.widen_pool() for row in rows]):
+                return
+        raise FitError(f"the working set did not settle in {MAX_ROUNDS} rounds; scale the signals to order one")
+
+    def _solve_coupled(self) -> None:
+        """(10) with full weights, which couple the rows."""
+        assert self.sums.coupled is not None
+        rows, q_all = self.rows, len(self.sums.psi_scale)
+        keep = np.concatenate([row.i * q_all + row.free_psi for row in rows])
+        unit = np.concatenate([row.unit_psi * row.scale for row in rows])
+        fixed = np.concatenate([row.fixed_d for row in rows])
+        gram = self.sums.coupled[np.ix_(keep, keep)] * np.outer(unit, unit)
+        linear = (self.sums.coupled @ fixed)[keep] * unit
+        largest = float(np.diagonal(gram).max(initial=1e-300))
+        starts = np.concatenate([[0], np.cumsum([row.r + row.q for row in rows])])
+        where_d = np.concatenate([np.arange(starts[k] + row.r, starts[k + 1]) for k, row in enumerate(rows)])
+        H, f = np.zeros((starts[-1], starts[-1])), np.zeros(starts[-1])
+        parts = [row.containment(row.pool) for row in rows]
+        G = np.zeros((sum(len(h) for _, h in parts), starts[-1]))
+        line = 0
+        for k, (row, (block, _)) in enumerate(zip(rows, parts, strict=True)):
+            mine = slice(starts[k], starts[k + 1])
+            own = (
+                np.diagonal(self.sums.coupled)[row.i * q_all + row.free_psi] * (row.unit_psi * row.scale) ** 2 / largest
+            )
+            H[mine, mine], f[mine] = row.hessian(np.diag(own), np.zeros(row.q), TIE_BREAK)
+            G[line : line + len(block), mine] = block
+            line += len(block)
+        H[np.ix_(where_d, where_d)] = gram / largest + 1e-13 * np.diag(np.diagonal(gram) / largest)
+        f[where_d] = linear / largest
+        lower, upper = (np.concatenate([getattr(row, side) for row in rows]) for side in ("lower", "upper"))
+        try:
+            answer, solver = solve_qp(H, f, G, np.concatenate([h for _, h in parts]), lower, upper)
+        except FitError:
+            for row in rows:
+                if found := row.contradiction():
+                    raise InfeasibleError(row.i, *found) from None
+            raise
+        self.solvers.add(solver)
+        for k, row in enumerate(rows):
+            row.store(answer[starts[k] : starts[k + 1]])

@@ -1,0 +1,116 @@
+"""Discards: the few transitions whose absence narrows the envelope most."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.structure import Structure
+from uncertain_lti.identification.working_set import Row, WorkingSet
+
+Array = NDArray[np.float64]
+
+_ACTIVE = 1e-7
+"""Slack, in scaled units, below which a sample carries the envelope."""
+
+
+def choose_discards(
+    problem: Problem, criterion: str, structure: Structure | None, budget: int
+) -> list[tuple[int, float]]:
+    """Greedy choice: again and again the transition whose absence lowers the objective most.
+
+    Only a transition on the edge of some row's bounds can have an effect; each of them is tried by solving the rows
+    it carries without it. A discarded transition need not be contained in any row. It stops early when none has an
+    effect.
+
+    Parameters
+    ----------
+    problem : Problem
+    criterion : {"qp", "lp"}
+        The objective is the sum over rows of (10), or of δ of (11) relative to what it was.
+    structure : Structure, optional
+    budget : int
+
+    Returns
+    -------
+    list of (int, float)
+        Transition, and the share of the objective that it cost, in order of choice.
+    """
+    engine = WorkingSet(Fleet([problem]), structure)
+    engine.quadratic() if criterion == "qp" else engine.linear()
+    first = np.array([_value(row, criterion, engine.weights) for row in engine.rows])
+    unit = np.full(len(first), max(float(first.sum()), 1e-300)) if criterion == "qp" else np.maximum(first, 1e-300)
+    chosen: list[tuple[int, float]] = []
+    gains: list[dict[int, float]] = [{} for _ in engine.rows]
+    stale = set(range(len(engine.rows)))
+    while len(chosen) < budget:
+        for i in stale:
+            gains[i] = _gains(engine, engine.rows[i], criterion)
+        total: dict[int, float] = {}
+        for i, row_gains in enumerate(gains):
+            for index, gain in row_gains.items():
+                total[index] = total.get(index, 0.0) + gain / unit[i]
+        if not total or max(total.values()) <= 1e-12:
+            break
+        index = max(total, key=lambda k: (total[k], -k))
+        chosen.append((index, total[index]))
+        stale = set()
+        for row, row_gains in zip(engine.rows, gains, strict=True):
+            _drop(row, index)
+            if index in row_gains:
+                _solve(engine, row, criterion)
+                stale.add(row.i)
+    return chosen
+
+
+def _value(row: Row, criterion: str, weights: Array | None) -> float:
+    if criterion == "lp":
+        return (row.limit or 0.0) * row.scale
+    d = row.d[row.free_psi] / (row.unit_psi * row.scale)
+    weight = 1.0 if weights is None else float(weights[row.i])
+    return weight * row.scale**2 * float(d @ row.gram @ d + 2.0 * row.linear @ d)
+
+
+def _gains(engine: WorkingSet, row: Row, criterion: str) -> dict[int, float]:
+    """Fall of the row's objective without each of the samples that carry it."""
+    if not row.unknown:
+        return {}
+    value = _value(row, criterion, engine.weights)
+    gains = {}
+    for index in row.samples.index[np.flatnonzero(row.slack() < _ACTIVE)].tolist():
+        trial = _copy(row)
+        _drop(trial, index)
+        _solve(engine, trial, criterion)
+        gains[index] = value - _value(trial, criterion, engine.weights)
+    return gains
+
+
+def _copy(row: Row) -> Row:
+    """A row that can be solved on its own, sharing what is only read."""
+    trial = copy.copy(row)
+    trial.theta, trial.d = row.theta.copy(), row.d.copy()
+    trial._simplex, trial._known = None, np.empty(0, dtype=np.intp)
+    return trial
+
+
+def _drop(row: Row, index: int) -> None:
+    """Take a sample out of what the row holds."""
+    keep = row.samples.index != index
+    if keep.all():
+        return
+    position = np.cumsum(keep) - 1
+    row.pool = position[row.pool[keep[row.pool]]]
+    row.samples = row.samples[keep]
+    row.phi, row.psi = row.phi[keep], row.psi[keep]
+    row.y, row.half, row.width = row.y[keep], row.half[keep], row.width[keep]
+    row._simplex, row._known = None, np.empty(0, dtype=np.intp)
+
+
+def _solve(engine: WorkingSet, row: Row, criterion: str) -> None:
+    if criterion == "lp":
+        row.limit = None
+    engine._settle([row], Row.solve_quadratic if criterion == "qp" else Row.solve_linear)

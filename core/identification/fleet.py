@@ -1,0 +1,76 @@
+"""Fleet: the partitions of the data, and how a pass visits them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.identification import passes
+from uncertain_lti.identification.passes import Candidate, Moments, Samples
+from uncertain_lti.identification.problem import Columns, Partition
+from uncertain_lti.model import UncertainLTI
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+class Fleet:
+    """Partitions visited one after the other in this process; the passes over all data as map and reduce.
+
+    Parameters
+    ----------
+    partitions : sequence of Partition
+        With the same columns, states and controls.
+    """
+
+    def __init__(self, partitions: Sequence[Partition]) -> None:
+        self.partitions = list(partitions)
+        self._describe([(part.N, part.n, part.p, part.columns) for part in self.partitions])
+
+    def _describe(self, facts: Sequence[tuple[int, int, int, Columns]]) -> None:
+        self.counts = [count for count, *_ in facts]
+        self.offsets = [0, *np.cumsum(self.counts)[:-1].tolist()]
+        self.N = sum(self.counts)
+        _, self.n, self.p, self.columns = facts[0]
+
+    @property
+    def weights(self) -> Array | None:
+        """Weights (n,) that are constant in time; None where they are not."""
+        first = self.partitions[0].weights
+        return first if first.ndim == 1 else None
+
+    def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
+        """function(partition, *arguments of that partition) for every partition, in order."""
+        return [function(part, *args) for part, args in zip(self.partitions, arguments, strict=True)]
+
+    def _same(self, *arguments: Any) -> list[tuple[Any, ...]]:
+        return [arguments] * len(self.counts)
+
+    def moments(self, stride: int) -> tuple[Moments, list[Samples]]:
+        """Sums over all transitions, and every stride-th transition per row."""
+        results = self.map(passes.moments, [(offset, stride) for offset in self.offsets])
+        total = results[0][0]
+        for sums, _ in results[1:]:
+            total = total + sums
+        return total, [Samples.join([r[1][i] for r in results], self.p) for i in range(self.n)]
+
+    def scan(self, candidate: Candidate) -> list[tuple[Samples, float]]:
+        """Per row the samples of least slack, and the reach below which none is missing."""
+        results = self.map(passes.scan, [(candidate, offset) for offset in self.offsets])
+        rows = []
+        for i in range(self.n):
+            rows.append((Samples.join([r[i][0] for r in results], self.p), min(r[i][1] for r in results)))
+        return rows
+
+    def count_outside(self, model: UncertainLTI) -> NDArray[np.intp]:
+        """Transitions outside each row's bounds, (n,), by the verdict's own arithmetic."""
+        counts = self.map(passes.count_outside, self._same(model))
+        return np.asarray(np.sum(counts, axis=0), dtype=np.intp)
+
+    def widest(self, d: Array) -> tuple[Array, Array]:
+        """Largest width, and largest √w_ii x width, each (n,), normalised."""
+        results = self.map(passes.widest, self._same(d))
+        return np.max([r[0] for r in results], axis=0), np.max([r[1] for r in results], axis=0)

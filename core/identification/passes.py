@@ -1,0 +1,268 @@
+"""Passes over all transitions: sums, the search for samples outside, and the count by the verdict's arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.identification.problem import Block, Partition
+from uncertain_lti.model import UncertainLTI
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass
+class Moments:
+    """Sums over all transitions, which the objectives need whatever N is; they add up over partitions.
+
+    gram: (n, q, q), Σ w_ii (Δt ψ)(Δt ψ)ᵀ per row where weights differ between samples, else None; plain_gram (q, q),
+    the same without weights; coupled (n q, n q) for full weights, else None. centre (r, r) and target (r, n), the
+    normal equations of the unweighted squared distance of the bounds' centre; rate_square (n,), Σ (x_next - x)².
+    width_sum (q,), Σ Δt ψ. low, high (p,): ranges of z; dt_min, dt_max; count: transitions.
+    """
+
+    plain_gram: Array
+    gram: Array | None
+    coupled: Array | None
+    centre: Array
+    target: Array
+    rate_square: Array
+    width_sum: Array
+    low: Array
+    high: Array
+    dt_min: float
+    dt_max: float
+    count: int
+
+    def __add__(self, other: Moments) -> Moments:
+        def both(a: Array | None, b: Array | None) -> Array | None:
+            return None if a is None or b is None else a + b
+
+        return Moments(
+            self.plain_gram + other.plain_gram,
+            both(self.gram, other.gram),
+            both(self.coupled, other.coupled),
+            self.centre + other.centre,
+            self.target + other.target,
+            self.rate_square + other.rate_square,
+            self.width_sum + other.width_sum,
+            np.minimum(self.low, other.low),
+            np.maximum(self.high, other.high),
+            min(self.dt_min, other.dt_min),
+            max(self.dt_max, other.dt_max),
+            self.count + other.count,
+        )
+
+    @property
+    def phi_scale(self) -> Array:
+        """Root mean square of Δt φ, (r,); 0 where a column is all zero."""
+        return np.sqrt(np.diagonal(self.centre) / self.count)
+
+    @property
+    def psi_scale(self) -> Array:
+        """Root mean square of Δt ψ, (q,); 0 where a column is all zero."""
+        return np.sqrt(np.diagonal(self.plain_gram) / self.count)
+
+    @property
+    def rate_scale(self) -> Array:
+        """Root mean square of x_next - x, (n,); 1 where it is 0."""
+        scale = np.sqrt(self.rate_square / self.count)
+        return np.where(scale > 0, scale, 1.0)
+
+
+def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Samples]]:
+    """One pass for everything in `Moments`, and every stride-th transition of the whole (none where stride is 0).
+
+    offset: number of transitions in the partitions before this one. The samples are returned per row.
+    """
+    columns, n, p = part.columns, part.n, part.p
+    q = p + columns.disturbance + columns.noise
+    sums: Moments | None = None
+    sampled: list[list[Samples]] = [[] for _ in range(n)]
+    for block in part.blocks():
+        if stride:
+            chosen = np.arange(-(block.start + offset) % stride, len(block), stride)
+            for i in range(n):
+                sampled[i].append(_take(block, i, chosen, offset))
+        phi = block.phi(columns) * block.dt
+        psi = block.psi(columns)
+        psi *= block.dt
+        step = block.x_next - block.z[:n]
+        weights = block.weights
+        gram = np.stack([(psi * weights[:, i]) @ psi.T for i in range(n)]) if weights.ndim == 2 else None
+        coupled = None
+        if weights.ndim == 3:
+            parts = np.empty((n, q, n, q))
+            for i in range(n):
+                for j in range(i, n):
+                    parts[i, :, j] = (psi * weights[:, i, j]) @ psi.T
+                    parts[j, :, i] = parts[i, :, j].T
+            coupled = parts.reshape(n * q, n * q)
+        found = Moments(
+            psi @ psi.T,
+            gram,
+            coupled,
+            phi @ phi.T,
+            phi @ step.T,
+            np.einsum("ik,ik->i", step, step),
+            psi.sum(axis=1),
+            block.z.min(axis=1),
+            block.z.max(axis=1),
+            float(block.dt.min()),
+            float(block.dt.max()),
+            len(block),
+        )
+        sums = found if sums is None else sums + found
+    if sums is None:
+        raise ValueError("a partition without transitions")
+    return sums, [Samples.join(s, p) for s in sampled]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Some transitions as one row sees them: index (K,) among all, z (p, K), rate (K,), dt (K,), √w_ii (K,)."""
+
+    index: Index
+    z: Array
+    rate: Array
+    dt: Array
+    root_weight: Array
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def __getitem__(self, chosen: Index | NDArray[np.bool_]) -> Samples:
+        return Samples(
+            self.index[chosen], self.z[:, chosen], self.rate[chosen], self.dt[chosen], self.root_weight[chosen]
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence[Samples], p: int) -> Samples:
+        """All of them, in order of index, each index once."""
+        if not parts:
+            nothing = np.empty(0)
+            return cls(np.empty(0, dtype=np.intp), np.empty((p, 0)), nothing, nothing, nothing)
+        index, first = np.unique(np.concatenate([s.index for s in parts]), return_index=True)
+        return cls(
+            index,
+            np.hstack([s.z for s in parts])[:, first],
+            np.concatenate([s.rate for s in parts])[first],
+            np.concatenate([s.dt for s in parts])[first],
+            np.concatenate([s.root_weight for s in parts])[first],
+        )
+
+
+def _take(block: Block, i: int, chosen: Index, offset: int) -> Samples:
+    z, dt = block.z[:, chosen], block.dt[chosen]
+    root = block.root_weights()[i]
+    return Samples(
+        chosen + (block.start + offset),
+        z,
+        (block.x_next[i, chosen] - z[i]) / dt,
+        dt,
+        root[chosen] if len(root) > 1 else np.broadcast_to(root, len(dt)),
+    )
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A solution to hold against all samples, and the units in which its slack is measured.
+
+    theta (r, n), d (q, n); size_unit (q,): size of a sample is size_unit·ψ; scale (n,): slack of row i is divided by
+    size x scale_i. limit (n,): δ of (11), or None; reach (n,): samples with less slack than this are wanted; most: so
+    many of them per row at most.
+    """
+
+    theta: Array
+    d: Array
+    size_unit: Array
+    scale: Array
+    limit: Array | None
+    reach: Array
+    most: int
+
+
+def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[Samples, float]]:
+    """Samples whose slack is below the reach, per row, and the reach that held to the end: one pass.
+
+    The slack of a sample is its distance from leaving the bounds (8)(9), or from being wider than (11) allows, in
+    scaled units; negative where it is outside. Where more than `most` samples of a row qualify, those of least slack
+    are returned, and the reach is the least slack of the others.
+    """
+    columns = part.columns
+    theta, d = np.ascontiguousarray(candidate.theta.T), np.ascontiguousarray(candidate.d.T)
+    n = len(theta)
+    found: list[list[Samples]] = [[] for _ in range(n)]
+    slacks: list[list[Array]] = [[] for _ in range(n)]
+    kept = [0] * n
+    reach = candidate.reach.copy()
+    scale = candidate.scale[:, None]
+    for block in part.blocks():
+        psi = block.psi(columns)
+        size = candidate.size_unit @ psi
+        size[size == 0.0] = np.inf  # at rest without an additive term nothing but rest is contained
+        half = d @ psi
+        slack = theta @ block.phi(columns)
+        slack -= block.rate()
+        np.abs(slack, out=slack)
+        np.subtract(half, slack, out=slack)
+        if candidate.limit is not None:
+            room = candidate.limit[:, None] / (2.0 * block.root_weights() * block.dt) - half
+            np.minimum(slack, room, out=slack)
+        slack /= size
+        slack /= scale
+        for i, row in enumerate(slack):
+            below = np.flatnonzero(row < reach[i])
+            if not len(below):
+                continue
+            found[i].append(_take(block, i, below, offset))
+            slacks[i].append(row[below])
+            kept[i] += len(below)
+            if kept[i] > 2 * candidate.most:
+                found[i], slacks[i], reach[i] = _least(found[i], slacks[i], candidate.most, part.p, reach[i])
+                kept[i] = len(found[i][0])
+    pairs = []
+    for i in range(n):
+        samples, _, held = _least(found[i], slacks[i], candidate.most, part.p, reach[i])
+        pairs.append((samples[0], held))
+    return pairs
+
+
+def _least(
+    found: list[Samples], slacks: list[Array], most: int, p: int, reach: float
+) -> tuple[list[Samples], list[Array], float]:
+    if not found:
+        return [Samples.join([], p)], [np.empty(0)], reach
+    samples, slack = Samples.join(found, p), np.concatenate(slacks)  # both in order of index
+    if len(slack) > most:
+        order = np.argpartition(slack, most)
+        chosen, reach = np.sort(order[:most]), float(slack[order[most]])
+        samples, slack = samples[chosen], slack[chosen]
+    return [samples], [slack], reach
+
+
+def count_outside(part: Partition, model: UncertainLTI) -> NDArray[np.intp]:
+    """Transitions outside each row's bounds (6)(7), (n,), by the arithmetic of `UncertainLTI.bounds`."""
+    outside = np.zeros(part.n, dtype=np.intp)
+    for block in part.blocks():
+        centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
+        model.columns_centre_and_half(block.z, block.dt, centre, half)
+        inside = (centre - half <= block.x_next) & (block.x_next <= centre + half)
+        outside += len(block) - np.count_nonzero(inside, axis=1)
+    return outside
+
+
+def widest(part: Partition, d: Array) -> tuple[Array, Array]:
+    """Largest width per step, and largest √w_ii x width, each (n,), normalised."""
+    largest, weighted = np.zeros(part.n), np.zeros(part.n)
+    for block in part.blocks():
+        width = d.T @ block.psi(part.columns)
+        width *= 2.0 * block.dt
+        largest = np.maximum(largest, width.max(axis=1))
+        width *= block.root_weights()
+        weighted = np.maximum(weighted, width.max(axis=1))
+    return largest, weighted

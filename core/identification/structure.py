@@ -1,0 +1,173 @@
+"""Structure: what is known of single elements before the fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uncertain_lti.errors import FitError
+
+Array = NDArray[np.float64]
+
+NOMINAL, HALF_WIDTH = ("A", "B", "c"), ("dA", "dB", "dc", "v")
+
+
+class Structure:
+    """Elements fixed to values, or kept within bounds.
+
+    Parameters
+    ----------
+    n, m : int
+        Numbers of states and controls.
+    fixed : mapping, optional
+        From "A", "B", "c", "dA", "dB", "dc" or "v" to an array of that shape: a number fixes the element, NaN leaves
+        it free.
+    lower, upper : mapping, optional
+        The same for bounds; NaN for none. A sign constraint is a bound of 0. Half-widths are never below 0.
+
+    Raises
+    ------
+    FitError
+        A name or shape is unknown, or an element is bounded to nothing; names the element.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        m: int,
+        fixed: Mapping[str, ArrayLike] | None = None,
+        lower: Mapping[str, ArrayLike] | None = None,
+        upper: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        self.n, self.m = n, m
+        self._shapes = {"A": (n, n), "B": (n, m), "c": (n,), "dA": (n, n), "dB": (n, m), "dc": (n,), "v": (n,)}
+        self.lower: dict[str, Array] = {}
+        self.upper: dict[str, Array] = {}
+        for name, shape in self._shapes.items():
+            self.lower[name] = np.full(shape, 0.0 if name in HALF_WIDTH else -math.inf)
+            self.upper[name] = np.full(shape, math.inf)
+        for given, targets in (
+            (lower, (self.lower,)),
+            (upper, (self.upper,)),
+            (fixed, (self.lower, self.upper)),
+        ):
+            for name, values in (given or {}).items():
+                for target in targets:
+                    said = self._read(name, values)
+                    target[name] = np.where(np.isnan(said), target[name], said)
+        for name in self._shapes:
+            wrong = np.argwhere(self.lower[name] > self.upper[name])
+            if len(wrong):
+                at = tuple(wrong[0].tolist())
+                raise FitError(
+                    f"structure: {name}{list(at)} is to be at least {self.lower[name][at]:g} and at most "
+                    f"{self.upper[name][at]:g}; mend one of them"
+                )
+            if name in HALF_WIDTH and (self.lower[name] < 0).any():
+                at = tuple(np.argwhere(self.lower[name] < 0)[0].tolist())
+                raise FitError(f"structure: {name}{list(at)} is a half-width and cannot be below 0")
+
+    def _read(self, name: str, values: ArrayLike) -> Array:
+        if name not in self._shapes:
+            raise FitError(f"structure: there is no '{name}'; there are {', '.join(self._shapes)}")
+        try:
+            array = np.asarray(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise FitError(f"structure: {name} is not an array of numbers; write NaN for a free element") from None
+        if array.shape != self._shapes[name]:
+            raise FitError(f"structure: {name} has shape {array.shape}; it must be {self._shapes[name]}")
+        return array
+
+    @classmethod
+    def from_rules(
+        cls, rules: Any, states: Sequence[str], controls: Sequence[str], source: str = "structure"
+    ) -> Structure:
+        """From the list under `structure:` in a signals file.
+
+        Each rule names elements by `state` (the row; `*` for all) and `from` (a state, a control, `drift`, `noise` or
+        `*` for every state and control), and says `nominal` and/or `half_width`: a number, or {min: a, max: b}.
+        A later rule overrides an earlier one.
+
+        Raises
+        ------
+        FitError
+            A rule names what is not there, or is not of this form.
+        """
+        n, m = len(states), len(controls)
+        structure = cls(n, m)
+        if not isinstance(rules, list):
+            raise FitError(f"{source}: a list of rules is wanted, not {type(rules).__name__}")
+        for number, rule in enumerate(rules):
+            here = f"{source}[{number}]"
+            if not isinstance(rule, dict) or not {"state", "from"} <= set(rule) <= {
+                "state",
+                "from",
+                "nominal",
+                "half_width",
+            }:
+                raise FitError(f"{here}: a rule has the keys state, from, and nominal and/or half_width")
+            rows = range(n) if rule["state"] == "*" else [_position(rule["state"], states, f"{here}: state")]
+            columns: list[tuple[str, str, int | None]] = []
+            if rule["from"] == "drift":
+                columns = [("c", "dc", None)]
+            elif rule["from"] == "noise":
+                columns = [("", "v", None)]
+            elif rule["from"] == "*":
+                columns = [*(("A", "dA", j) for j in range(n)), *(("B", "dB", j) for j in range(m))]
+            else:
+                j = _position(rule["from"], (*states, *controls), f"{here}: from")
+                columns = [("A", "dA", j) if j < n else ("B", "dB", j - n)]
+            for i in rows:
+                for nominal, half, column in columns:
+                    at = (i,) if column is None else (i, column)
+                    for key, name in (("nominal", nominal), ("half_width", half)):
+                        if key in rule:
+                            if not name:
+                                raise FitError(f"{here}: noise has no nominal value; say half_width")
+                            low, high = _range(rule[key], f"{here}: {key}")
+                            structure.lower[name][at] = (
+                                max(low, 0.0) if name in HALF_WIDTH and low == -math.inf else low
+                            )
+                            structure.upper[name][at] = high
+        return cls(n, m, lower=structure.lower, upper=structure.upper)
+
+    def stacked(self, drift: bool, disturbance: bool, noise: bool) -> tuple[Array, Array, Array, Array]:
+        """Bounds in the order of the unknowns: theta lower, upper (r, n); d lower, upper (q, n).
+
+        Raises
+        ------
+        FitError
+            An additive element is fixed to a number other than 0, and the fit does not have that term.
+        """
+        for name, there in (("c", drift), ("dc", disturbance), ("v", noise)):
+            forced = (self.lower[name] > 0) | (self.upper[name] < 0)
+            if not there and forced.any():
+                raise FitError(f"structure: {name} is not 0, and the fit has no such term; choose another additive")
+        sides = []
+        for side in (self.lower, self.upper):
+            theta = [side["A"].T, side["B"].T] + ([side["c"][None]] if drift else [])
+            d = [side["dA"].T, side["dB"].T]
+            d += ([side["dc"][None]] if disturbance else []) + ([side["v"][None]] if noise else [])
+            sides.append((np.vstack(theta), np.vstack(d)))
+        return sides[0][0], sides[1][0], sides[0][1], sides[1][1]
+
+
+def _position(name: Any, names: Sequence[str], where: str) -> int:
+    if name not in names:
+        raise FitError(f"{where}: there is no '{name}'; there are {', '.join(names)}")
+    return list(names).index(name)
+
+
+def _range(value: Any, where: str) -> tuple[float, float]:
+    if isinstance(value, dict) and value and set(value) <= {"min", "max"}:
+        low, high = value.get("min", -math.inf), value.get("max", math.inf)
+    else:
+        low = high = value
+    for number in (low, high):
+        if isinstance(number, bool) or not isinstance(number, (int, float)) or math.isnan(number):
+            raise FitError(f"{where} is {value!r}; write a number, or {{min: a, max: b}}")
+    return float(low), float(high)
