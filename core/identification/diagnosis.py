@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.errors import FitError
-from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification import excitation, sensors
+from uncertain_lti.identification.excitation import quoted as _list
+from uncertain_lti.identification.problem import Columns, Moments, Problem, moments
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.transient import Transient
 
 Array = NDArray[np.float64]
+
+LOOKED_AT, STRETCHES = 100_000, 20
+"""At most so many transitions, in so many stretches, are looked at for what shows in any of them."""
+FAST = 0.7
+"""|eigenvalue| x dt above which a step of forward Euler is long for the mode."""
+TRIED = 4000
+"""Samples on which the gain of an additive term is tried."""
+WORTH = 1.3
+"""Gain in mean width from which on the additive term is suggested."""
 
 
 def check_solvable(problem: Problem, transients: Sequence[Transient], names: Sequence[str]) -> None:
@@ -49,19 +60,19 @@ def check_solvable(problem: Problem, transients: Sequence[Transient], names: Seq
         )
 
 
-def _rank(problem: Problem, moments: Moments, names: Sequence[str]) -> tuple[int, list[str]]:
+def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, list[str]]:
     """Rank of the nominal regressors and, in words, which columns make it deficient."""
     names = [*names, "the drift c"] if problem.columns.drift else list(names)
     messages = []
-    dead = moments.phi_scale == 0
+    dead = sums.phi_scale == 0
     for j in np.flatnonzero(dead):
         messages.append(
             f"rank deficient: '{names[j]}' is 0 in every transition, so its column is not identifiable and is set "
             f"to 0; record it moving, or leave it out"
         )
     free = np.flatnonzero(~dead)
-    unit = 1.0 / moments.phi_scale[free]
-    correlation = moments.centre[np.ix_(free, free)] * np.outer(unit, unit) / problem.N
+    unit = 1.0 / sums.phi_scale[free]
+    correlation = sums.centre[np.ix_(free, free)] * np.outer(unit, unit) / problem.N
     values, vectors = np.linalg.eigh(correlation)
     limit = 1e-12 * len(free)
     for value, vector in zip(values, vectors.T, strict=True):
@@ -81,11 +92,22 @@ def _rank(problem: Problem, moments: Moments, names: Sequence[str]) -> tuple[int
 
 
 def describe(
-    model: UncertainLTI, problem: Problem, moments: Moments, mean_width: Array, max_width: Array
+    model: UncertainLTI,
+    problem: Problem,
+    sums: Moments,
+    mean_width: Array,
+    max_width: Array,
+    transients: Sequence[Transient] = (),
 ) -> tuple[int, list[str]]:
-    """Rank, and what the user must be told of a fitted model."""
+    """Rank, and what the user must be told of a fitted model and of the recordings it was fitted to.
+
+    transients name the recordings, and say how many controls were stale.
+    """
     states = model.state_names
-    found, messages = _rank(problem, moments, [*states, *model.control_names])
+    names = [*states, *model.control_names]
+    found, messages = _rank(problem, sums, names)
+    messages += _recordings(model, problem, sums, names, transients)
+    messages += _slow(model)
     unstable = [v for v in model.eigenvalues() if v.real > 0]
     if unstable:
         values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
@@ -93,33 +115,22 @@ def describe(
             f"the nominal model is unstable (eigenvalues {values} 1/s): one-step bounds restart from the measured "
             f"state and stay valid, a free run does not"
         )
-    elif model.spectral_radius() > 1.0:
+    elif model.spectral_radius() > 1.0 + 1e-9:
         messages.append(
             f"the nominal recursion runs away at the recorded step (spectral radius {model.spectral_radius():.4g}): "
             f"the sampling is slow for the fastest mode"
         )
-    z_names = [*states, *model.control_names]
     nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
     wide = np.argwhere(half > np.abs(nominal))
     if len(wide):
         i, j = max(wide.tolist(), key=lambda ij: float(half[ij[0], ij[1]] - abs(nominal[ij[0], ij[1]])))
         messages.append(
             f"{len(wide)} of {nominal.size} half-widths exceed their nominal elements (most: {states[i]} from "
-            f"{z_names[j]}, {nominal[i, j]:.3g} ± {half[i, j]:.3g} 1/s): the sign of these effects is not known"
+            f"{names[j]}, {nominal[i, j]:.3g} ± {half[i, j]:.3g} 1/s): the sign of these effects is not known"
         )
     columns = problem.columns
     if not columns.noise and not columns.disturbance:
-        box, size = _least_squares_box(problem, moments), np.abs(problem.z).sum(axis=1)
-        rest = float(np.mean(size <= 0.02 * np.quantile(size, 0.95)))
-        blown = [i for i in range(problem.n) if mean_width[i] > box[i] > 0]
-        if blown:
-            worst = max(blown, key=lambda i: float(mean_width[i] / box[i]))
-            messages.append(
-                f"the envelope of {_list([states[i] for i in blown])} is absurdly wide: the mean width of "
-                f"{states[worst]} is {mean_width[worst] / box[worst]:.3g} times that of a constant band around least "
-                f"squares, because noise near rest ({rest:.0%} of the samples) inflates the half-widths; use an "
-                f"additive term: --additive noise, or --additive disturbance"
-            )
+        messages += _near_rest(problem, sums, mean_width, states)
     span = np.ptp(problem.z[:, : problem.n], axis=0)
     for i in np.flatnonzero((span > 0) & (mean_width > 0.5 * span)).tolist():
         messages.append(
@@ -131,18 +142,105 @@ def describe(
     return found, messages
 
 
-def _least_squares_box(problem: Problem, moments: Moments) -> Array:
+def _recordings(
+    model: UncertainLTI, problem: Problem, sums: Moments, names: Sequence[str], transients: Sequence[Transient]
+) -> list[str]:
+    """What the recordings themselves say: excitation, sensors, topics."""
+    signals = model.signals.signals
+    limit = 1e-12 * problem.p
+    messages = excitation.collinear(problem, sums, names, limit)
+    messages += excitation.weak(problem, sums, names)
+    part = _stretches(problem)
+    messages += excitation.one_sided(part, names)
+    messages += excitation.fed_back(part, names)
+    messages += sensors.delayed(part, signals)
+    messages += sensors.quantised(part, signals)
+    messages += sensors.held(part, signals)
+    messages += sensors.frozen(part, signals, transients)
+    messages += sensors.stale(signals, model.n, part, transients)
+    return messages
+
+
+def _stretches(problem: Problem) -> Problem:
+    """A problem of bounded size: stretches of consecutive transitions, spread evenly over a larger one."""
+    if problem.N <= LOOKED_AT:
+        return problem
+    starts = np.linspace(0, problem.N - LOOKED_AT // STRETCHES, STRETCHES).astype(np.intp)
+    return problem.subset(np.unique(starts[:, None] + np.arange(LOOKED_AT // STRETCHES)))
+
+
+def _slow(model: UncertainLTI) -> list[str]:
+    """Modes that a step of forward Euler is too long for."""
+    dt = model.sampling.dt_median
+    if dt is None:
+        return []
+    fastest = max(model.eigenvalues(), key=abs)
+    turn = abs(fastest) * dt
+    if turn <= FAST:
+        return []
+    return [
+        f"sampling is slow for the fastest mode ({fastest.real:.3g}{fastest.imag:+.3g}j 1/s, {turn:.2g} in a step of "
+        f"{dt:.3g} s): A is then the matrix of this step length rather than of the machine, and holds for no other; "
+        f"sample {np.ceil(turn / 0.2):.0f} times as fast, or leave the fast state out"
+    ]
+
+
+def _near_rest(problem: Problem, sums: Moments, mean_width: Array, states: Sequence[str]) -> list[str]:
+    """Widths that come from samples near rest, and what the additive term would gain."""
+    box, size = _least_squares_box(problem, sums), np.abs(problem.z).sum(axis=1)
+    rest = float(np.mean(size <= 0.02 * np.quantile(size, 0.95)))
+    floor = 1e-9 * np.abs(problem.z[:, : problem.n]).max(axis=0)  # below it both are rounding
+    suspect = [i for i in range(problem.n) if mean_width[i] > 0.7 * box[i] > floor[i]]
+    if not suspect:
+        return []
+    gain = _gain(problem)
+    messages = []
+    blown = [i for i in suspect if mean_width[i] > box[i]]
+    if blown:
+        worst = max(blown, key=lambda i: float(mean_width[i] / box[i]))
+        messages.append(
+            f"the envelope of {_list([states[i] for i in blown])} is absurdly wide: the mean width of "
+            f"{states[worst]} is {mean_width[worst] / box[worst]:.3g} times that of a constant band around least "
+            f"squares, because noise near rest ({rest:.0%} of the samples) inflates the half-widths; use an "
+            f"additive term: --additive noise, or --additive disturbance (with noise, the mean width of "
+            f"{states[worst]} falls to {1 / gain[worst]:.0%})"
+        )
+    much = [i for i in suspect if i not in blown and gain[i] > WORTH]
+    if much:
+        best = max(much, key=lambda i: float(gain[i]))
+        messages.append(
+            f"samples near rest dominate the envelope of {_list([states[i] for i in much])}: with --additive noise "
+            f"the mean width of {states[best]} falls to {1 / gain[best]:.0%}"
+        )
+    return messages
+
+
+def _gain(problem: Problem) -> Array:
+    """Mean width without over mean width with the noise term, (n,), by (10) on some of the samples."""
+    from uncertain_lti.identification.working_set import WorkingSet
+
+    size = np.abs(problem.z).sum(axis=1)
+    order = np.argsort(size, kind="stable")
+    index = np.arange(problem.N)
+    if problem.N > TRIED:  # those nearest rest, and an even share of the others
+        index = np.union1d(order[: TRIED // 4], order[:: max(problem.N // TRIED, 1)])
+    part = problem.subset(index)
+    widths = []
+    for columns in (problem.columns, Columns(False, False, True)):
+        some = replace(part, columns=columns, weights=np.ones(problem.n))
+        solution = WorkingSet(some, moments(some), None).quadratic()
+        whole = slice(0, part.N)
+        widths.append((part.dt[:, None] * (some.psi(whole) @ np.maximum(solution.d, 0.0))).mean(axis=0))
+    return np.asarray(widths[0] / np.maximum(widths[1], 1e-300))
+
+
+def _least_squares_box(problem: Problem, sums: Moments) -> Array:
     """Width of a constant band around least squares that contains every sample, (n,), per step."""
-    free = moments.phi_scale > 0
-    theta = np.zeros(moments.target.shape)
-    theta[free] = np.linalg.lstsq(moments.centre[np.ix_(free, free)], moments.target[free], rcond=None)[0]
+    free = sums.phi_scale > 0
+    theta = np.zeros(sums.target.shape)
+    theta[free] = np.linalg.lstsq(sums.centre[np.ix_(free, free)], sums.target[free], rcond=None)[0]
     largest = np.zeros(problem.n)
-    for block in problem.blocks():
-        residual = np.abs(block.rate() - theta.T @ block.phi(problem.columns)) * block.dt
-        largest = np.maximum(largest, residual.max(axis=1))
+    for part in problem.blocks():
+        residual = np.abs(problem.rate(part) - problem.phi(part) @ theta) * problem.dt[part, None]
+        largest = np.maximum(largest, residual.max(axis=0))
     return 2.0 * largest
-
-
-def _list(names: Sequence[str]) -> str:
-    quoted = [n if n.startswith("the ") else f"'{n}'" for n in names]
-    return quoted[0] if len(quoted) == 1 else ", ".join(quoted[:-1]) + " and " + quoted[-1]

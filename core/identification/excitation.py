@@ -1,0 +1,137 @@
+"""Whether the recordings move every signal enough, both ways and independently, to tell its effect from the others'."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.identification.problem import Moments, Problem
+
+Array = NDArray[np.float64]
+
+COLLINEAR = 1e-3
+"""Smallest eigenvalue of the regressors' correlation below which signals move nearly together (and above rank)."""
+DETERMINED = 4.0
+"""A control's effect on some state must be so many standard errors, or it cannot be told from the noise."""
+ONE_SIDED = 0.05
+"""A control that goes less than this share of its range to one side of its steady value is one-sided."""
+FED_BACK = 0.9
+"""Share of a control's changes that the states explain, from which on they are said to."""
+
+
+def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: float) -> list[str]:
+    """Signals that nearly move together, and the recording that would tell them apart; not those that are one."""
+    free = np.flatnonzero(moments.phi_scale[: problem.p] > 0)
+    unit = 1.0 / moments.phi_scale[free]
+    values, vectors = np.linalg.eigh(moments.centre[np.ix_(free, free)] * np.outer(unit, unit) / problem.N)
+    messages = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if not limit < value < COLLINEAR:
+            continue
+        part = [int(free[j]) for j in np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())]
+        if len(part) < 2:
+            continue
+        states = [names[j] for j in part if j < problem.n]
+        controls = [names[j] for j in part if j >= problem.n]
+        if not states:
+            cure = f"record {quoted(controls[:1])} moving while {quoted(controls[1:])} rests"
+        elif controls:
+            cure = (
+                f"record steps of {quoted(controls)} that are sharper than {quoted(states)} can follow, not set by a "
+                f"feedback"
+            )
+        else:
+            cure = f"excite them by other controls or from other initial states, or leave one of {quoted(states)} out"
+        messages.append(
+            f"{quoted([names[j] for j in part])} nearly move together (all but {value**0.5:.2%} of their size), so "
+            f"their columns are poorly told apart and their elements may trade places: {cure}"
+        )
+    return messages
+
+
+def one_sided(problem: Problem, names: Sequence[str]) -> list[str]:
+    """Controls that stay on one side of their steady value."""
+    messages = []
+    for j in range(problem.n, problem.p):
+        low, high = float(problem.z[:, j].min()), float(problem.z[:, j].max())
+        if low == high:  # said to be constant elsewhere
+            continue
+        reach = max(high, -low)
+        side = "below" if low > -ONE_SIDED * reach else "above" if high < ONE_SIDED * reach else None
+        if side:
+            messages.append(
+                f"control '{names[j]}' never goes {side} its steady value (normalised {low:.3g} to {high:.3g}): the "
+                f"envelope is fitted to one side and says nothing of the other; record it moving both ways, as far as "
+                f"it will move in use"
+            )
+    return messages
+
+
+def weak(problem: Problem, moments: Moments, names: Sequence[str]) -> list[str]:
+    """Controls whose effect on every state is lost in what one step leaves unexplained."""
+    free = np.flatnonzero(moments.phi_scale > 0)
+    centre, target = moments.centre[np.ix_(free, free)], moments.target[free]
+    if not len(free) or problem.N <= len(free):
+        return []
+    inverse = np.linalg.pinv(centre, hermitian=True)
+    theta = inverse @ target
+    total = moments.rate_scale**2 * problem.N
+    residual = np.maximum(total - np.einsum("ji,ji->i", theta, target), 1e-14 * total)
+    error = np.sqrt(np.outer(np.diagonal(inverse), residual / (problem.N - len(free))))
+    messages = []
+    for row, j in enumerate(free.tolist()):
+        if not problem.n <= j < problem.p or np.ptp(problem.z[:, j]) == 0:
+            continue
+        certainty = np.abs(theta[row]) / np.maximum(error[row], 1e-300)
+        best = int(np.argmax(certainty))
+        if certainty[best] < DETERMINED:
+            messages.append(
+                f"control '{names[j]}' moves too little to be told from the noise: its strongest effect, on "
+                f"'{names[best]}', is {certainty[best]:.2g} standard errors; record it with larger or more steps "
+                f"({max(2.0, DETERMINED / max(float(certainty[best]), 0.4)):.2g} times the amplitude), or leave it out"
+            )
+    return messages
+
+
+def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
+    """Controls whose changes follow from the states: closed-loop recordings, or inputs too regular to tell.
+
+    u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} where a feedback sets u_k; an input that somebody steps
+    at will is not.
+    """
+    follows = successive(problem)
+    if len(follows) <= 4 * problem.p:
+        return []
+    before, now = problem.z[follows], problem.z[follows + 1]
+    n = problem.n
+    basis = np.column_stack([now[:, :n], before, np.ones(len(before))])
+    messages = []
+    for j in range(n, problem.p):
+        change = now[:, j] - before[:, j]
+        change = change - change.mean()
+        size = float(change @ change)
+        if size <= 1e-18 * float(now[:, j] @ now[:, j]) or np.count_nonzero(np.diff(change)) < 0.05 * len(change):
+            continue
+        left = change - basis @ np.linalg.lstsq(basis, change, rcond=1e-12)[0]
+        explained = 1.0 - float(left @ left) / size
+        if explained > FED_BACK:
+            messages.append(
+                f"the changes of control '{names[j]}' follow from the states to {explained:.0%}: a feedback sets it, "
+                f"or it moves too regularly to tell; its effect cannot be told from the plant's own, so the nominal "
+                f"matrices may mix both (the bounds hold for the same feedback only); record it with steps of its own"
+            )
+    return messages
+
+
+def successive(problem: Problem) -> NDArray[np.intp]:
+    """Transitions that the next one in the problem continues: same recording, next sample."""
+    same = (problem.source[1:] == problem.source[:-1]) & (problem.k[1:] == problem.k[:-1] + 1)
+    return np.flatnonzero(same)
+
+
+def quoted(names: Sequence[str]) -> str:
+    """'a', 'b' and 'c'."""
+    marked = [n if n.startswith("the ") else f"'{n}'" for n in names]
+    return marked[0] if len(marked) == 1 else ", ".join(marked[:-1]) + " and " + marked[-1]

@@ -1,0 +1,180 @@
+"""What the recorded values say of the sensors and topics they came from: quantised, frozen, held, stale, late."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.identification.excitation import successive
+from uncertain_lti.identification.problem import Problem
+from uncertain_lti.signals import Signal
+from uncertain_lti.transient import Transient
+
+Array = NDArray[np.float64]
+
+LONGEST_DELAY = 10
+"""Delays of a control that are tried, samples."""
+FROZEN = 25
+"""A value that stands still for so many samples while the others move may be frozen."""
+STALE = 0.01
+"""Share of the samples from which on stale controls are worth a word."""
+
+
+def quantised(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+    """States recorded in steps that are not small against what they move by from sample to sample."""
+    messages = []
+    for i, signal in enumerate(signals[: problem.n]):
+        x = problem.z[:, i]
+        span = float(np.ptp(x))
+        if span == 0:
+            continue
+        levels = np.unique(np.round(x / span, 9))
+        if len(levels) < 3 or len(levels) > max(problem.N // 5, 3):
+            continue
+        gaps = np.diff(levels)
+        step = float(gaps.min())
+        # levels lie on a grid: what a rounding sensor gives, and nothing else does with so many samples
+        if step < 1e-6 or np.abs(gaps / step - np.rint(gaps / step)).max() > 0.02:
+            continue
+        move = float(np.sqrt(np.mean((problem.x_next[:, i] - x) ** 2))) / span
+        if step > 0.5 * move:
+            size = step * span * float(signal.scale)
+            messages.append(
+                f"'{signal.name}' is recorded in steps of {size:.3g}{' ' + signal.unit if signal.unit else ''}, "
+                f"{step / move:.2g} times what it moves by from sample to sample (root mean square): no envelope is "
+                f"narrower than such a step; use the noise term, a finer field, or fewer samples per second"
+            )
+    return messages
+
+
+def held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+    """States that repeat their last value between samples of a slower topic."""
+    messages = []
+    follows = successive(problem)
+    for i, signal in enumerate(signals[: problem.n]):
+        changed = problem.x_next[:, i] != problem.z[:, i]
+        instants = np.flatnonzero(changed)
+        if len(instants) < 10 or len(instants) > 0.7 * problem.N or len(follows) < 0.5 * problem.N:
+            continue
+        fresh = np.unique(problem.x_next[instants, i])
+        period = float(np.median(np.diff(instants)))
+        # a rounding sensor repeats few values; a machine at rest stands still in few, long stretches
+        if period >= 2 and len(fresh) > 0.5 * len(instants):
+            messages.append(
+                f"'{signal.name}' repeats its last value in {1 - len(instants) / problem.N:.0%} of the steps and is "
+                f"new about every {period:.0f} samples: its topic or its sensor is slower than the clock, and its row "
+                f"is fitted to jumps; make its topic the clock, or leave it out"
+            )
+    return messages
+
+
+def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Transient]) -> list[str]:
+    """States that stand at exactly one value for long while the other signals move."""
+    messages = []
+    for i, signal in enumerate(signals[: problem.n]):
+        still = problem.x_next[:, i] == problem.z[:, i]
+        if still.all() or still.mean() > 0.5:  # held, quantised, or at rest most of the time: said elsewhere
+            continue
+        joined = np.concatenate([[False], still, [False]])
+        joined[1:-1][1:] &= np.concatenate([[True], (problem.source[1:] == problem.source[:-1])])[1:]
+        edges = np.flatnonzero(np.diff(joined.astype(np.int8)))
+        runs = edges.reshape(-1, 2)
+        runs = runs[runs[:, 1] - runs[:, 0] >= FROZEN]
+        others = [j for j in range(problem.p) if j != i]
+        spread = np.ptp(problem.z, axis=0)
+        for start, stop in runs:
+            moving = np.ptp(problem.z[start:stop], axis=0) > 0.2 * spread
+            if not any(moving[j] and spread[j] > 0 for j in others):
+                continue
+            mover = signals[next(j for j in others if moving[j])].name
+            where, k = int(problem.source[start]), int(problem.k[start])
+            place = (
+                f"{transients[where].name} from {transients[where].t[k]:.6g} s"
+                if where < len(transients)
+                else f"recording {where + 1} from sample {k}"
+            )
+            messages.append(
+                f"'{signal.name}' stands at exactly one value for {stop - start} samples in {place} while '{mover}' "
+                f"moves: a frozen sensor? Leave that stretch out, or the envelope will take it for healthy"
+            )
+            break
+    return messages
+
+
+def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Sequence[Transient]) -> list[str]:
+    """Controls that were too old for many samples, or that ended long before the recording did."""
+    messages = []
+    samples = sum(len(t) for t in transients)
+    for j, signal in enumerate(signals[n:], start=n):
+        count = sum(t.counters[f"stale {signal.name}"] for t in transients)
+        if samples and count > STALE * samples:
+            messages.append(
+                f"control '{signal.name}' was older than its max_hold ({signal.max_hold} s) in {count} of {samples} "
+                f"samples, which are not used: record it for as long as the states, or raise max_hold if the machine "
+                f"holds the last command"
+            )
+        if signal.max_hold is not None:
+            continue
+        for source in range(int(problem.source[-1]) + 1):
+            u = problem.z[problem.source == source, j]
+            changes = np.flatnonzero(np.diff(u)) + 1
+            if len(changes) < 20:
+                continue
+            tail = len(u) - int(changes[-1])
+            if tail > 0.2 * len(u) and tail > 5 * float(np.diff(changes).max()):
+                name = transients[source].name if source < len(transients) else f"recording {source + 1}"
+                messages.append(
+                    f"control '{signal.name}' changes all the time and then not at all for the last {tail} samples of "
+                    f"{name}: commands that have ended are no constant input; give it a max_hold, or cut the recording"
+                )
+                break
+    return messages
+
+
+def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+    """Controls that explain the states better when taken some samples earlier."""
+    n, p = problem.n, problem.p
+    follows = successive(problem)
+    run = np.zeros(problem.N, dtype=np.intp)  # samples before this one in the same unbroken stretch
+    joined = np.zeros(problem.N, dtype=bool)
+    joined[follows + 1] = True
+    breaks = np.flatnonzero(~joined)
+    run = np.arange(problem.N) - breaks[np.searchsorted(breaks, np.arange(problem.N), side="right") - 1]
+    usable = np.flatnonzero(run >= LONGEST_DELAY)
+    if len(usable) < 20 * p:
+        return []
+    dt = problem.dt[usable, None]
+    z = problem.z[usable]
+    increment = problem.x_next[usable] - z[:, :n]
+    scale = np.maximum(np.sqrt(np.mean(increment**2, axis=0)), 1e-300)
+    constant = np.ones((len(usable), 1))
+
+    def unexplained(columns: Array) -> float:
+        basis = np.column_stack([columns * dt, constant * dt])
+        size = np.maximum(np.abs(basis).max(axis=0), 1e-300)
+        left = increment / scale - (basis / size) @ np.linalg.lstsq(basis / size, increment / scale, rcond=1e-10)[0]
+        return float(np.log(np.maximum(np.sum(left**2, axis=0), 1e-20 * len(left))).sum())
+
+    messages = []
+    now = unexplained(z)
+    for j in range(n, p):
+        if np.ptp(z[:, j]) == 0:
+            continue
+        scores = [now]
+        for lag in range(1, LONGEST_DELAY + 1):
+            columns = z.copy()
+            columns[:, j] = problem.z[usable - lag, j]
+            scores.append(unexplained(columns))
+        best = int(np.argmin(scores))
+        gain = now - scores[best]
+        # 5 % less unexplained, and far more than chance: N log-likelihood units per row
+        if best and gain > 0.05 and gain * len(usable) > 50:
+            said = signals[j].delay + best
+            messages.append(
+                f"the states follow control '{signals[j].name}' better when it is taken {best} samples earlier (the "
+                f"unexplained part of a step falls by {1 - np.exp(-gain / n / 2):.0%}): try `delay: {said}` for it in "
+                f"the signals file"
+            )
+    return messages
