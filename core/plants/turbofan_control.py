@@ -1,0 +1,170 @@
+"""How the turbofan is run: schedules over the power lever, steady states, the closed-loop controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import root
+
+from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.plants.turbofan import Engine, GasPath, GasPathSolver, Health, engine
+from uncertain_lti.plants.turbofan_components import T_STANDARD
+
+Array = NDArray[np.float64]
+
+IDLE, MAXIMUM = 12.0, 68.0
+"""Power-lever angle, deg."""
+
+
+def power(pla: float) -> float:
+    """Lever position between idle, 0, and the maximum regime, 1."""
+    if not IDLE <= pla <= MAXIMUM:
+        raise UncertainLTIError(f"turbofan: PLA is {pla:g} deg; it must be from {IDLE:g} to {MAXIMUM:g}")
+    return (pla - IDLE) / (MAXIMUM - IDLE)
+
+
+def fan_speed(pla: float, plant: Engine) -> float:
+    """Scheduled fan speed, rpm: 50 % at idle, flatter towards the maximum (chosen)."""
+    share: float = 0.5 + 0.5 * power(pla) ** 0.75
+    return share * plant.design.fan_speed
+
+
+def nozzle_area(pla: float, plant: Engine) -> float:
+    """Scheduled throat area, m^2: opened by 20 % at idle, to keep thrust low and the fan away from surge (chosen)."""
+    return float(plant.nozzle_area * (1.0 + 0.20 * (1.0 - power(pla)) ** 1.2))
+
+
+def vanes(low: float, high: float, plant: Engine) -> tuple[float, float]:
+    """Scheduled angles, deg, of fan and compressor vanes at spool speeds in rpm.
+
+    The compressor's inlet temperature, which its corrected speed needs, is taken from the fan speed, as its rise goes
+    nearly with the square of that.
+    """
+    n = low / plant.design.fan_speed
+    share = T_STANDARD / plant.compressor.T_design
+    n_high = high / plant.design.compressor_speed / (share + (1.0 - share) * n * n) ** 0.5
+    return plant.fan.schedule(n), plant.compressor.schedule(n_high)
+
+
+@dataclass(frozen=True)
+class Trim:
+    """A steady state: x (5,), u (4,) in recorded units and the gas path there."""
+
+    pla: float
+    x: Array
+    u: Array
+    path: GasPath
+
+
+def trim(pla: float, plant: Engine | None = None, health: Health | None = None) -> Trim:
+    """Steady state at a lever angle: fan speed, area and vanes by schedule, fuel and compressor speed by balance.
+
+    Raises
+    ------
+    UncertainLTIError
+        The lever is out of range, or there is no steady state.
+    """
+    plant, health = plant or engine(), health or Health()
+    d, low, area = plant.design, fan_speed(pla, plant), nozzle_area(pla, plant)
+    solver = GasPathSolver(plant)
+
+    def at(q: Array) -> tuple[list[float], list[float]]:
+        high = float(q[0]) * d.compressor_speed
+        fan_vane, compressor_vane = vanes(low, high, plant)
+        return [low, high, 0.0, 0.0, 0.0], [float(q[1]) * plant.fuel, area, fan_vane, compressor_vane]
+
+    def imbalance(q: Array) -> Array:
+        x, u = at(q)
+        path = plant.gas_path(x, u, health, solver)
+        loss = d.mechanical_efficiency
+        return np.array(
+            [
+                path.low_turbine_power * loss / path.fan_power - 1.0,
+                path.high_turbine_power * loss / path.compressor_power - 1.0,
+            ]
+        )
+
+    # from the maximum downwards in small steps: each steady state is the guess for the next
+    q = np.ones(2)
+    steps = max(1, round((MAXIMUM - pla) / 2.0))
+    for k in range(1, steps + 1):
+        angle = MAXIMUM + (pla - MAXIMUM) * k / steps
+        low, area = fan_speed(angle, plant), nozzle_area(angle, plant)
+        found = root(imbalance, q, tol=1e-13, options={"factor": 0.1})
+        q = found.x
+        if np.abs(found.fun).max() > 1e-9:
+            raise UncertainLTIError(f"turbofan: no steady state at PLA {angle:g} deg: {found.message}")
+    x, u = at(q)
+    path = plant.gas_path(x, u, health, solver)
+    x[2:] = [path.P3, path.P5, path.T5]
+    return Trim(pla, np.array(x), np.array(u), path)
+
+
+@cache
+def operating_point() -> OperatingPoint:
+    """PLA 68 deg, scaled by the largest steady magnitude from idle to there (Leibov's normalisation)."""
+    trims = [trim(pla) for pla in np.linspace(IDLE, MAXIMUM, 15)]
+    X = np.abs([t.x for t in trims]).max(axis=0)
+    U = np.abs([t.u for t in trims]).max(axis=0)
+    return OperatingPoint(trims[-1].x, trims[-1].u, X, U)
+
+
+class Controller:
+    """Fan speed follows the lever; compressor speed, turbine temperature and the fuel's rate are limited.
+
+    One step per sample. Fuel is changed by the least of three proportional-integral laws, on the fan speed's error and on
+    the distances to both limits; the velocity form needs no protection of an integrator. Gains are chosen for a response
+    of about a second.
+
+    Parameters
+    ----------
+    plant : Engine
+    start : Trim
+        The steady state it takes over.
+    dt : float
+        Step, s.
+    """
+
+    PROPORTIONAL, INTEGRAL = 2.0, 4.0  # relative fuel over relative speed: 1, 1/s
+    FUEL_RATE = 0.35  # kg/s^2
+    AREA_RATE = 0.04  # m^2/s
+    VANE_RATE = 40.0  # deg/s
+    LEAST_FUEL = 0.07  # share of the design's
+    COMPRESSOR_LIMIT = 1.01  # of the design speed
+    TEMPERATURE_LIMIT = 1.03  # of the design's
+
+    def __init__(self, plant: Engine, start: Trim, dt: float) -> None:
+        self._plant, self._dt = plant, dt
+        self._limits = (
+            self.COMPRESSOR_LIMIT * plant.design.compressor_speed,
+            self.TEMPERATURE_LIMIT * float(operating_point().x_s[4]),
+        )
+        self._command = start.u.copy()
+        self._offset = start.x[0] - fan_speed(start.pla, plant)  # a steady state is one of the loop, to the last bit
+        self._errors = self._distances(start.pla, start.x)
+
+    def _distances(self, pla: float, x: Array) -> Array:
+        demand = fan_speed(pla, self._plant) + self._offset
+        return np.array([(demand - x[0]) / demand, 1.0 - x[1] / self._limits[0], 1.0 - x[4] / self._limits[1]])
+
+    def step(self, pla: float, x: Array) -> Array:
+        """Commands (4,) from the lever and the measured states (5,), recorded units."""
+        errors = self._distances(pla, x)
+        wanted = self.PROPORTIONAL * (errors - self._errors) + self.INTEGRAL * self._dt * errors
+        self._errors = errors
+        u = self._command.copy()
+        change = float(wanted.min()) * self._plant.fuel
+        u[0] += min(max(change, -self.FUEL_RATE * self._dt), self.FUEL_RATE * self._dt)
+        u[0] = max(u[0], self.LEAST_FUEL * self._plant.fuel)
+        targets = (nozzle_area(pla, self._plant), *vanes(float(x[0]), float(x[1]), self._plant))
+        for j, (target, rate) in enumerate(
+            zip(targets, (self.AREA_RATE, self.VANE_RATE, self.VANE_RATE), strict=True), start=1
+        ):
+            limit = rate * self._dt
+            u[j] += min(max(target - u[j], -limit), limit)
+        self._command = u
+        return u.copy()

@@ -1,0 +1,75 @@
+"""What can go wrong with the turbofan: an actuator, a sensor or a component, from an instant on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.plants.turbofan import CONTROLS, STATES, Health
+
+Array = NDArray[np.float64]
+
+KINDS = {
+    "fuel_stuck": "the fuel flow stays where it is, whatever is commanded",
+    "nozzle_stuck": "the nozzle area stays where it is, whatever is commanded",
+    "sensor_bias": "the reading of the compressor exit pressure jumps by 2 % of its scale",
+    "sensor_drift": "the reading of the turbine exit temperature drifts by 0.2 % of its scale per second",
+    "compressor_wear": "the compressor loses efficiency at 0.1 % per second, down to 3 % less",
+    "fan_damage": "the fan loses 2 % of its efficiency at once",
+}
+"""Kinds of fault, each with what happens; the sizes are the ones below."""
+
+BIAS, DRIFT = 0.02, 0.002  # of the scale; of the scale per s
+WEAR, WORST_WEAR = 0.001, 0.03  # of the efficiency per s; at most
+DAMAGE = 0.02  # of the efficiency
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A kind of fault and the instant of its onset, s after the first sample.
+
+    Raises
+    ------
+    UncertainLTIError
+        The kind is not one of KINDS.
+    """
+
+    kind: str
+    at: float
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UncertainLTIError(f"turbofan: there is no fault '{self.kind}'; there are {', '.join(KINDS)}")
+
+    def health(self, t: float) -> Health:
+        """Efficiency factors at the instant t, s."""
+        if self.kind == "compressor_wear" and t > self.at:
+            return Health(compressor=1.0 - min(WEAR * (t - self.at), WORST_WEAR))
+        if self.kind == "fan_damage" and t >= self.at:
+            return Health(fan=1.0 - DAMAGE)
+        return Health()
+
+    def reading(self, t: float, x: Array, X: Array) -> Array:
+        """What the sensors say of the states x (5,) with scales X (5,)."""
+        if t < self.at or not self.kind.startswith("sensor"):
+            return x
+        x = x.copy()
+        if self.kind == "sensor_bias":
+            i = STATES.index("compressor_exit_total_pressure")
+            x[i] += BIAS * X[i]
+        else:
+            i = STATES.index("turbine_exit_total_temperature")
+            x[i] += DRIFT * (t - self.at) * X[i]
+        return x
+
+    def stuck(self, t: float) -> int | None:
+        """Position of the control that no longer follows its command, if any."""
+        if t < self.at:
+            return None
+        return {
+            "fuel_stuck": CONTROLS.index("main_fuel_flow"),
+            "nozzle_stuck": CONTROLS.index("nozzle_throat_area"),
+        }.get(self.kind)

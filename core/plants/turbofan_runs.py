@@ -1,0 +1,194 @@
+"""Recordings of the turbofan: what is commanded, what goes wrong, and the transient that results.
+
+Every run is sampled at 0.025 s; controls are recorded as commands and held between samples. Readings are rounded to 1e-9
+of their scale, so that a steady state is steady to the last bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, JOINT_STATE, STATE_TOPIC
+from uncertain_lti.plants.turbofan import (
+    CONTROL_UNITS,
+    CONTROLS,
+    STATE_UNITS,
+    STATES,
+    Engine,
+    GasPathSolver,
+    Health,
+    engine,
+)
+from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating_point, trim
+from uncertain_lti.plants.turbofan_faults import Fault
+from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.transient import Transient
+
+Array = NDArray[np.float64]
+
+DT = DT_NS * 1e-9
+"""Step, s: that of the paper."""
+START_NS = 1_136_073_600 * 10**9
+"""Stamp of the first sample of every run, ns: a simulated clock, the first second of 2006."""
+RESOLUTION = 1e-9
+"""Of a reading, over its scale."""
+PULSE = 3.75
+"""Width of a pulse and of the rest after it, s."""
+PROPORTION = np.array([1.0, 0.3, 0.5, 0.5])
+"""Height of the pulses of each control, over its scale, for an amplitude of 1: a nozzle or a vane acts more than fuel
+does for the same share of its range, and none may push the engine off its maps."""
+PULSE_SAMPLES = 1201
+HOLD = 0.2
+"""A command older than this is not in force, s."""
+
+LEVELS = ((0.0, 68.0), (4.0, 64.0), (9.0, 67.0), (13.0, 61.0), (18.0, 65.0), (22.0, 60.0), (27.0, 66.0), (32.0, 63.0),
+          (36.0, 68.0), (42.0, 62.0), (47.0, 64.0), (52.0, 61.0), (56.0, 68.0))  # fmt: skip
+"""(instant s, lever deg): the lever jumps and stays."""
+
+
+@cache
+def turbofan_signals() -> SignalMap:
+    """States and controls as the plant node publishes them, around PLA 68 deg; `config/signals/turbofan.yaml`."""
+    point = operating_point()
+
+    def signals(names: tuple[str, ...], units: tuple[str, ...], topic: str, steady: Array, scale: Array,
+                hold: float | None) -> tuple[Signal, ...]:  # fmt: skip
+        return tuple(
+            Signal(name, topic, f"position[{name}]", float(s), float(c), unit, JOINT_STATE, hold)
+            for name, unit, s, c in zip(names, units, steady, scale, strict=True)
+        )
+
+    return SignalMap(
+        signals(STATES, STATE_UNITS, STATE_TOPIC, _rounded(point.x_s, point.X), point.X, None),
+        signals(CONTROLS, CONTROL_UNITS, CONTROL_TOPIC, point.u_s, point.U, HOLD),
+        clock=STATE_TOPIC,
+        max_gap=2.5 * DT,
+        time={STATE_TOPIC: "header", CONTROL_TOPIC: "header"},
+        source="turbofan",
+    )
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of the plant.
+
+    amplitude: of the pulses of an open-loop run, see `pulses`, negative downwards; None for a closed-loop run along
+    `lever`. noise: standard deviation of every reading, over its scale.
+    """
+
+    samples: int
+    amplitude: float | None = None
+    lever: tuple[tuple[float, float], ...] = ((0.0, MAXIMUM),)
+    noise: float = 0.0
+    seed: int = 0
+    fault: Fault | None = None
+
+    def __post_init__(self) -> None:
+        if self.samples < 2:
+            raise UncertainLTIError(f"turbofan: a run of {self.samples} samples; it must have at least 2")
+        if self.noise < 0:
+            raise UncertainLTIError(f"turbofan: noise is {self.noise:g}; it must be 0 or more")
+
+
+def pulses(t: float, amplitude: float) -> Array:
+    """Deviation of the controls over their scales at t, (4,): one pulse on each in turn, separated by rests.
+
+    1.875 s of rest, then for each control 3.75 s of pulse and 3.75 s of rest: 30 s (METHOD section 6).
+    """
+    u = np.zeros(len(CONTROLS))
+    number, phase = divmod(t - PULSE / 2.0, 2.0 * PULSE)
+    if 0 <= number < len(CONTROLS) and phase < PULSE:
+        u[int(number)] = amplitude * PROPORTION[int(number)]
+    return u
+
+
+def simulate(run: Run, start_ns: int = START_NS, plant: Engine | None = None) -> Transient:
+    """Run the engine: readings and commands, sample by sample.
+
+    Between samples the nonlinear equations are integrated by SciPy's DOP853 to a relative tolerance of 1e-9, with the
+    commands held.
+
+    Raises
+    ------
+    UncertainLTIError
+        The run leaves what the engine can do.
+    """
+    plant = plant or engine()
+    point, rng = operating_point(), np.random.default_rng(run.seed)
+    begin = trim(run.lever[0][1], plant) if run.amplitude is None else trim(MAXIMUM, plant)
+    solver = GasPathSolver(plant)
+    controller = Controller(plant, replace(begin, x=_rounded(begin.x, point.X)), DT)
+    x, x_read, u_sent = begin.x.copy(), np.empty((run.samples, 5)), np.empty((run.samples, 4))
+    fault = run.fault or Fault("fan_damage", np.inf)
+    actual = begin.u.copy()
+    for k in range(run.samples):
+        t = k * DT
+        reading = fault.reading(t, x, point.X)
+        if run.noise:
+            reading = reading + run.noise * point.X * rng.standard_normal(5)
+        x_read[k] = _rounded(reading, point.X)
+        if run.amplitude is None:
+            u_sent[k] = controller.step(_lever(run.lever, t), x_read[k])
+        else:
+            u_sent[k] = point.u_s + point.U * pulses(t, run.amplitude)
+        if k + 1 == run.samples:
+            break
+        stuck = fault.stuck(t)
+        held, actual = actual, u_sent[k].copy()
+        if stuck is not None:
+            actual[stuck] = held[stuck]
+        x = _advance(plant, solver, x, actual, point.X, fault.health(t))
+    return Transient(
+        start_ns + DT_NS * np.arange(run.samples, dtype=np.int64),
+        x_read,
+        u_sent,
+        name="turbofan",
+        signals=turbofan_signals(),
+        max_gap=turbofan_signals().max_gap,
+    )
+
+
+def _advance(plant: Engine, solver: GasPathSolver, x: Array, u: Array, X: Array, health: Health) -> Array:
+    """x after one step under u."""
+    controls = u.tolist()
+
+    def rate(_: float, z: Array) -> Array:
+        return plant.derivative((z * X).tolist(), controls, health, solver) / X
+
+    found = solve_ivp(rate, (0.0, DT), x / X, method="DOP853", rtol=1e-9, atol=1e-11, first_step=DT)
+    if not found.success:
+        raise UncertainLTIError(f"turbofan: the step was not integrated: {found.message}")
+    end: Array = found.y[:, -1] * X
+    return end
+
+
+def _rounded(x: Array, X: Array) -> Array:
+    step: Array = np.round(x / X / RESOLUTION) * RESOLUTION * X
+    return step
+
+
+def _lever(profile: tuple[tuple[float, float], ...], t: float) -> float:
+    return [pla for since, pla in profile if since <= t + 1e-9][-1]
+
+
+def pulse_run(amplitude: float, noise: float = 0.0, seed: int = 0) -> Run:
+    """The paper's identification transient, 1201 samples."""
+    return Run(PULSE_SAMPLES, amplitude, noise=noise, seed=seed)
+
+
+def check_run(noise: float = 0.0, seed: int = 0) -> Run:
+    """The paper's check: the lever from 68 to 60 deg in closed loop, 101 samples, the step at the first."""
+    return Run(101, lever=((0.0, MAXIMUM), (DT, 60.0)), noise=noise, seed=seed)
+
+
+def levels_run(noise: float = 0.0, seed: int = 0, fault: Fault | None = None, samples: int = 2401) -> Run:
+    """Closed loop over several power levels between 60 and 68 deg."""
+    return Run(samples, lever=LEVELS, noise=noise, seed=seed, fault=fault)
+
+
