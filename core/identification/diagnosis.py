@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from uncertain_lti.errors import FitError
 from uncertain_lti.identification import excitation, sensors
 from uncertain_lti.identification.excitation import quoted as _list
-from uncertain_lti.identification.problem import Columns, Moments, Problem, moments
+from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.problem import Columns, Problem
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.transient import Transient
 
@@ -72,7 +73,7 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
         )
     free = np.flatnonzero(~dead)
     unit = 1.0 / sums.phi_scale[free]
-    correlation = sums.centre[np.ix_(free, free)] * np.outer(unit, unit) / problem.N
+    correlation = sums.centre[np.ix_(free, free)] * np.outer(unit, unit) / sums.count
     values, vectors = np.linalg.eigh(correlation)
     limit = 1e-12 * len(free)
     for value, vector in zip(values, vectors.T, strict=True):
@@ -166,7 +167,20 @@ def _stretches(problem: Problem) -> Problem:
     if problem.N <= LOOKED_AT:
         return problem
     starts = np.linspace(0, problem.N - LOOKED_AT // STRETCHES, STRETCHES).astype(np.intp)
-    return problem.subset(np.unique(starts[:, None] + np.arange(LOOKED_AT // STRETCHES)))
+    return _subset(problem, np.unique(starts[:, None] + np.arange(LOOKED_AT // STRETCHES)))
+
+
+def _subset(problem: Problem, index: NDArray[np.intp]) -> Problem:
+    """The same problem on some transitions, with weights of one."""
+    return Problem(
+        problem.z_columns[:, index],
+        problem.next_columns[:, index],
+        problem.dt[index],
+        problem.source[index],
+        problem.k[index],
+        np.ones(problem.n),
+        problem.columns,
+    )
 
 
 def _slow(model: UncertainLTI) -> list[str]:
@@ -217,6 +231,7 @@ def _near_rest(problem: Problem, sums: Moments, mean_width: Array, states: Seque
 
 def _gain(problem: Problem) -> Array:
     """Mean width without over mean width with the noise term, (n,), by (10) on some of the samples."""
+    from uncertain_lti.identification.fleet import Fleet
     from uncertain_lti.identification.working_set import WorkingSet
 
     size = np.abs(problem.z).sum(axis=1)
@@ -224,13 +239,12 @@ def _gain(problem: Problem) -> Array:
     index = np.arange(problem.N)
     if problem.N > TRIED:  # those nearest rest, and an even share of the others
         index = np.union1d(order[: TRIED // 4], order[:: max(problem.N // TRIED, 1)])
-    part = problem.subset(index)
+    part = _subset(problem, index)
     widths = []
     for columns in (problem.columns, Columns(False, False, True)):
-        some = replace(part, columns=columns, weights=np.ones(problem.n))
-        solution = WorkingSet(some, moments(some), None).quadratic()
-        whole = slice(0, part.N)
-        widths.append((part.dt[:, None] * (some.psi(whole) @ np.maximum(solution.d, 0.0))).mean(axis=0))
+        some = replace(part, columns=columns)
+        solution = WorkingSet(Fleet([some])).quadratic()
+        widths.append((part.dt[:, None] * (some.psi() @ np.maximum(solution.d, 0.0))).mean(axis=0))
     return np.asarray(widths[0] / np.maximum(widths[1], 1e-300))
 
 
@@ -240,7 +254,7 @@ def _least_squares_box(problem: Problem, sums: Moments) -> Array:
     theta = np.zeros(sums.target.shape)
     theta[free] = np.linalg.lstsq(sums.centre[np.ix_(free, free)], sums.target[free], rcond=None)[0]
     largest = np.zeros(problem.n)
-    for part in problem.blocks():
-        residual = np.abs(problem.rate(part) - problem.phi(part) @ theta) * problem.dt[part, None]
-        largest = np.maximum(largest, residual.max(axis=0))
+    for block in problem.blocks():
+        residual = np.abs(block.rate() - theta.T @ block.phi(problem.columns)) * block.dt
+        largest = np.maximum(largest, residual.max(axis=1))
     return 2.0 * largest

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.identification.problem import Moments, Problem
+from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.problem import Problem
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: f
     """Signals that nearly move together, and the recording that would tell them apart; not those that are one."""
     free = np.flatnonzero(moments.phi_scale[: problem.p] > 0)
     unit = 1.0 / moments.phi_scale[free]
-    values, vectors = np.linalg.eigh(moments.centre[np.ix_(free, free)] * np.outer(unit, unit) / problem.N)
+    values, vectors = np.linalg.eigh(moments.centre[np.ix_(free, free)] * np.outer(unit, unit) / moments.count)
     messages = []
     for value, vector in zip(values, vectors.T, strict=True):
         if not limit < value < COLLINEAR:
@@ -73,13 +74,13 @@ def weak(problem: Problem, moments: Moments, names: Sequence[str]) -> list[str]:
     """Controls whose effect on every state is lost in what one step leaves unexplained."""
     free = np.flatnonzero(moments.phi_scale > 0)
     centre, target = moments.centre[np.ix_(free, free)], moments.target[free]
-    if not len(free) or problem.N <= len(free):
+    if not len(free) or moments.count <= len(free):
         return []
     inverse = np.linalg.pinv(centre, hermitian=True)
     theta = inverse @ target
-    total = moments.rate_scale**2 * problem.N
+    total = moments.rate_square
     residual = np.maximum(total - np.einsum("ji,ji->i", theta, target), 1e-14 * total)
-    error = np.sqrt(np.outer(np.diagonal(inverse), residual / (problem.N - len(free))))
+    error = np.sqrt(np.outer(np.diagonal(inverse), residual / (moments.count - len(free))))
     messages = []
     for row, j in enumerate(free.tolist()):
         if not problem.n <= j < problem.p or np.ptp(problem.z[:, j]) == 0:

@@ -1,0 +1,258 @@
+"""Diagnosis: each message appears where its cause is, and not where it is not."""
+
+import numpy as np
+import pytest
+
+from uncertain_lti import OperatingPoint, SignalMap, Transient, fit
+from uncertain_lti.signals import Signal
+
+A = np.array([[-1.0, 0.4], [0.3, -2.5]])
+B = np.array([[1.0, 0.2], [0.1, 2.0]])
+
+
+def steps(rng, count, held=12):
+    """Levels of both signs, drawn anew at random instants."""
+    fresh = rng.random((count, 2)) < 1 / held
+    levels = rng.uniform(-1, 1, (count, 2))
+    u = np.zeros((count, 2))
+    for k in range(1, count):
+        u[k] = np.where(fresh[k], levels[k], u[k - 1])
+    return u
+
+
+def run(seed=0, count=1500, noise=1e-3, dt=0.05, u=None, feedback=None, lag=0, change=None, plant=(A, B), **options):
+    """A linear plant under random steps, sensor noise on top; `change` edits the recorded x and u."""
+    rng = np.random.default_rng(seed)
+    nominal, gain = plant
+    u = steps(rng, count + 1) if u is None else u.copy()
+    x = np.zeros((count + 1, 2))
+    for k in range(count):
+        if feedback is not None:
+            u[k] = u[k] * 0.2 - feedback @ x[k]
+        x[k + 1] = x[k] + dt * (nominal @ x[k] + gain @ u[max(k - lag, 0)]) + dt * 2e-3 * rng.standard_normal(2)
+    if feedback is not None:
+        u[count] = u[count] * 0.2 - feedback @ x[count]
+    x = x + noise * rng.standard_normal(x.shape)
+    if change is not None:
+        x, u = change(x, u)
+    names = dict(state_names=["speed", "flow"], control_names=["valve", "pump"])
+    t_ns = np.rint(np.arange(count + 1) * dt * 1e9).astype(np.int64)
+    return Transient(t_ns, x, u, name="run", **{**names, **options})
+
+
+def messages(*transients, additive="noise", **options):
+    return fit(list(transients), additive=additive, **options).fit["messages"]
+
+
+WORDS = {
+    "collinear": "nearly move together",
+    "one-sided": "steady value",
+    "weak": "moves too little",
+    "feedback": "follow from the states",
+    "slow": "sampling is slow",
+    "quantised": "is recorded in steps of",
+    "frozen": "frozen sensor",
+    "held": "repeats its last value",
+    "ended": "commands that have ended",
+    "delay": "samples earlier",
+    "gain": "--additive noise",
+}
+
+
+def said(found):
+    return {key for key, words in WORDS.items() if any(words in message for message in found)}
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3, 1e-2])
+def test_healthy_recordings_cause_no_alarm(seed, noise):
+    assert said(messages(run(seed, noise=noise))) == set()
+
+
+def test_controls_that_nearly_move_together_are_named_with_the_cure():
+    rng = np.random.default_rng(1)
+    u = steps(rng, 1501)
+    u[:, 1] = 0.7 * u[:, 0] + 0.01 * u[:, 1]
+    (message,) = [m for m in messages(run(u=u, noise=0.0)) if WORDS["collinear"] in m]
+    assert "'valve' and 'pump'" in message and "record 'valve' moving while 'pump' rests" in message
+
+
+def test_a_state_that_follows_its_control_is_named_with_the_cure():
+    u = np.zeros((1501, 2))
+    u[:, 0] = np.sin(np.arange(1501) * 0.002)  # far slower than the plant
+    u[:, 1] = steps(np.random.default_rng(2), 1501)[:, 1]
+    apart = (np.diag(np.diag(A)), np.diag(np.diag(B)))
+    (message,) = [m for m in messages(run(u=u, noise=0.0, plant=apart)) if WORDS["collinear"] in m]
+    assert "'speed' and 'valve'" in message and "steps of 'valve' that are sharper than 'speed' can follow" in message
+
+
+def test_one_sided_control_is_named_with_its_side():
+    up = steps(np.random.default_rng(3), 1501)
+    up[:, 1] = np.abs(up[:, 1])
+    (message,) = [m for m in messages(run(u=up)) if "never goes" in m]
+    assert "'pump' never goes below" in message
+    up[:, 1] *= -1
+    (message,) = [m for m in messages(run(u=up)) if "never goes" in m]
+    assert "'pump' never goes above" in message
+
+
+def test_one_sided_is_seen_from_the_steady_value():
+    up = np.abs(steps(np.random.default_rng(3), 1501))
+    centred = OperatingPoint([0, 0], [0.5, 0.5], [1, 1], [1, 1])
+    assert any("never goes" in m for m in messages(run(u=up)))
+    assert not any("never goes" in m for m in messages(run(u=up), operating_point=centred, additive="both"))
+
+
+def test_control_lost_in_the_noise_is_named():
+    u = steps(np.random.default_rng(4), 1501)
+    u[:, 1] *= 1e-5
+    (message,) = [m for m in messages(run(u=u, noise=1e-2)) if WORDS["weak"] in m]
+    assert "'pump'" in message and "standard errors" in message
+    assert not any(WORDS["weak"] in m for m in messages(run(u=u, noise=0.0, count=1500, seed=4)) if "'valve'" in m)
+
+
+def test_control_set_by_a_feedback_is_named_and_open_loop_is_not():
+    K = np.array([[2.0, 0.3], [0.1, 1.5]])
+    found = messages(run(feedback=K, noise=0.0, u=np.zeros((1501, 2))))
+    assert sum(WORDS["feedback"] in m for m in found) == 2
+    assert "feedback" not in said(messages(run(5, noise=0.0)))
+
+
+def test_feedback_with_steps_of_its_own_on_top_is_left_alone():
+    reference = 5 * steps(np.random.default_rng(6), 1501, held=6)
+    K = np.array([[0.2, 0.0], [0.0, 0.2]])
+    assert "feedback" not in said(messages(run(feedback=K, u=reference, noise=0.0)))
+
+
+@pytest.mark.parametrize(("dt", "slow"), [(0.02, False), (0.2, False), (0.5, True)])
+def test_step_too_long_for_the_fastest_mode(dt, slow):
+    assert ("slow" in said(messages(run(dt=dt, noise=1e-5)))) == slow
+
+
+def test_rounding_sensor_is_named_with_its_step():
+    def rounded(size):
+        return lambda x, u: (np.column_stack([np.round(x[:, 0] / size) * size, x[:, 1]]), u)
+
+    (message,) = [m for m in messages(run(change=rounded(0.05))) if WORDS["quantised"] in m]
+    assert "'speed' is recorded in steps of 0.05" in message
+    assert "quantised" not in said(messages(run(change=rounded(1e-5))))  # far finer than the movement
+
+
+def test_frozen_sensor_is_named_with_its_stretch():
+    def freeze(x, u):
+        x = x.copy()
+        x[400:520, 1] = x[400, 1]
+        return x, u
+
+    (message,) = [m for m in messages(run(change=freeze)) if WORDS["frozen"] in m]
+    assert "'flow'" in message and "119 samples" in message
+    assert "run from 20 s" in message or "recording 1 from sample 400" in message
+
+
+def test_a_machine_at_rest_is_not_frozen():
+    u = steps(np.random.default_rng(7), 1501)
+    u[300:700] = 0.0
+
+    def settle(x, u):
+        x = x.copy()
+        x[400:700] = 0.0
+        return x, u
+
+    assert "frozen" not in said(messages(run(u=u, change=settle, noise=0.0)))
+
+
+@pytest.mark.parametrize("period", [2, 5])
+def test_state_of_a_slower_topic_is_named_with_its_period(period):
+    def slower(x, u):
+        x = x.copy()
+        x[:, 1] = x[np.arange(len(x)) // period * period, 1]
+        return x, u
+
+    (message,) = [m for m in messages(run(change=slower)) if WORDS["held"] in m]
+    assert "'flow'" in message and f"every {period} samples" in message
+
+
+def test_commands_that_ended_long_ago_are_named():
+    u = np.random.default_rng(8).uniform(-1, 1, (1501, 2))
+    u[900:, 0] = u[900, 0]
+    (message,) = [m for m in messages(run(u=u)) if WORDS["ended"] in m]
+    assert "'valve'" in message
+    assert "ended" not in said(messages(run(u=np.random.default_rng(8).uniform(-1, 1, (1501, 2)))))
+
+
+def test_stale_controls_are_named():
+    signals = SignalMap(
+        (Signal("speed", "/s", "a"), Signal("flow", "/s", "b")),
+        (Signal("valve", "/c", "a", max_hold=0.1), Signal("pump", "/c", "b")),
+        clock="/s",
+        max_gap=1.0,
+    )
+    from uncertain_lti.identification.problem import assemble
+    from uncertain_lti.identification.sensors import stale
+
+    old = run(signals=signals, counters={"stale valve": 400})
+    problem = assemble([old], OperatingPoint.identity(2, 2), None, "noise")
+    (message,) = stale(signals.signals, 2, problem, [old])
+    assert "'valve' was older than its max_hold (0.1 s) in 400 of 1501 samples" in message
+    assert stale(signals.signals, 2, problem, [run(signals=signals, counters={"stale valve": 3})]) == []
+
+
+@pytest.mark.parametrize("lag", [1, 3, 7])
+@pytest.mark.parametrize("noise", [1e-4, 1e-2])
+def test_delay_is_found_and_setting_it_mends_the_fit(lag, noise):
+    transient = run(10, lag=lag, noise=noise)
+    found = [m for m in messages(transient) if WORDS["delay"] in m]
+    assert len(found) == 2 and all(f"`delay: {lag}`" in m for m in found)
+    shifted = Transient(transient.t_ns[lag:], transient.x[lag:], transient.u[: len(transient) - lag])
+    assert "delay" not in said(messages(shifted))
+    assert (fit(shifted, additive="noise").fit["mean_width"] < fit(transient, additive="noise").fit["mean_width"]).all()
+
+
+def test_noise_near_rest_is_named_with_what_the_term_gains():
+    u = steps(np.random.default_rng(11), 1501)
+    u[200:800] = 0.0
+    transient = run(11, u=u, noise=5e-3)
+    transient = Transient(transient.t_ns[1:], transient.x[1:], transient.u[1:])
+    (message,) = [m for m in messages(transient, additive="none") if WORDS["gain"] in m]
+    promised = float(message.rpartition("falls to ")[2].rstrip("%)")) / 100
+    name = message.rpartition("mean width of ")[2].split()[0]
+    i = int(name.strip("x")) - 1
+    pure, better = fit(transient, additive="none"), fit(transient, additive="noise")
+    assert better.fit["mean_width"][i] / pure.fit["mean_width"][i] == pytest.approx(promised, abs=0.1)
+
+
+def test_pure_intervals_that_do_well_are_left_alone():
+    rng = np.random.default_rng(12)
+    u = steps(rng, 1501)
+    x = np.zeros((1501, 2))
+    x[0] = 1.0
+    for k in range(1500):
+        x[k + 1] = x[k] + 0.05 * (A * (1 + 0.2 * rng.uniform(-1, 1, (2, 2))) @ x[k] + B @ u[k])
+    assert "gain" not in said(messages(Transient(np.arange(1501) * 0.05, x, u), additive="none"))
+
+
+def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
+    from uncertain_lti import read_transients
+
+    def of(bags, signals):
+        return fit(read_transients([recordings / b for b in bags], signals_folder / signals)).fit["messages"]
+
+    hunter = of(["hunter_se/straight_odd_t_0_5_run_01.mcap"], "hunter_se.yaml")
+    assert {"collinear", "one-sided"} <= said(hunter)  # a straight run: the speed follows a throttle that only opens
+    neato = of(["neato/person_follower.mcap"], "neato.yaml")
+    assert {"delay", "slow"} <= said(neato)
+    assert "weak" in said(of(["crazyflie/rollbag_0.mcap"], "crazyflie_vicon.yaml"))
+    go2 = said(of(["go2/test_3.mcap"], "go2_joint.yaml"))
+    assert not go2 & {"delay", "slow", "weak", "held", "quantised", "frozen", "one-sided"}
+
+
+def test_the_suggested_delay_narrows_the_neato(recordings, signals_folder):
+    from dataclasses import replace
+
+    from uncertain_lti import read_transients
+
+    bag = recordings / "neato/person_follower.mcap"
+    signals = SignalMap.load(signals_folder / "neato.yaml")
+    later = replace(signals, controls=tuple(replace(c, delay=1) for c in signals.controls))
+    plain, shifted = fit(read_transients(bag, signals)), fit(read_transients(bag, later))
+    assert (shifted.fit["mean_width"] < 0.65 * plain.fit["mean_width"]).all()
