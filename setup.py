@@ -24,6 +24,7 @@ extras = {
     # What `uncertain_lti.fit` needs. The newest of these want numpy 2: in a sourced ROS 2 say
     # `pip install '.[fit]' 'numpy<2'` (./run pins its numpy), and pip takes the last that do without.
     "fit": ["cvxpy", "daqp", "highspy", "osqp>=1", "piqp", "scipy"],
+    "cluster": ["distributed"],
     "frames": ["pandas"],
     "plots": ["matplotlib"],
     # Real rclpy where no ROS 2 is installed: wheels for x86_64 Linux.

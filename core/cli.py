@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from uncertain_lti import __version__
-from uncertain_lti.errors import BagError, UncertainLTIError
+from uncertain_lti.errors import BagError, FitError, UncertainLTIError
 
 DONE, ALARM, BAD_INPUT = 0, 1, 2
 
@@ -51,6 +51,7 @@ _ROS = "source a ROS 2 Jazzy installation, or pip install 'uncertain-lti-ros[ros
 _EXTRAS = {
     **dict.fromkeys(("cvxpy", "osqp", "daqp", "piqp", "highspy", "scipy"), _FIT),
     **dict.fromkeys(("rclpy", "std_msgs", "sensor_msgs", "rosgraph_msgs", "std_srvs", "uncertain_lti_ros"), _ROS),
+    "distributed": "install what a cluster needs: pip install 'uncertain-lti-ros[cluster]'",
     "matplotlib": "install what figures need: pip install 'uncertain-lti-ros[plots]'",
 }
 
@@ -89,6 +90,17 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
         help="further terms: drift with its half-width, measurement noise (default: the signals file's, else none)",
     )
     fit.add_argument("--json", action="store_true", help="print JSON")
+
+    fit.add_argument(
+        "--discard",
+        type=_budget,
+        default=0,
+        metavar="K",
+        help="leave at most K transitions outside (or a share such as 0.001), chosen by effect and listed",
+    )
+    fit.add_argument("--cache", metavar="FOLDER", help="more recordings than memory: keep the arrays in this folder")
+    fit.add_argument("--scheduler", metavar="ADDRESS", help="fit on the workers of this Dask scheduler")
+    fit.add_argument("--workers", type=int, metavar="N", help="fit on a Dask cluster of N workers on this machine")
 
     check = command("check", _check, "check a recording against a model")
     check.add_argument("model", metavar="MODEL", help="model file")
@@ -134,6 +146,11 @@ def _ros(module: str) -> Any:
         return int(import_module(f"uncertain_lti_ros.{module}").run(options))
 
     return run
+
+
+def _budget(text: str) -> float:
+    """A whole number, or a share below 1."""
+    return int(text) if text.isdigit() else float(text)
 
 
 def _progress(text: str) -> Any:
@@ -197,16 +214,18 @@ def _fit(options: argparse.Namespace) -> int:
     from uncertain_lti.report import fit_text, left_out_text, recording_text
     from uncertain_lti.validation import leave_out_cheaply
 
+    output = Path(options.output)
+    if not output.parent.is_dir():
+        raise BagError(f"{output}: the folder {output.parent} is not there; make it first")
+    if options.cache or options.scheduler or options.workers:
+        return _fit_archive(options, output)
     transients = read_transients(options.bags, options.signals, _progress("reading"))
     if not options.json:
         for transient in transients:
             _say(transient.notes)
             print(recording_text(transient))
-    output = Path(options.output)
-    if not output.parent.is_dir():
-        raise BagError(f"{output}: the folder {output.parent} is not there; make it first")
     began = time.perf_counter()
-    model = fit(transients, options.criterion, additive=options.additive)
+    model = fit(transients, options.criterion, additive=options.additive, discard=options.discard)
     sources = [{"file": name, "sha256": _sha256(name)} for t in transients for name in t.sources]
     model = model.with_(fit={**model.fit, "sources": sources})
     left_out = leave_out_cheaply(transients, model, time.perf_counter() - began)
@@ -220,6 +239,51 @@ def _fit(options: argparse.Namespace) -> int:
         print(fit_text(model, transients))
         if left_out is not None:
             print(left_out_text(left_out))
+        print(f"model written to {output}")
+    return DONE
+
+
+def _fit_archive(options: argparse.Namespace, output: Path) -> int:
+    from contextlib import ExitStack
+
+    from uncertain_lti.archive import fit_archive
+    from uncertain_lti.report import archive_text
+
+    if options.discard:
+        raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
+    if options.cache and (options.scheduler or options.workers):
+        raise FitError("--cache keeps the arrays on disk and --scheduler or --workers on a cluster; choose one")
+    with ExitStack() as stack:
+        client = None
+        if options.scheduler or options.workers:
+            dask: Any = import_module("distributed")
+
+            where = options.scheduler or stack.enter_context(
+                dask.LocalCluster(
+                    n_workers=options.workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+                )
+            )
+            try:
+                client = stack.enter_context(dask.Client(where, timeout=10))
+            except (OSError, TimeoutError, ValueError):
+                raise FitError(f"no Dask scheduler answers at {where}; start one with `dask scheduler`") from None
+        say = print if sys.stderr.isatty() and not options.json else None
+        model = fit_archive(
+            options.bags,
+            options.signals,
+            options.criterion,
+            options.additive,
+            cache=options.cache,
+            client=client,
+            progress=say,
+        )
+    sources = [{**s, "sha256": _sha256(s["file"])} for s in model.fit["sources"]]
+    model = model.with_(fit={**model.fit, "sources": sources})
+    model.save(output)
+    if options.json:
+        _print_json({"model": str(output), "fit": model.to_dict()["fit"]})
+    else:
+        print(archive_text(model))
         print(f"model written to {output}")
     return DONE
 

@@ -71,7 +71,32 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
         table(("one-step envelope", "mean width", "largest", "rms step", "range", "width/range"), rows),
         f"eigenvalues of A [1/s]: {_eigenvalues(model)}",
     ]
+    if "discarded" in facts:
+        gone, before = facts["discarded"], facts["with_discarded"]["mean_width_recorded"]
+        lines.append(
+            f"discarded {len(gone)} transitions (mean width with them: {', '.join(map(number, before))}): "
+            + ", ".join(f"{d['file']} t = {d['t']:.4f} s" for d in gone[:20])
+            + (f" and {len(gone) - 20} more (in the model file)" if len(gone) > 20 else "")
+        )
     return "\n".join(lines + [f"note: {message}" for message in facts["messages"]])
+
+
+def archive_text(model: UncertainLTI) -> str:
+    """Summary of a fit whose transitions were not all in memory."""
+    facts = model.fit
+    rows = [
+        [s.name + (f" [{s.unit}]" if s.unit else ""), number(a), number(b)]
+        for s, a, b in zip(model.signals.states, facts["mean_width_recorded"], facts["max_width_recorded"], strict=True)
+    ]
+    return "\n".join(
+        [
+            f"criterion {facts['criterion']}; additive: {facts['additive']}; {facts['transients']} recordings, "
+            f"{facts['transitions']} transitions, {facts['violations']} outside, gap {facts['gap']:.1e}, "
+            f"{facts['solver']['passes']} passes",
+            table(("one-step envelope", "mean width", "largest"), rows),
+            f"eigenvalues of A [1/s]: {_eigenvalues(model)}",
+        ]
+    )
 
 
 def _eigenvalues(model: UncertainLTI) -> str:

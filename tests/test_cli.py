@@ -8,44 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import Message, Topic, cdr, header, write
+from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
 from uncertain_lti.cli import main
-from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
-
-SIGNALS = """
-states:
-  - {name: fan, topic: /engine/state, field: "position[fan_speed]"}
-  - {name: core, topic: /engine/state, field: "position[compressor_speed]"}
-controls:
-  - {name: fuel, topic: /engine/control, field: "position[main_fuel_flow]"}
-  - {name: area, topic: /engine/control, field: "position[nozzle_throat_area]"}
-"""
-
-
-def joint_state(names, values, stamp_ns):
-    empty = np.empty(0)
-    return cdr(
-        "sensor_msgs/msg/JointState",
-        header=header(stamp_ns),
-        name=list(names),
-        position=np.array(values),
-        velocity=empty,
-        effort=empty,
-    )
-
-
-def engine_bag(path, steps=300, seed=1, change=lambda k, x: x, **run):
-    """A run of the published engine as a bag, state before control at every instant."""
-    plant = transient(steps, seed, start_ns=10**18, **run)
-    messages = []
-    for k, t in enumerate(plant.t_ns.tolist()):
-        x = change(k, plant.x[k])
-        messages.append(Message(STATE_TOPIC, t, joint_state(plant.state_names, x, t), t))
-        messages.append(Message(CONTROL_TOPIC, t, joint_state(plant.control_names, plant.u[k], t), t))
-    topics = [Topic(STATE_TOPIC, "sensor_msgs/msg/JointState"), Topic(CONTROL_TOPIC, "sensor_msgs/msg/JointState")]
-    return write(topics, messages).save(path)
+from uncertain_lti.plants.leibov import STATE_TOPIC
 
 
 @pytest.fixture

@@ -170,19 +170,6 @@ def _stretches(problem: Problem) -> Problem:
     return _subset(problem, np.unique(starts[:, None] + np.arange(LOOKED_AT // STRETCHES)))
 
 
-def _subset(problem: Problem, index: NDArray[np.intp]) -> Problem:
-    """The same problem on some transitions, with weights of one."""
-    return Problem(
-        problem.z_columns[:, index],
-        problem.next_columns[:, index],
-        problem.dt[index],
-        problem.source[index],
-        problem.k[index],
-        np.ones(problem.n),
-        problem.columns,
-    )
-
-
 def _slow(model: UncertainLTI) -> list[str]:
     """Modes that a step of forward Euler is too long for."""
     dt = model.sampling.dt_median
@@ -239,7 +226,7 @@ def _gain(problem: Problem) -> Array:
     index = np.arange(problem.N)
     if problem.N > TRIED:  # those nearest rest, and an even share of the others
         index = np.union1d(order[: TRIED // 4], order[:: max(problem.N // TRIED, 1)])
-    part = _subset(problem, index)
+    part = problem.subset(index)
     widths = []
     for columns in (problem.columns, Columns(False, False, True)):
         some = replace(part, columns=columns)

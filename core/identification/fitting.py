@@ -148,6 +148,7 @@ def fit(
             progress=progress,
             dt_median=float(np.median(problem.dt)),
             describe_on=problem,
+            transients=transients,
         )
     except InfeasibleError as error:
         raise name(error) from None
@@ -161,7 +162,9 @@ def fit(
     }
     if budget:
         facts["discarded"] = discarded
-        facts["with_discarded"] = {key: before.fit[key] for key in ("objective", "mean_width", "max_width")}
+        facts["with_discarded"] = {
+            key: before.fit[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
+        }
     return model.with_(fit=facts)
 
 
@@ -176,6 +179,7 @@ def fit_fleet(
     progress: Callable[[str], None] | None = None,
     dt_median: float | None = None,
     describe_on: Problem | None = None,
+    transients: Sequence[Transient] = (),
 ) -> UncertainLTI:
     """`fit` on transitions that are already normalised, wherever they lie.
 
@@ -190,6 +194,8 @@ def fit_fleet(
         s.
     describe_on : Problem, optional
         What the messages in words are made from: the data, or a part of it.
+    transients : sequence of Transient
+        The recordings, for the same messages.
 
     Raises
     ------
@@ -239,7 +245,7 @@ def fit_fleet(
         "versions": _versions(),
     }
     if describe_on is not None:
-        facts["rank"], facts["messages"] = describe(model, describe_on, sums, mean_width, max_width)
+        facts["rank"], facts["messages"] = describe(model, describe_on, sums, mean_width, max_width, transients)
     return model.with_(fit=facts)
 
 
@@ -255,11 +261,17 @@ def _contradiction(
     error: InfeasibleError, problem: Problem, transients: Sequence[Transient], signals: SignalMap
 ) -> FitError:
     transient, k = transients[problem.source[error.index]], int(problem.k[error.index])
+    return contradiction_in(
+        error, f"the step from sample {k} of {transient.name} (t = {transient.t[k]:.6g} s)", signals
+    )
+
+
+def contradiction_in(error: InfeasibleError, where: str, signals: SignalMap) -> FitError:
+    """The sentence for a transition that the structure cannot contain."""
     signal = signals.states[error.row]
     distance = error.distance * float(signal.scale)
     return FitError(
-        f"structure: '{signal.name}' cannot contain the step from sample {k} of {transient.name} "
-        f"(t = {transient.t[k]:.6g} s), which stays {distance:.3g} {signal.unit} outside at "
+        f"structure: '{signal.name}' cannot contain {where}, which stays {distance:.3g} {signal.unit} outside at "
         f"best; free a half-width of this row, or use an additive term"
     )
 

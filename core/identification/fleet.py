@@ -70,6 +70,16 @@ class Fleet:
         counts = self.map(passes.count_outside, self._same(model))
         return np.asarray(np.sum(counts, axis=0), dtype=np.intp)
 
+    def moving_from_rest(self) -> tuple[int, int, float]:
+        """Samples with x = u = 0 and a successor that is not: how many, and the state that moves most and how far."""
+        results = self.map(passes.moving_from_rest, self._same())
+        _, state, step = max(results, key=lambda r: r[2])
+        return sum(r[0] for r in results), state, step
+
+    def median_dt(self) -> float:
+        """Median of Δt, s."""
+        return float(np.median(np.concatenate(self.map(passes.steps, self._same()))))
+
     def widest(self, d: Array) -> tuple[Array, Array]:
         """Largest width, and largest √w_ii x width, each (n,), normalised."""
         results = self.map(passes.widest, self._same(d))

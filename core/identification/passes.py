@@ -256,6 +256,24 @@ def count_outside(part: Partition, model: UncertainLTI) -> NDArray[np.intp]:
     return outside
 
 
+def moving_from_rest(part: Partition) -> tuple[int, int, float]:
+    """Samples with x = u = 0 and a successor that is not: how many, and the state that moves most and how far."""
+    count, state, step = 0, 0, 0.0
+    for block in part.blocks():
+        rest = ~block.z.any(axis=0)
+        if rest.any():
+            moves = np.abs(block.x_next[:, rest])
+            count += int(moves.any(axis=0).sum())
+            if moves.max() > step:
+                state, step = int(moves.max(axis=1).argmax()), float(moves.max())
+    return count, state, step
+
+
+def steps(part: Partition) -> Array:
+    """Δt of every transition, (N,)."""
+    return np.concatenate([block.dt for block in part.blocks()])
+
+
 def widest(part: Partition, d: Array) -> tuple[Array, Array]:
     """Largest width per step, and largest √w_ii x width, each (n,), normalised."""
     largest, weighted = np.zeros(part.n), np.zeros(part.n)

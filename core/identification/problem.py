@@ -200,20 +200,24 @@ class Problem:
         weights = self.weights if self.weights.ndim == 1 else self.weights[part]
         return Block(0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights)
 
+    def subset(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Problem:
+        """The same problem on some transitions."""
+        weights = self.weights if self.weights.ndim == 1 else self.weights[index]
+        return Problem(
+            self.z_columns[:, index],
+            self.next_columns[:, index],
+            self.dt[index],
+            self.source[index],
+            self.k[index],
+            weights,
+            self.columns,
+        )
+
     def without(self, index: NDArray[np.intp]) -> Problem:
         """The same problem without some transitions."""
         keep = np.ones(self.N, dtype=bool)
         keep[index] = False
-        weights = self.weights if self.weights.ndim == 1 else self.weights[keep]
-        return Problem(
-            self.z_columns[:, keep],
-            self.next_columns[:, keep],
-            self.dt[keep],
-            self.source[keep],
-            self.k[keep],
-            weights,
-            self.columns,
-        )
+        return self.subset(keep)
 
 
 def is_constant(dt: Array) -> bool:
@@ -226,6 +230,7 @@ def assemble(
     point: OperatingPoint,
     weights: ArrayLike | Sequence[ArrayLike] | None,
     additive: Additive,
+    empty: bool = False,
 ) -> Problem:
     """Put the usable transitions of all recordings into one problem.
 
@@ -236,6 +241,8 @@ def assemble(
     weights : None, (n,), (N, n), (N, n, n), or one such array per transient
         N counts the steps of a transient (samples less one), usable or not.
     additive : {"none", "disturbance", "noise", "both"}
+    empty : bool
+        No transition at all is no error.
 
     Raises
     ------
@@ -246,7 +253,7 @@ def assemble(
     steps = [t.transitions() for t in transients]
     k = np.concatenate([s.k for s in steps])
     source = np.repeat(np.arange(len(steps)), [len(s.k) for s in steps])
-    if not len(k):
+    if not len(k) and not empty:
         names = ", ".join(t.name for t in transients)
         raise FitError(
             f"{names}: no usable transition among {sum(len(t) for t in transients)} samples; signals are missing, "

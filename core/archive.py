@@ -1,0 +1,225 @@
+"""Archive: a fit over more recordings than memory holds, from arrays on disk or on the workers of a cluster."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.bag import Bag, group_recordings
+from uncertain_lti.errors import BagError, FitError, SignalError
+from uncertain_lti.identification.cache import CacheWriter
+from uncertain_lti.identification.cluster import DaskFleet
+from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, is_constant
+from uncertain_lti.identification.structure import Structure
+from uncertain_lti.identification.working_set import InfeasibleError
+from uncertain_lti.model import Alarm, UncertainLTI
+from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.reading import read_stream, sample
+from uncertain_lti.sampler import resolve
+from uncertain_lti.signals import SignalMap
+
+Recording = tuple[str, tuple[str, ...]]
+"""Name and files of one recording."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What resolving a signal map needs of one recording: types, stamped messages and instants by topic."""
+
+    types: dict[str, str]
+    stamped: dict[str, int]
+    counted: dict[str, int]
+    header: dict[str, NDArray[np.int64]]
+    log: dict[str, NDArray[np.int64]]
+
+
+def fit_archive(
+    paths: Sequence[str | os.PathLike[str]],
+    signals: SignalMap | str | os.PathLike[str],
+    criterion: str = "qp",
+    additive: Additive | None = None,
+    *,
+    cache: str | os.PathLike[str] | None = None,
+    client: Any = None,
+    alarm: Alarm | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> UncertainLTI:
+    """`fit` over recordings that together need not fit in memory; each of them must.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        As for `read_transients`; a cluster's workers must be able to read them under the same names.
+    signals : SignalMap or path
+        steady and scale must be numbers: `auto` would need all recordings at once.
+    criterion, additive, alarm
+        As for `fit`.
+    cache : path, optional
+        Folder for the arrays, written while the bags are read; passes then read it block by block.
+    client : distributed.Client, optional
+        The workers read the recordings and keep the arrays. Give cache or client.
+    progress : callable, optional
+        Called with one line of text per recording and per pass.
+
+    Returns
+    -------
+    UncertainLTI
+        The same optimum as `fit` finds.
+
+    Raises
+    ------
+    BagError, SignalError, FitError
+        As for `read_transients` and `fit`.
+    """
+    if (cache is None) == (client is None):
+        raise FitError("an archive is fitted from a cache or on a cluster; give one of them")
+    if not isinstance(signals, SignalMap):
+        signals = SignalMap.load(signals)
+    for signal in signals.signals:
+        if "auto" in (signal.steady, signal.scale):
+            raise SignalError(
+                f"{signals.source}: '{signal.name}' has auto, and an archive is read one recording at a time; write "
+                f"numbers (a fit to a few of the recordings prints them)"
+            )
+    say = progress or (lambda text: None)
+    recordings: list[Recording] = [
+        (os.fspath(bag.path), tuple(map(str, bag.parts))) for bag in group_recordings(list(paths))
+    ]
+    if not recordings:
+        raise BagError("no recording is named; give at least one MCAP file or folder")
+
+    def visit(function: Callable[..., Any], *more: Any) -> list[Any]:
+        if client is not None:
+            return DaskFleet.run(client, [(function, (recording, *more)) for recording in recordings])
+        results = []
+        for number, recording in enumerate(recordings, start=1):
+            say(f"{recording[0]} ({number} of {len(recordings)})")
+            results.append(function(recording, *more))
+        return results
+
+    signals = _resolve(visit(survey, signals), signals, recordings)
+    additive = additive or signals.additive or "none"
+    structure = None
+    if signals.structure:
+        names = ([s.name for s in signals.states], [s.name for s in signals.controls])
+        structure = Structure.from_rules(signals.structure, *names, f"{signals.source}: structure")
+    fleet: Fleet
+    if client is not None:
+        # whether Δt is constant decides what is identifiable, and must be one answer for all partitions
+        constant = additive == "both" and all(visit(_constant_dt, signals))
+        columns = Columns.of(additive, constant)
+        fleet = DaskFleet(client, [(load, (recording, signals, columns)) for recording in recordings])
+        counts, dt = fleet.counts, None
+    else:
+        assert cache is not None
+        counts, steps = [], []
+        with CacheWriter(cache) as writer:
+            for number, recording in enumerate(recordings, start=1):
+                say(f"{recording[0]} ({number} of {len(recordings)})")
+                problem = load(recording, signals, Columns(False, False, False))
+                counts.append(problem.N)
+                steps.append(problem.dt)
+                if problem.N:
+                    writer.add(problem)
+        dt = np.concatenate(steps)
+        columns = Columns.of(additive, is_constant(dt))
+        fleet = Fleet([writer.partition(np.ones(len(signals.states)), columns)])
+    _check(fleet, signals)
+    try:
+        model = fit_fleet(
+            fleet,
+            signals,
+            criterion,
+            structure=structure,
+            alarm=alarm,
+            progress=progress,
+            dt_median=fleet.median_dt() if dt is None else float(np.median(dt)),
+        )
+    except InfeasibleError as error:
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        which = int(np.searchsorted(starts, error.index, side="right")) - 1
+        name = f"transition {error.index - starts[which]} of {recordings[which][0]}"
+        raise contradiction_in(error, name, signals) from None
+    facts = {
+        **model.fit,
+        "additive": additive,
+        "weights": "ones",
+        "transients": len(recordings),
+        "sources": [{"file": file} for _, files in recordings for file in files],
+    }
+    return model.with_(fit=facts)
+
+
+def survey(recording: Recording, signals: SignalMap) -> Survey:
+    """First look at one recording; see `Survey`."""
+    stream = read_stream(Bag(recording[0], recording[1]), signals)
+    states = {s.topic for s in signals.states}
+    types, stamped, counted = {}, {}, {}
+    header, log = {}, {}
+    for position, topic in enumerate(signals.topics):
+        chosen = stream.topic == position
+        if not chosen.any():
+            raise BagError(f"{recording[0]}: {topic} has no message; record it, or choose another topic")
+        stamps = stream.stamp[chosen]
+        types[topic] = stream.bag.topics[topic].type
+        stamped[topic], counted[topic] = int(np.count_nonzero(stamps >= 0)), len(stamps)
+        if topic in states:
+            header[topic], log[topic] = stamps[stamps >= 0], stream.arrival[chosen]
+    return Survey(types, stamped, counted, header, log)
+
+
+def _resolve(surveys: Sequence[Survey], signals: SignalMap, recordings: Sequence[Recording]) -> SignalMap:
+    """As `read_transients` resolves a map, from surveys."""
+    types: dict[str, str] = {}
+    for (name, _), found in zip(recordings, surveys, strict=True):
+        for topic, kind in found.types.items():
+            if types.setdefault(topic, kind) != kind:
+                raise BagError(
+                    f"{name}: {topic} is {kind}, and {types[topic]} in {recordings[0][0]}; "
+                    f"fit recordings of the same types together"
+                )
+    time: dict[str, str] = {}
+    for topic in signals.topics:
+        stamped = 2 * sum(s.stamped[topic] for s in surveys) > sum(s.counted[topic] for s in surveys)
+        time[topic] = signals.time.get(topic) or ("header" if stamped else "log")
+    instants = {
+        topic: [(s.header if time[topic] == "header" else s.log)[topic] for s in surveys]
+        for topic in dict.fromkeys(s.topic for s in signals.states)
+    }
+    return resolve(signals.with_types(types), instants, time)
+
+
+def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
+    """The usable transitions of one recording, normalised."""
+    transient = sample(read_stream(Bag(recording[0], recording[1]), signals), signals)
+    point = OperatingPoint.of(signals.states, signals.controls)
+    return replace(assemble([transient], point, None, "none", empty=True), columns=columns)
+
+
+def _constant_dt(recording: Recording, signals: SignalMap) -> bool:
+    dt = load(recording, signals, Columns(False, False, False)).dt
+    return is_constant(dt)
+
+
+def _check(fleet: Fleet, signals: SignalMap) -> None:
+    """What `diagnosis.check_solvable` refuses."""
+    unknowns = fleet.p + fleet.columns.drift
+    if fleet.N < unknowns:
+        raise FitError(f"{fleet.N} usable transitions for {unknowns} unknown nominal elements per row; record more")
+    if fleet.columns.disturbance or fleet.columns.noise:
+        return
+    count, state, step = fleet.moving_from_rest()
+    if count:
+        signal = signals.states[state]
+        raise FitError(
+            f"{count} samples are at rest, x = u = 0, and move in the next step ('{signal.name}' by up to "
+            f"{step * float(signal.scale):.3g} {signal.unit}), which no interval matrices can contain; use an additive "
+            f"term: --additive noise for measurement noise, --additive disturbance for unmodelled inputs"
+        )

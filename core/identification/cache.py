@@ -1,0 +1,141 @@
+"""Arrays on disk: transitions in blocks that a pass reads one after the other."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.errors import FitError
+from uncertain_lti.identification.problem import BLOCK, Block, Columns, Problem
+
+Array = NDArray[np.float64]
+
+_FORMAT = "uncertain-lti-cache/1"
+_DATA, _FACTS = "transitions.f64", "facts.json"
+
+
+@dataclass(frozen=True)
+class DiskPartition:
+    """A `Partition` in a folder: blocks of [z; x_next; Δt] as float64, read anew by every pass.
+
+    Only one block is in memory at a time. weights are (n,), constant in time.
+    """
+
+    folder: Path
+    count: int
+    n: int
+    p: int
+    weights: Array
+    columns: Columns
+
+    @property
+    def N(self) -> int:
+        """Number of transitions."""
+        return self.count
+
+    def blocks(self) -> Iterator[Block]:
+        """All transitions, in the blocks they were written in.
+
+        Raises
+        ------
+        FitError
+            The file is shorter than its facts say.
+        """
+        lines = self.p + self.n + 1
+        with open(self.folder / _DATA, "rb", buffering=0) as stream:
+            for start in range(0, self.count, BLOCK):
+                size = min(BLOCK, self.count - start)
+                data = np.fromfile(stream, dtype="<f8", count=lines * size)
+                if len(data) < lines * size:
+                    raise FitError(f"{self.folder}: the cache is cut short; delete the folder and fit again")
+                table = data.reshape(lines, size)
+                yield Block(start, table[: self.p], table[self.p : -1], table[-1], self.weights)
+
+    def with_columns(self, columns: Columns) -> DiskPartition:
+        """The same transitions with other unknown terms."""
+        return replace(self, columns=columns)
+
+
+class CacheWriter:
+    """Writes a `DiskPartition` from problems that come one after the other, each of which fits in memory.
+
+    Use it as a context: left without an error, the folder is complete; else it has no facts and is not read.
+
+    Parameters
+    ----------
+    folder : path
+        Made where it is not there; a cache in it is replaced.
+
+    Raises
+    ------
+    FitError
+        The folder cannot be written, or holds something else.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        self._pending: list[Array] = []
+        self._waiting = 0
+        self._count = 0
+        self._shape: tuple[int, int] | None = None
+
+    def __enter__(self) -> CacheWriter:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            strangers = {f.name for f in self.folder.iterdir()} - {_DATA, _FACTS}
+            if strangers:
+                raise FitError(
+                    f"{self.folder}: holds {min(strangers)}, so it is no cache; name an empty or a new folder"
+                )
+            (self.folder / _FACTS).unlink(missing_ok=True)
+            self._stream = open(self.folder / _DATA, "wb")  # closed in __exit__
+        except OSError as error:
+            raise FitError(f"{self.folder}: cannot be written: {error.strerror}; choose another folder") from None
+        return self
+
+    def add(self, problem: Problem) -> None:
+        """Append the transitions of a recording."""
+        shape = (problem.n, problem.p)
+        if self._shape not in (None, shape):
+            raise FitError(f"{self.folder}: recordings differ in their numbers of signals")
+        self._shape = shape
+        table = np.vstack([problem.z_columns, problem.next_columns, problem.dt])
+        self._pending.append(table)
+        self._waiting += table.shape[1]
+        while self._waiting >= BLOCK:
+            self._write(BLOCK)
+
+    def _write(self, size: int) -> None:
+        whole = np.hstack(self._pending)
+        try:
+            np.ascontiguousarray(whole[:, :size], dtype="<f8").tofile(self._stream)
+        except OSError as error:
+            raise FitError(f"{self.folder}: cannot be written: {error.strerror}; free some space") from None
+        self._pending = [whole[:, size:]]
+        self._waiting -= size
+        self._count += size
+
+    def __exit__(self, kind: object, *_: Any) -> None:
+        if kind is None and self._waiting:
+            self._write(self._waiting)
+        self._stream.close()
+        if kind is None and self._shape is not None:
+            n, p = self._shape
+            facts = {"format": _FORMAT, "transitions": self._count, "n": n, "p": p}
+            temporary = self.folder / (_FACTS + ".tmp")
+            temporary.write_text(json.dumps(facts))
+            temporary.replace(self.folder / _FACTS)
+
+    def partition(self, weights: Array, columns: Columns) -> DiskPartition:
+        """What was written."""
+        if self._shape is None:
+            raise FitError(f"{self.folder}: no usable transition was written")
+        n, p = self._shape
+        return DiskPartition(self.folder, self._count, n, p, weights, columns)

@@ -1,0 +1,81 @@
+"""Fleet on Dask: partitions in the memory of workers, passes as map and reduce."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.errors import FitError, UncertainLTIError
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.problem import Problem
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+class DaskFleet(Fleet):
+    """Partitions that workers make and keep; a pass sends the candidate and brings back the few samples that matter.
+
+    A partition is the result of a pure task, so a worker that is lost costs the time to make its partitions anew.
+
+    Parameters
+    ----------
+    client : distributed.Client
+    tasks : sequence of (callable, arguments)
+        Each makes one `Problem`.
+
+    Raises
+    ------
+    UncertainLTIError
+        What a task raised.
+    """
+
+    def __init__(self, client: Any, tasks: Sequence[tuple[Callable[..., Problem], tuple[Any, ...]]]) -> None:
+        self._client = client
+        made = [client.submit(function, *arguments, pure=False, retries=3) for function, arguments in tasks]
+        facts = _gather(client, [client.submit(_facts, part, pure=False, retries=3) for part in made])
+        kept = [(part, fact[0]) for part, fact in zip(made, facts, strict=True) if fact[0][0]]
+        if not kept:
+            raise FitError("no usable transition in any recording; check the signals file")
+        self._parts = [part for part, _ in kept]
+        self._constant_weights = next(fact[1] for fact in facts if fact[0][0])
+        self._describe([fact for _, fact in kept])
+
+    @property
+    def weights(self) -> Array | None:
+        """Weights (n,) that are constant in time; None where they are not."""
+        return self._constant_weights  # type: ignore[no-any-return]
+
+    @staticmethod
+    def run(client: Any, tasks: Sequence[tuple[Callable[..., T], tuple[Any, ...]]]) -> list[T]:
+        """Results of tasks in order."""
+        return _gather(client, [client.submit(f, *arguments, pure=False, retries=3) for f, arguments in tasks])
+
+    def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
+        """function(partition, *arguments) on the workers, results in order of the partitions."""
+        futures = [
+            self._client.submit(function, part, *args, pure=False, retries=3)
+            for part, args in zip(self._parts, arguments, strict=True)
+        ]
+        return _gather(self._client, futures)
+
+
+def _gather(client: Any, futures: list[Any]) -> list[Any]:
+    from distributed.client import FutureCancelledError
+    from distributed.comm.core import CommClosedError
+    from distributed.scheduler import KilledWorker
+
+    try:
+        results: list[Any] = client.gather(futures)
+    except UncertainLTIError:
+        raise
+    except (KilledWorker, CommClosedError, FutureCancelledError, TimeoutError, OSError) as error:
+        raise FitError(f"the Dask cluster gave up ({type(error).__name__}); look at its workers' logs") from None
+    return results
+
+
+def _facts(part: Problem) -> tuple[tuple[Any, ...], Array | None]:
+    return (part.N, part.n, part.p, part.columns), part.weights if part.weights.ndim == 1 else None

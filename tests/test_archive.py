@@ -1,0 +1,189 @@
+"""Archives: the same optimum from disk and from a cluster as in memory."""
+
+import json
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from engine_bag import SIGNALS, engine_bag
+
+from uncertain_lti import OperatingPoint, Transient, fit, read_transients
+from uncertain_lti.archive import fit_archive
+from uncertain_lti.errors import FitError, SignalError
+from uncertain_lti.identification.cache import CacheWriter
+from uncertain_lti.identification.fitting import fit_fleet
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.problem import BLOCK, Columns, assemble
+
+ARRAYS = ("A", "B", "dA", "dB", "c", "dc", "v")
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("archive")
+    (folder / "signals.yaml").write_text("additive: disturbance\n" + SIGNALS)
+    return folder / "signals.yaml", [engine_bag(folder / f"run{s}x.mcap", 80 + 15 * s, s) for s in range(8)]
+
+
+def equal(one, two):
+    for name in ARRAYS:
+        assert getattr(one, name) == pytest.approx(getattr(two, name), rel=1e-9, abs=1e-9)
+    assert np.asarray(one.fit["objective"]) == pytest.approx(np.asarray(two.fit["objective"]), rel=1e-12)
+    assert one.sampling == two.sampling
+    assert one.signals == two.signals
+    assert np.array_equal(one.domain.x_min, two.domain.x_min)
+    assert one.fit["transitions"] == two.fit["transitions"] and one.fit["violations"] == 0
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize("additive", ["disturbance", "both"])
+def test_from_disk_as_in_memory(bags, tmp_path, criterion, additive):
+    signals, paths = bags
+    transients = read_transients(paths, signals)
+    model = fit(transients, criterion, additive=additive)
+    same = fit_archive(paths, signals, criterion, additive, cache=tmp_path / "cache")
+    equal(same, model)
+    for t in transients:
+        s = t.transitions()
+        lower, upper = same.bounds(s.x, s.u, s.dt)
+        assert ((lower <= s.x_next) & (s.x_next <= upper)).all()
+
+
+def random_problem(seed, N, n=3, m=2, noise=1e-3):
+    rng = np.random.default_rng(seed)
+    x, u = rng.uniform(-1, 1, (N, n)), rng.uniform(-1, 1, (N, m))
+    M = np.hstack([-np.diag(np.arange(1.0, n + 1)), np.ones((n, m))])
+    spread = 0.3 * rng.uniform(0, 1, M.shape)
+    z = np.hstack([x, u])
+    rate = np.einsum("kj,kij->ki", z, M + spread * rng.uniform(-1, 1, (N, *M.shape)))
+    pairs = np.empty((2 * N, n))
+    pairs[::2], pairs[1::2] = x, x + 0.01 * rate + noise * rng.standard_normal((N, n))
+    t = np.repeat(np.arange(N) * 10**9, 2) + np.tile([0, 10**7], N)
+    transient = Transient(t, pairs, np.repeat(u, 2, axis=0), max_gap=0.1)
+    return transient, assemble([transient], OperatingPoint.identity(n, m), None, "noise")
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_many_blocks_and_passes_from_disk(tmp_path, criterion):
+    """More samples than are held: screening and passes over blocks that do not end where recordings do."""
+    parts = [random_problem(seed, count) for seed, count in enumerate((30_001, 5, BLOCK, 12_345))]
+    whole = fit([t for t, _ in parts], criterion, additive="noise")
+    with CacheWriter(tmp_path / "c") as writer:
+        for _, problem in parts:
+            writer.add(problem)
+    partition = writer.partition(np.ones(3), Columns.of("noise", True))
+    assert partition.N == sum(p.N for _, p in parts)
+    stacked = np.hstack([block.z for block in partition.blocks()])
+    assert np.array_equal(stacked, np.hstack([p.z_columns for _, p in parts]))
+    model = fit_fleet(Fleet([partition]), whole.signals, criterion)
+    objective = np.asarray(model.fit["objective"])
+    assert objective == pytest.approx(np.asarray(whole.fit["objective"]), rel=1e-12)
+    assert model.dA == pytest.approx(whole.dA, rel=1e-9, abs=1e-9)
+    # and in parts, as a cluster would hold them
+    fleet = Fleet([p for _, p in parts])
+    assert np.asarray(fit_fleet(fleet, whole.signals, criterion).fit["objective"]) == pytest.approx(
+        objective, rel=1e-12
+    )
+    assert fleet.count_outside(model).sum() == 0
+
+
+def test_cut_cache_and_wrong_folders_are_named(tmp_path):
+    _, problem = random_problem(0, 9000)
+    with CacheWriter(tmp_path / "c") as writer:
+        writer.add(problem)
+    partition = writer.partition(np.ones(3), Columns.of("noise", True))
+    data = tmp_path / "c" / "transitions.f64"
+    data.write_bytes(data.read_bytes()[:-8])
+    with pytest.raises(FitError, match="cut short"):
+        list(partition.blocks())
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("")
+    with pytest.raises(FitError, match=r"thesis\.tex.*no cache"), CacheWriter(tmp_path / "other"):
+        pass
+    with pytest.raises(RuntimeError), CacheWriter(tmp_path / "broken") as writer:
+        writer.add(problem)
+        raise RuntimeError
+    assert not (tmp_path / "broken" / "facts.json").exists()
+
+
+def test_bad_archives_are_refused(bags, tmp_path):
+    signals, paths = bags
+    auto = tmp_path / "auto.yaml"
+    auto.write_text(SIGNALS.replace('field: "position[fan_speed]"', 'field: "position[fan_speed]", steady: auto'))
+    with pytest.raises(SignalError, match="'fan' has auto"):
+        fit_archive(paths, auto, cache=tmp_path / "c")
+    with pytest.raises(FitError, match="cache or on a cluster"):
+        fit_archive(paths, signals)
+    rest = tmp_path / "rest.yaml"
+    rest.write_text(SIGNALS)
+    still = engine_bag(tmp_path / "still.mcap", 60, change=lambda k, x: x * 0 + (1.0 if k == 40 else 0.0))
+    control = engine_bag(tmp_path / "moving.mcap", 60, 3)
+    with pytest.raises(FitError, match="at rest.*--additive noise"):
+        fit_archive([still, control], rest, cache=tmp_path / "c")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as local:
+        with distributed.Client(local) as client:
+            yield local, client
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_on_a_cluster_as_in_memory(bags, cluster, criterion):
+    signals, paths = bags
+    model = fit(read_transients(paths, signals), criterion)
+    equal(fit_archive(paths, signals, criterion, client=cluster[1]), model)
+
+
+@pytest.mark.slow
+def test_a_lost_worker_costs_time_and_nothing_else(bags, cluster):
+    signals, paths = bags
+    model = fit(read_transients(paths, signals))
+    local, client = cluster
+    victim = next(iter(local.workers.values()))
+    pid = victim.process.process.pid
+    lost = threading.Event()
+
+    def kill():
+        time.sleep(0.3)
+        os.kill(pid, signal.SIGKILL)
+        lost.set()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    for _ in range(50):  # until the kill has fallen into the middle of one of them
+        same = fit_archive(paths, signals, client=client)
+        equal(same, model)
+        if lost.is_set():
+            break
+    killer.join()
+    assert lost.is_set()
+    equal(fit_archive(paths, signals, client=client), model)
+
+
+@pytest.mark.slow
+def test_errors_of_workers_are_sentences(bags, cluster, tmp_path):
+    signals, paths = bags
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(SIGNALS.replace("position[fan_speed]", "position[fan]"))
+    with pytest.raises(SignalError, match="there is no 'fan' in the message's names"):
+        fit_archive(paths, wrong, client=cluster[1])
+
+
+def test_cache_of_the_command(bags, tmp_path, capsys):
+    from uncertain_lti.cli import main
+
+    signals, paths = bags
+    arguments = ["fit", *map(str, paths), "--signals", str(signals), "--output"]
+    assert main([*arguments, str(tmp_path / "a.json")]) == 0
+    assert main([*arguments, str(tmp_path / "b.json"), "--cache", str(tmp_path / "cache")]) == 0
+    one, two = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
+    assert np.array(one["dA"]) == pytest.approx(np.array(two["dA"]), rel=1e-9, abs=1e-9)
+    assert one["fit"]["sources"] == two["fit"]["sources"]
+    capsys.readouterr()
