@@ -167,7 +167,9 @@ def _stretches(problem: Problem) -> Problem:
     if problem.N <= LOOKED_AT:
         return problem
     starts = np.linspace(0, problem.N - LOOKED_AT // STRETCHES, STRETCHES).astype(np.intp)
-    return _subset(problem, np.unique(starts[:, None] + np.arange(LOOKED_AT // STRETCHES)))
+    return replace(
+        problem.subset(np.unique(starts[:, None] + np.arange(LOOKED_AT // STRETCHES))), weights=np.ones(problem.n)
+    )
 
 
 def _slow(model: UncertainLTI) -> list[str]:
@@ -226,7 +228,7 @@ def _gain(problem: Problem) -> Array:
     index = np.arange(problem.N)
     if problem.N > TRIED:  # those nearest rest, and an even share of the others
         index = np.union1d(order[: TRIED // 4], order[:: max(problem.N // TRIED, 1)])
-    part = problem.subset(index)
+    part = replace(problem.subset(index), weights=np.ones(problem.n))
     widths = []
     for columns in (problem.columns, Columns(False, False, True)):
         some = replace(part, columns=columns)
