@@ -18,7 +18,7 @@ from uncertain_lti.transient import Transient
 
 Array = NDArray[np.float64]
 
-LOOKED_AT, STRETCHES = 100_000, 20
+LOOKED_AT, STRETCHES = 20_000, 20
 """At most so many transitions, in so many stretches, are looked at for what shows in any of them."""
 FAST = 0.7
 """|eigenvalue| x dt above which a step of forward Euler is long for the mode."""
@@ -190,13 +190,17 @@ def _slow(model: UncertainLTI) -> list[str]:
 
 def _near_rest(problem: Problem, sums: Moments, mean_width: Array, states: Sequence[str]) -> list[str]:
     """Widths that come from samples near rest, and what the additive term would gain."""
-    box, size = _least_squares_box(problem, sums), np.abs(problem.z).sum(axis=1)
-    rest = float(np.mean(size <= 0.02 * np.quantile(size, 0.95)))
-    floor = 1e-9 * np.abs(problem.z[:, : problem.n]).max(axis=0)  # below it both are rounding
+    part = _stretches(problem)
+    floor = 1e-9 * np.abs(part.z_columns[: part.n]).max(axis=1)  # below it both are rounding
+    box = _least_squares_box(part, sums)
+    if part is not problem and (mean_width > 0.7 * box).any():  # the band of all samples is no narrower: a screen
+        box = _least_squares_box(problem, sums)
     suspect = [i for i in range(problem.n) if mean_width[i] > 0.7 * box[i] > floor[i]]
     if not suspect:
         return []
-    gain = _gain(problem)
+    size = np.abs(part.z_columns).sum(axis=0)
+    rest = float(np.mean(size <= 0.02 * np.quantile(size, 0.95)))
+    gain = _gain(part, size)
     messages = []
     blown = [i for i in suspect if mean_width[i] > box[i]]
     if blown:
@@ -218,16 +222,15 @@ def _near_rest(problem: Problem, sums: Moments, mean_width: Array, states: Seque
     return messages
 
 
-def _gain(problem: Problem) -> Array:
-    """Mean width without over mean width with the noise term, (n,), by (10) on some of the samples."""
+def _gain(problem: Problem, size: Array) -> Array:
+    """Mean width without over mean width with the noise term, (n,), by (10) on some samples; size (N,): |z|_1."""
     from uncertain_lti.identification.fleet import Fleet
     from uncertain_lti.identification.working_set import WorkingSet
 
-    size = np.abs(problem.z).sum(axis=1)
-    order = np.argsort(size, kind="stable")
     index = np.arange(problem.N)
     if problem.N > TRIED:  # those nearest rest, and an even share of the others
-        index = np.union1d(order[: TRIED // 4], order[:: max(problem.N // TRIED, 1)])
+        nearest = np.argpartition(size, TRIED // 4)[: TRIED // 4]
+        index = np.union1d(nearest, index[:: problem.N // TRIED])
     part = replace(problem.subset(index), weights=np.ones(problem.n))
     widths = []
     for columns in (problem.columns, Columns(False, False, True)):

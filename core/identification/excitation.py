@@ -108,6 +108,7 @@ def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
     before, now = problem.z[follows], problem.z[follows + 1]
     n = problem.n
     basis = np.column_stack([now[:, :n], before, np.ones(len(before))])
+    gram = basis.T @ basis
     messages = []
     for j in range(n, problem.p):
         change = now[:, j] - before[:, j]
@@ -115,8 +116,7 @@ def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
         size = float(change @ change)
         if size <= 1e-18 * float(now[:, j] @ now[:, j]) or np.count_nonzero(np.diff(change)) < 0.05 * len(change):
             continue
-        left = change - basis @ np.linalg.lstsq(basis, change, rcond=1e-12)[0]
-        explained = 1.0 - float(left @ left) / size
+        explained = 1.0 - float(unexplained(gram, (basis.T @ change)[:, None], np.array([size]))[0]) / size
         if explained > FED_BACK:
             messages.append(
                 f"the changes of control '{names[j]}' follow from the states to {explained:.0%}: a feedback sets it, "
@@ -124,6 +124,20 @@ def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
                 f"matrices may mix both (the bounds hold for the same feedback only); record it with steps of its own"
             )
     return messages
+
+
+def unexplained(gram: Array, cross: Array, total: Array) -> Array:
+    """Sum of squares of each target that its least-squares fit on some regressors leaves, (t,).
+
+    gram (b, b), cross (b, t): products of the regressors with one another and with the targets; total (t,): sums of
+    squares of the targets. Shares below 1e-11 are not told apart, which no decision here needs.
+    """
+    size = np.sqrt(np.diagonal(gram))
+    unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
+    keep = values > 1e-11 * values[-1]
+    turned = (vectors[:, keep] / np.sqrt(values[keep])).T @ (cross * unit[:, None])
+    return np.asarray(np.maximum(total - np.einsum("bt,bt->t", turned, turned), 1e-11 * total))
 
 
 def successive(problem: Problem) -> NDArray[np.intp]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.identification.excitation import successive
+from uncertain_lti.identification.excitation import successive, unexplained
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.signals import Signal
 from uncertain_lti.transient import Transient
@@ -137,38 +137,35 @@ def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
     """Controls that explain the states better when taken some samples earlier."""
     n, p = problem.n, problem.p
     follows = successive(problem)
-    run = np.zeros(problem.N, dtype=np.intp)  # samples before this one in the same unbroken stretch
     joined = np.zeros(problem.N, dtype=bool)
     joined[follows + 1] = True
     breaks = np.flatnonzero(~joined)
+    # samples before this one in the same unbroken stretch
     run = np.arange(problem.N) - breaks[np.searchsorted(breaks, np.arange(problem.N), side="right") - 1]
     usable = np.flatnonzero(run >= LONGEST_DELAY)
     if len(usable) < 20 * p:
         return []
-    dt = problem.dt[usable, None]
-    z = problem.z[usable]
-    increment = problem.x_next[usable] - z[:, :n]
-    scale = np.maximum(np.sqrt(np.mean(increment**2, axis=0)), 1e-300)
-    constant = np.ones((len(usable), 1))
+    dt = problem.dt[usable]
+    now = problem.z_columns[:, usable]
+    increment = problem.next_columns[:, usable] - now[:n]
+    movers = [j for j in range(n, p) if np.ptp(now[j]) > 0]
+    lagged = [problem.z_columns[j, usable - lag] for j in movers for lag in range(1, LONGEST_DELAY + 1)]
+    regressors = np.vstack([now, np.ones(len(usable)), *lagged]) * dt  # all at once: one product of all with all
+    gram, cross = regressors @ regressors.T, regressors @ increment.T
+    total = np.einsum("nk,nk->n", increment, increment)
 
-    def unexplained(columns: Array) -> float:
-        basis = np.column_stack([columns * dt, constant * dt])
-        size = np.maximum(np.abs(basis).max(axis=0), 1e-300)
-        left = increment / scale - (basis / size) @ np.linalg.lstsq(basis / size, increment / scale, rcond=1e-10)[0]
-        return float(np.log(np.maximum(np.sum(left**2, axis=0), 1e-20 * len(left))).sum())
+    def score(chosen: list[int]) -> float:
+        left = unexplained(gram[np.ix_(chosen, chosen)], cross[chosen], total)
+        return float(np.log(np.maximum(left, 1e-300)).sum())
 
     messages = []
-    now = unexplained(z)
-    for j in range(n, p):
-        if np.ptp(z[:, j]) == 0:
-            continue
-        scores = [now]
-        for lag in range(1, LONGEST_DELAY + 1):
-            columns = z.copy()
-            columns[:, j] = problem.z[usable - lag, j]
-            scores.append(unexplained(columns))
+    undelayed = [*range(p), p]
+    for position, j in enumerate(movers):
+        scores = [score(undelayed)]
+        for lag in range(LONGEST_DELAY):
+            scores.append(score([position * LONGEST_DELAY + p + 1 + lag if c == j else c for c in undelayed]))
         best = int(np.argmin(scores))
-        gain = now - scores[best]
+        gain = scores[0] - scores[best]
         # 5 % less unexplained, and far more than chance: N log-likelihood units per row
         if best and gain > 0.05 and gain * len(usable) > 50:
             said = signals[j].delay + best
