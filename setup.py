@@ -60,6 +60,7 @@ setup(
             "uncertain-lti = uncertain_lti.cli:main",
             "envelope_monitor = uncertain_lti_ros.envelope_monitor:main",
             "plant = uncertain_lti_ros.plant:main",
+            "turbofan = uncertain_lti_ros.turbofan:main",
         ]
     },
 )

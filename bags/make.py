@@ -1,7 +1,10 @@
-"""Make the two recordings anew: the plant node in one process, `uncertain-lti record` in another.
+"""Make the recordings anew: a plant node in one process, `uncertain-lti record` in another.
 
-Run it as `./run python bags/make.py`, or with both programs on the path. It takes four minutes: the plant runs in real
-time, so that log time and header stamps go at the same pace.
+    ./run python bags/make.py [FOLDER [NAME...]]
+
+All, or those named; beside this file, or in FOLDER, where none of them may be yet. The plants run in real time, so that
+log time and header stamps go at the same pace: 15 minutes for all. Those of the turbofan carry a simulated clock and
+come out with the same messages every time; log times differ.
 """
 
 import signal
@@ -10,23 +13,32 @@ import sys
 from pathlib import Path
 
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, STATE_TOPIC
+from uncertain_lti.plants.turbofan_faults import KINDS
+from uncertain_lti.plants.turbofan_runs import RECORDINGS
 
-BAGS = {
+LEIBOV = {
     "leibov_fit": {"steps": 6000, "seed": 1, "fault_at": -1},
     "leibov_check": {"steps": 2400, "seed": 2, "fault_at": 1200},
+}
+BAGS = {
+    **{name: ("plant", "leibov2006", parameters) for name, parameters in LEIBOV.items()},
+    **{name: ("turbofan", "turbofan", parameters) for name, parameters in RECORDINGS.items()},
 }
 
 
 def make(name: str, folder: Path) -> None:
-    """Record one run of the plant, with what it was made from as a metadata record."""
-    parameters = BAGS[name]
-    notes = {"plant": "leibov2006", "dt": f"{DT_NS * 1e-9:g} s"} | {k: str(v) for k, v in parameters.items()}
-    if parameters["fault_at"] >= 0:
+    """Record one run of its plant, with what it was made from as a metadata record."""
+    node, model, parameters = BAGS[name]
+    notes = {"plant": model, "dt": f"{DT_NS * 1e-9:g} s"} | {k: str(v) for k, v in parameters.items()}
+    if node == "plant" and parameters["fault_at"] >= 0:
         notes["leaves its intervals"] = f"{parameters['fault_at'] * DT_NS * 1e-9:g} s after the first state"
+    if "fault" in parameters:
+        notes["fault_at"] = f"{parameters['fault_at']:g} s after the first state"
+        notes["what happens"] = KINDS[parameters["fault"]]
     record = ["uncertain-lti", "record", STATE_TOPIC, CONTROL_TOPIC, "--output", str(folder / f"{name}.mcap")]
     for key, value in notes.items():
         record += ["--note", f"{key}={value}"]
-    plant = ["plant", "--ros-args"]
+    plant = [node, "--ros-args"]
     for key, value in parameters.items():
         plant += ["-p", f"{key}:={value}"]
     recorder = subprocess.Popen(record)
@@ -39,5 +51,8 @@ def make(name: str, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    for bag in BAGS:
-        make(bag, Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent)
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    for bag in sys.argv[2:] or BAGS:
+        if bag not in BAGS:
+            sys.exit(f"there is no recording '{bag}'; there are {', '.join(BAGS)}")
+        make(bag, folder)

@@ -130,6 +130,11 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     info.add_argument("model", metavar="MODEL", help="model file")
     info.add_argument("--json", action="store_true", help="print the file as JSON")
 
+    reproduce = command("reproduce", _reproduce, "run the paper's experiment on the nonlinear turbofan")
+    reproduce.add_argument(
+        "--output", default="reproduce-output", metavar="FOLDER", help="for figures, models and numbers"
+    )
+
     for name, module, text in (
         ("play", "player", "publish a recording through rclpy"),
         ("record", "recorder", "record topics through rclpy"),
@@ -350,6 +355,16 @@ def _validate(options: argparse.Namespace) -> int:
         print(validation_text(data))
         if options.output is not None:
             print(f"model written to {options.output}")
+    return DONE
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    from uncertain_lti.reproduce import reproduce
+
+    try:
+        reproduce(options.output)
+    except OSError as error:
+        raise BagError(f"{options.output}: cannot be written: {error.strerror}; choose another folder") from None
     return DONE
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -12,6 +13,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
+from uncertain_lti.transient import Transient
 from uncertain_lti_ros.process import Life, living
 
 _SETTLE = 0.5  # s from the first subscriber on, for the others to come
@@ -49,21 +51,34 @@ def run(life: Life) -> int:
     """Wait for subscribers, publish one transient, wait until it has been received."""
     node = life.node
     assert isinstance(node, Plant)
-    publishers = (node.state, node.control)
-    if not _subscribed(life, publishers, node.wait):
-        if life.alive:
-            node.get_logger().error(f"no subscriber of both topics within {node.wait:g} s; start one first")
-        return 2
-    run = transient(
-        node.steps,
-        node.seed,
-        None if node.fault_at < 0 else node.fault_at,
-        start_ns=node.get_clock().now().nanoseconds,
+    return publish(
+        life,
+        (node.state, node.control),
+        lambda: transient(
+            node.steps,
+            node.seed,
+            None if node.fault_at < 0 else node.fault_at,
+            start_ns=node.get_clock().now().nanoseconds,
+        ),
+        node.rate,
+        node.wait,
     )
+
+
+def publish(
+    life: Life, publishers: tuple[Publisher, Publisher], make: Callable[[], Transient], rate: float, wait: float
+) -> int:
+    """Publish states and controls of a transient once both topics have subscribers; 2 where none came in `wait` s."""
+    node = life.node
+    if not _subscribed(life, publishers, wait):
+        if life.alive:
+            node.get_logger().error(f"no subscriber of both topics within {wait:g} s; start one first")
+        return 2
+    run = make()
     node.get_logger().info(f"publishing {run}")
     began = time.monotonic()
     for k, t_ns in enumerate(run.t_ns.tolist()):
-        due = began + (t_ns - int(run.t_ns[0])) * 1e-9 / node.rate
+        due = began + (t_ns - int(run.t_ns[0])) * 1e-9 / rate
         while life.alive and (rest := due - time.monotonic()) > 0:
             life.spin_once(rest)
         if not life.alive:

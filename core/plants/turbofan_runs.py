@@ -26,7 +26,7 @@ from uncertain_lti.plants.turbofan import (
     engine,
 )
 from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating_point, trim
-from uncertain_lti.plants.turbofan_faults import Fault
+from uncertain_lti.plants.turbofan_faults import KINDS, Fault
 from uncertain_lti.signals import Signal, SignalMap
 from uncertain_lti.transient import Transient
 
@@ -44,12 +44,14 @@ PROPORTION = np.array([1.0, 0.3, 0.5, 0.5])
 """Height of the pulses of each control, over its scale, for an amplitude of 1: a nozzle or a vane acts more than fuel
 does for the same share of its range, and none may push the engine off its maps."""
 PULSE_SAMPLES = 1201
+CHECK_SAMPLES, LEVELS_SAMPLES = 101, 2401
 HOLD = 0.2
 """A command older than this is not in force, s."""
 
+CHECK = ((0.0, MAXIMUM), (DT, 60.0))
 LEVELS = ((0.0, 68.0), (4.0, 64.0), (9.0, 67.0), (13.0, 61.0), (18.0, 65.0), (22.0, 60.0), (27.0, 66.0), (32.0, 63.0),
           (36.0, 68.0), (42.0, 62.0), (47.0, 64.0), (52.0, 61.0), (56.0, 68.0))  # fmt: skip
-"""(instant s, lever deg): the lever jumps and stays."""
+"""(instant s, lever deg): the lever jumps and stays. CHECK is the paper's, with the jump at the second sample."""
 
 
 @cache
@@ -177,18 +179,57 @@ def _lever(profile: tuple[tuple[float, float], ...], t: float) -> float:
     return [pla for since, pla in profile if since <= t + 1e-9][-1]
 
 
-def pulse_run(amplitude: float, noise: float = 0.0, seed: int = 0) -> Run:
-    """The paper's identification transient, 1201 samples."""
-    return Run(PULSE_SAMPLES, amplitude, noise=noise, seed=seed)
+def make_run(
+    manoeuvre: str,
+    amplitude: float = 0.0,
+    noise: float = 0.0,
+    seed: int = 0,
+    fault: str = "",
+    fault_at: float = 24.0,
+    samples: int = 0,
+) -> Run:
+    """A run by name: `pulses` (open loop, see `pulses`), `check` (lever from 68 to 60 deg) or `levels` (see LEVELS).
+
+    samples: 0 for the usual number. fault: one of `turbofan_faults.KINDS`, or empty; fault_at in s.
+
+    Raises
+    ------
+    UncertainLTIError
+        A name is not known, or a number out of range.
+    """
+    usual = {"pulses": PULSE_SAMPLES, "check": CHECK_SAMPLES, "levels": LEVELS_SAMPLES}
+    if manoeuvre not in usual:
+        raise UncertainLTIError(f"turbofan: there is no manoeuvre '{manoeuvre}'; there are {', '.join(usual)}")
+    if (manoeuvre == "pulses") != (amplitude != 0.0):
+        raise UncertainLTIError("turbofan: an amplitude other than 0 is for pulses, and pulses need one")
+    return Run(
+        samples or usual[manoeuvre],
+        amplitude if manoeuvre == "pulses" else None,
+        LEVELS if manoeuvre == "levels" else CHECK,
+        noise,
+        seed,
+        Fault(fault, fault_at) if fault else None,
+    )
 
 
-def check_run(noise: float = 0.0, seed: int = 0) -> Run:
-    """The paper's check: the lever from 68 to 60 deg in closed loop, 101 samples, the step at the first."""
-    return Run(101, lever=((0.0, MAXIMUM), (DT, 60.0)), noise=noise, seed=seed)
-
-
-def levels_run(noise: float = 0.0, seed: int = 0, fault: Fault | None = None, samples: int = 2401) -> Run:
-    """Closed loop over several power levels between 60 and 68 deg."""
-    return Run(samples, lever=LEVELS, noise=noise, seed=seed, fault=fault)
-
-
+SMALL, LARGE = 0.05, 0.30
+"""Amplitudes: of the paper's transient (the paper gives none; this is chosen), and larger than the check's excursion."""
+NOISE = 1e-4
+RECORDINGS: dict[str, dict[str, str | float | int]] = {
+    "turbofan_pulses_up": {"manoeuvre": "pulses", "amplitude": SMALL},
+    "turbofan_pulses_down": {"manoeuvre": "pulses", "amplitude": -SMALL},
+    "turbofan_pulses_up_large": {"manoeuvre": "pulses", "amplitude": LARGE},
+    "turbofan_pulses_down_large": {"manoeuvre": "pulses", "amplitude": -LARGE},
+    "turbofan_check": {"manoeuvre": "check"},
+    "turbofan_levels": {"manoeuvre": "levels"},
+    "turbofan_pulses_up_large_noise": {"manoeuvre": "pulses", "amplitude": LARGE, "noise": NOISE, "seed": 1},
+    "turbofan_pulses_down_large_noise": {"manoeuvre": "pulses", "amplitude": -LARGE, "noise": NOISE, "seed": 2},
+    "turbofan_levels_noise": {"manoeuvre": "levels", "noise": NOISE, "seed": 3},
+    **{
+        f"turbofan_{kind}": {
+            "manoeuvre": "levels", "noise": NOISE, "seed": 10 + i, "fault": kind, "fault_at": 24.0, "samples": 1401,
+        }
+        for i, kind in enumerate(KINDS)
+    },
+}  # fmt: skip
+"""Name of each shipped recording, and the arguments of `make_run` that it was made with."""

@@ -1,0 +1,330 @@
+"""`uncertain-lti reproduce`: the numerical example of Leibov (2006), on the nonlinear turbofan of this project."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from uncertain_lti.identification import fit
+from uncertain_lti.identification.direct_search import direct_search
+from uncertain_lti.model import UncertainLTI
+from uncertain_lti.monitor import EnvelopeMonitor, Verdicts
+from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.plants.turbofan import engine
+from uncertain_lti.plants.turbofan_control import operating_point, trim
+from uncertain_lti.plants.turbofan_runs import DT, LARGE, NOISE, SMALL, make_run, simulate
+from uncertain_lti.plots import ENVELOPE, RECORDED, VIOLATED
+from uncertain_lti.report import number, table
+from uncertain_lti.transient import Transient
+
+Array = NDArray[np.float64]
+
+SHORT = ("N1", "N2", "P3", "P5", "T5")
+"""Fan and compressor speed, pressures behind compressor and turbine, temperature behind the turbine."""
+SHORT_CONTROLS = ("fuel", "area", "fan vanes", "comp. vanes")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One identification and its check.
+
+    name: what it was identified from; outside: transitions outside in the identification transients; inside (n,) and
+    inside_all: shares of the check's transitions; mean_width, max_width (n,): of the bounds over the check, normalised,
+    per step; squared and largest (n,): discrepancies (4) and (5) of the nominal model over the check.
+    """
+
+    name: str
+    model: UncertainLTI
+    verdicts: Verdicts
+    outside: int
+    inside: Array
+    inside_all: float
+    mean_width: Array
+    max_width: Array
+    squared: float
+    largest: Array
+    outside_domain: int
+    seconds: float
+
+    @classmethod
+    def of(
+        cls, name: str, transients: Sequence[Transient], check: Transient, criterion: Any, additive: Any = "none"
+    ) -> Case:
+        """Fit and check."""
+        began = time.perf_counter()
+        model = fit(transients, criterion, additive=additive)
+        seconds = time.perf_counter() - began
+        monitor = EnvelopeMonitor(model)
+        verdicts = monitor.check(check)
+        judged = verdicts.judged
+        width = ((verdicts.upper - verdicts.lower) / model.operating_point.X)[judged]
+        squared, largest = model.discrepancy(check)
+        return cls(
+            name,
+            model,
+            verdicts,
+            sum(int(monitor.check(t).violated.sum()) for t in transients),
+            1.0 - (verdicts.flags[judged] == 1.0).mean(axis=0),
+            1.0 - float(verdicts.violated[judged].mean()),
+            width.mean(axis=0),
+            width.max(axis=0),
+            squared,
+            largest,
+            int(verdicts.outside_domain[judged].sum()),
+            seconds,
+        )
+
+    def data(self) -> dict[str, Any]:
+        """The numbers, as plain data."""
+        return {
+            "identified_from": self.name,
+            "criterion": self.model.fit["criterion"],
+            "additive": self.model.fit["additive"],
+            "objective": np.asarray(self.model.fit["objective"]).tolist(),
+            "outside_identification": self.outside,
+            "inside": self.inside.tolist(),
+            "inside_all": self.inside_all,
+            "mean_width": self.mean_width.tolist(),
+            "max_width": self.max_width.tolist(),
+            "discrepancy_4": self.squared,
+            "discrepancy_5": self.largest.tolist(),
+            "outside_domain": self.outside_domain,
+            "eigenvalues": [[v.real, v.imag] for v in self.model.eigenvalues().tolist()],
+            "seconds": self.seconds,
+        }
+
+
+def reproduce(output: str | os.PathLike[str], say: Callable[[str], None] = print) -> dict[str, Any]:
+    """Run the experiment, write figures, models, `reproduce.txt` and `reproduce.json` to a folder.
+
+    Parameters
+    ----------
+    output : path
+        Folder; made where it is not there.
+    say : callable
+        Takes each part of the text as it is ready.
+
+    Returns
+    -------
+    dict
+        What stands in `reproduce.json`.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written.
+    """
+    folder = Path(output)
+    folder.mkdir(parents=True, exist_ok=True)
+    lines: list[str] = []
+
+    def tell(text: str) -> None:
+        lines.append(text)
+        say(text)
+
+    tell(trim_text())
+    up, down = (simulate(make_run("pulses", a)) for a in (SMALL, -SMALL))
+    large = [simulate(make_run("pulses", a)) for a in (LARGE, -LARGE)]
+    noisy = [simulate(make_run("pulses", a, NOISE, seed)) for a, seed in ((LARGE, 1), (-LARGE, 2))]
+    check, noisy_check = simulate(make_run("check")), simulate(make_run("check", noise=NOISE, seed=4))
+    paper, both, wide = f"+{SMALL:.0%} (the paper's)", f"±{SMALL:.0%}", f"±{LARGE:.0%}"
+    cases = [
+        Case.of(name, transients, recording, criterion, additive)
+        for name, transients, recording, additive in (
+            (paper, [up], check, "none"),
+            (both, [up, down], check, "none"),
+            (f"+{LARGE:.0%}", large[:1], check, "none"),
+            (wide, large, check, "none"),
+            (f"{wide}, noise {NOISE:g}", noisy, noisy_check, "none"),
+            (f"{wide}, noise {NOISE:g}", noisy, noisy_check, "noise"),
+        )
+        for criterion in ("qp", "lp")
+    ]
+    tell(cases_text(cases))
+    tell(width_text(cases))
+    first, chosen = cases[0], next(c for c in cases if c.name == wide)
+    tell(eigenvalue_text({f"(10) from {paper}": first.model, f"(10) from {wide}": chosen.model}))
+    tell(matrix_text(chosen.model, f"(10) from {wide}"))
+    searches = []
+    for name, transients in ((paper, [up]), (wide, large)):
+        exact = next(c for c in cases if c.name == name)
+        found = direct_search(transients)
+        searches.append(
+            {
+                "identified_from": name,
+                "exact": float(exact.model.fit["objective"]),
+                "direct_search": found.objective,
+                "exact_seconds": exact.seconds,
+                "direct_search_seconds": found.seconds,
+                "evaluations": found.evaluations,
+            }
+        )
+    tell(search_text(searches))
+    for case in cases:
+        label = case.name.replace(" (the paper's)", "").replace(", noise 0.0001", "_noise")
+        name = label.replace("±", "both").replace("+", "up").replace("%", "")
+        name = f"{name}_{case.model.fit['criterion']}_{case.model.fit['additive']}"
+        case.model.save(folder / f"{name}.model.json")
+    check_figure(chosen, folder / "check.png")
+    check_figure(first, folder / "check_paper_pulses.png")
+    data = {
+        "cases": [c.data() for c in cases],
+        "direct_search": searches,
+        "published_eigenvalues": [[v.real, v.imag] for v in leibov2006().eigenvalues().tolist()],
+    }
+    (folder / "reproduce.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    (folder / "reproduce.txt").write_text("\n\n".join(lines) + "\n", encoding="utf-8")
+    say(f"models, figures (check.png, check_paper_pulses.png), reproduce.txt and reproduce.json are in {folder}")
+    return data
+
+
+def trim_text() -> str:
+    """Steady states at 68 and 60 deg."""
+    rows = []
+    for pla in (68.0, 60.0):
+        t = trim(pla)
+        p = t.path
+        rows.append(
+            [
+                f"{pla:g} deg", f"{t.x[0]:.0f}", f"{t.x[1]:.0f}", f"{p.thrust / 1e3:.1f}",
+                f"{p.specific_consumption:.3f}", f"{p.W2:.1f}", f"{p.overall_pressure_ratio:.1f}",
+                f"{p.bypass_ratio:.2f}", f"{p.T4:.0f}", f"{p.T5:.0f}", f"{p.fuel:.3f}",
+            ]
+        )  # fmt: skip
+    header = ("PLA", "N1 [rpm]", "N2 [rpm]", "thrust [kN]", "kg/(kgf h)", "air [kg/s]", "P3/P2", "bypass", "T4 [K]",
+              "T5 [K]", "fuel [kg/s]")  # fmt: skip
+    return "Steady states of the nonlinear engine, sea level, at rest\n" + table(header, rows)
+
+
+def cases_text(cases: Sequence[Case]) -> str:
+    """Shares of the check inside."""
+    rows = [
+        [
+            c.name, c.model.fit["criterion"], c.model.fit["additive"], str(c.outside), f"{c.inside_all:.0%}",
+            *(f"{share:.0%}" for share in c.inside), str(c.outside_domain),
+        ]
+        for c in cases
+    ]  # fmt: skip
+    return (
+        "Check: lever from 68 to 60 deg, 100 transitions; shares inside the one-step bounds\n"
+        + table(("identified from", "", "additive", "outside fit", "all", *SHORT, "outside domain"), rows)
+    )  # fmt: skip
+
+
+def width_text(cases: Sequence[Case]) -> str:
+    """Widths and discrepancies over the check."""
+    rows = [
+        [
+            c.name, c.model.fit["criterion"], c.model.fit["additive"], *(f"{1e4 * w:.2f}" for w in c.mean_width),
+            number(c.squared), *(number(1e4 * e) for e in c.largest),
+        ]
+        for c in cases
+    ]  # fmt: skip
+    x = cases[0].model.operating_point.normalise_x(cases[0].verdicts.transient.x)
+    step = np.sqrt(np.mean(np.diff(x, axis=0) ** 2, axis=0))
+    rows.append(["rms step of the check", "", "", *(f"{1e4 * s:.2f}" for s in step)] + [""] * 6)
+    header = ("identified from", "", "additive", *SHORT, "(4)", *(f"(5) {s}" for s in SHORT))
+    return (
+        "Mean width of the bounds over the check, and discrepancies (4) and (5) of the nominal model's free run; widths and\n"
+        "(5) in 1e-4 of the scale\n" + table(header, rows)
+    )
+
+
+def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
+    """Eigenvalues beside the published ones."""
+    point, plant = operating_point(), engine()
+    A = plant.linearise(point.x_s, point.u_s, point.X, point.U)[0]
+    sampled = (expm(A * DT) - np.eye(len(A))) / DT
+    every = {
+        "published": leibov2006().A,
+        "engine, linearised": A,
+        "the same over one step": sampled,
+        **{name: model.A for name, model in models.items()},
+    }
+    rows = []
+    for name, matrix in every.items():
+        values = sorted(np.linalg.eigvals(matrix).tolist(), key=lambda v: (-v.real, v.imag))
+        rows.append([name, *(f"{v.real:.2f}{v.imag:+.2f}j" if abs(v.imag) > 1e-9 else f"{v.real:.2f}" for v in values)])
+    return (
+        "Eigenvalues of A [1/s]; over one step: (exp(A Δt) - I) / Δt, what (3) sees of the same engine\n"
+        + table(("", "1", "2", "3", "4", "5"), rows)
+    )  # fmt: skip
+
+
+def matrix_text(model: UncertainLTI, name: str) -> str:
+    """A, B and their half-widths beside the published ones."""
+    parts = []
+    published = leibov2006()
+    for title, m in (("published", published), (name, model)):
+        nominal, half = np.hstack([m.A, m.B]), np.hstack([m.dA, m.dB])
+        rows = [
+            [SHORT[i], *(f"{a:.2f} ± {d:.2g}" for a, d in zip(nominal[i], half[i], strict=True))] for i in range(m.n)
+        ]
+        parts.append(f"A, B [1/s], {title}\n" + table(("", *SHORT, *SHORT_CONTROLS), rows))
+    return "\n\n".join(parts)
+
+
+def search_text(searches: Sequence[dict[str, Any]]) -> str:
+    """The paper's solver beside the exact one."""
+    rows = [
+        [
+            s["identified_from"], number(s["exact"]), number(s["direct_search"]),
+            f"{s['direct_search'] / s['exact'] - 1:+.1%}", f"{s['exact_seconds']:.2f}",
+            f"{s['direct_search_seconds']:.2f}", f"{s['direct_search_seconds'] / s['exact_seconds']:.0f}",
+        ]
+        for s in searches
+    ]  # fmt: skip
+    header = ("identified from", "(10), exact", "direct search", "above", "exact [s]", "direct [s]", "ratio of times")
+    return "The paper's solver, direct search by golden section, beside the exact one\n" + table(header, rows)
+
+
+def check_figure(case: Case, path: str | os.PathLike[str]) -> None:
+    """The paper's figure: each state between the bounds; beside it the same relative to the bounds' centre.
+
+    Left, in recorded units, as the paper draws it; the bounds are so close there that right shows what they leave.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    verdicts, model = case.verdicts, case.model
+    t, x = verdicts.transient.t, verdicts.transient.x
+    X = model.operating_point.X
+    figure = Figure(figsize=(12, 13), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes: Any = figure.subplots(model.n, 2, sharex=True)
+    for i, signal in enumerate(model.signals.states):
+        lower, upper = verdicts.lower[:, i], verdicts.upper[:, i]
+        bad = verdicts.flags[:, i] == 1.0
+        left, right = axes[i]
+        left.fill_between(t, lower, upper, color=ENVELOPE, alpha=0.6, label="one-step bounds")
+        left.plot(t, x[:, i], color=RECORDED, linewidth=1.0, label="recorded")
+        left.set_ylabel(f"{signal.name.replace('_', ' ')}\n[{signal.unit}]")
+        centre = 0.5 * (lower + upper)
+        scale = 1e3 / X[i]
+        right.fill_between(t, (lower - centre) * scale, (upper - centre) * scale, color=ENVELOPE, alpha=0.6, linewidth=0)
+        right.plot(t, (x[:, i] - centre) * scale, color=RECORDED, linewidth=1.0)
+        right.plot(t[bad], (x[bad, i] - centre[bad]) * scale, ".", color=VIOLATED, label=f"outside ({int(bad.sum())})")
+        right.set_ylabel("from the centre\n[1e-3 of the scale]")
+        right.set_title(f"{case.inside[i]:.0%} inside", loc="right", fontsize="small")
+        for axis in (left, right):
+            axis.grid(alpha=0.25)
+            axis.margins(x=0.01)
+        if bad.any():
+            left.plot(t[bad], x[bad, i], ".", color=VIOLATED)
+    axes[0][0].legend(loc="upper right", fontsize="small")
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]")
+    figure.suptitle(
+        f"Lever from 68 to 60 deg. Identified by (10) from pulses of {case.name}: {case.inside_all:.0%} of the "
+        f"transitions inside all bounds"
+    )
+    figure.savefig(path, dpi=110)
