@@ -184,6 +184,7 @@ def detection(parts: Sequence[Part], rule: Alarm, size: float = FAULT_SIZE) -> t
         if K == 0:
             continue
         clock = np.cumsum(part.dt)
+        anyway = part.level(rule.violations, rule.window) > rule.margin  # alarms that are not the fault's
         for start in sorted({int(s) for s in np.linspace(0, max(K - 1, 0), STARTS + 1)[:-1]}):
             for i in range(n):
                 for sign in (1.0, -1.0):
@@ -191,7 +192,7 @@ def detection(parts: Sequence[Part], rule: Alarm, size: float = FAULT_SIZE) -> t
                     # size mean widths are 2 size mean half-widths; half_k follows from the sample's own width
                     moved[start:, i] += sign * 2.0 * size * part.narrowness[start:, i]
                     level = part.level(rule.violations, rule.window, np.abs(moved).max(axis=1))
-                    seen = np.flatnonzero(level[start:] > rule.margin)
+                    seen = np.flatnonzero((level > rule.margin)[start:] & ~anyway[start:])
                     before = clock[start] - part.dt[start]
                     times[i].append(float(clock[start + seen[0]] - before) if len(seen) else math.inf)
     detected = np.array([np.mean(np.isfinite(t)) if t else np.nan for t in times])

@@ -69,9 +69,10 @@ def scenario_interval(support: int, transients: int, confidence: float) -> tuple
     """Interval for the probability that a fresh whole transient leaves the envelope of this very model.
 
     Garatti and Campi, "Risk and complexity in scenario optimization" (Mathematical Programming 191, 2022), theorem 2:
-    with N transients drawn independently from one distribution and a convex problem whose solution is unique and not
-    degenerate, of which `support` transients would change the solution if left out, the probability lies in
-    [1 - t_2, 1 - t_1] with at least this confidence, whatever the distribution. t_1 < t_2 are the roots of
+    with N transients drawn independently from one distribution and a convex problem whose objective does not depend on
+    them and whose solution is unique and not degenerate, of which `support` transients would change the solution if
+    left out, the probability lies in [1 - t_2, 1 - t_1] with at least this confidence, whatever the distribution.
+    t_1 < t_2 are the roots of
 
         C(N,k) t^(N-k) - β/2N Σ_{i=k}^{N-1} C(i,k) t^(i-k) - β/6N Σ_{i=N+1}^{4N} C(i,k) t^(i-k) = 0,
 

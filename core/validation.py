@@ -389,7 +389,8 @@ def scenario(validation: Validation) -> dict[str, Any]:
     discarded = _discarded(v.model)
     condition = (
         "holds if the recordings were drawn independently of one another from one and the same distribution, and the "
-        "machine will be run like that again; counted by whole recordings, margin 1"
+        "machine will be run like that again; counted by whole recordings, margin 1; a guide rather than a theorem, as "
+        "the theorem asks for an objective that does not depend on the recordings, and the sum of squared widths does"
     )
     if v.kind == "blocks":
         return {"words": "no scenario bound: blocks of one recording are not independent of one another"}
@@ -414,14 +415,14 @@ def scenario(validation: Validation) -> dict[str, Any]:
     if high > VOID:
         return {
             "support": support,
-            "words": f"not enough transients for a scenario bound: {support} of {G} are needed to hold the envelope "
-            f"in its place; record more of them",
+            "words": f"not enough transients for a scenario bound: {support} of {G} left the envelope of the others; "
+            f"record more of them",
         }
     return {
         "support": support,
         "interval": [low, high],
         "words": f"a fresh recording leaves the envelope somewhere with a probability between {low:.1%} and "
-        f"{high:.1%} (confidence {v.confidence:.0%}, {support} of {G} recordings hold the envelope in its place); "
+        f"{high:.1%} (confidence {v.confidence:.0%}, {support} of {G} recordings left the envelope of the others); "
         f"{condition}",
     }
 
@@ -465,6 +466,11 @@ def _notes(validation: Validation) -> list[str]:
     ]
     if G < 6:
         notes.append(f"{G} {what} say little: an interval from so few is wide, and rests on them being typical")
+    if count := len(v.model.fit.get("discarded", [])):
+        notes.append(
+            f"every left-out fit may discard {count} transitions as well; in what is left out nothing is discarded, so "
+            f"outliers there count as violations"
+        )
     if v.kind == "blocks":
         notes.append(
             "blocks show how the model does on the same run at another time; another run, load or day can differ by "
@@ -521,7 +527,10 @@ def _options(model: UncertainLTI) -> Mapping[str, Any]:
             raise FitError(f"the model does not say by which {key} it was fitted; fit it again")
     if facts.get("weights", "ones") != "ones":
         raise FitError("the model was fitted with weights, which its file does not hold; use validate() from Python")
-    return {"criterion": facts["criterion"], "additive": facts["additive"]}
+    options = {"criterion": facts["criterion"], "additive": facts["additive"]}
+    if facts.get("discarded"):
+        options["discard"] = len(facts["discarded"])
+    return options
 
 
 def _same(one: UncertainLTI, other: UncertainLTI) -> bool:

@@ -175,8 +175,10 @@ def test_state_of_a_slower_topic_is_named_with_its_period(period):
 def test_commands_that_ended_long_ago_are_named():
     u = np.random.default_rng(8).uniform(-1, 1, (1501, 2))
     u[900:, 0] = u[900, 0]
+    assert "ended" not in said(messages(run(u=u)))  # the other control of the topic goes on
+    u[900:] = u[900]
     (message,) = [m for m in messages(run(u=u)) if WORDS["ended"] in m]
-    assert "'valve'" in message
+    assert "'valve' and 'pump' change all the time" in message and "the last 600 samples" in message
     assert "ended" not in said(messages(run(u=np.random.default_rng(8).uniform(-1, 1, (1501, 2)))))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.identification.excitation import successive, unexplained
+from uncertain_lti.identification.excitation import quoted, successive, unexplained
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.signals import Signal
 from uncertain_lti.transient import Transient
@@ -107,7 +107,7 @@ def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Seque
     """Controls that were too old for many samples, or that ended long before the recording did."""
     messages = []
     samples = sum(len(t) for t in transients)
-    for j, signal in enumerate(signals[n:], start=n):
+    for signal in signals[n:]:
         count = sum(t.counters[f"stale {signal.name}"] for t in transients)
         if samples and count > STALE * samples:
             messages.append(
@@ -115,19 +115,20 @@ def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Seque
                 f"samples, which are not used: record it for as long as the states, or raise max_hold if the machine "
                 f"holds the last command"
             )
-        if signal.max_hold is not None:
-            continue
+    for topic in dict.fromkeys(s.topic for s in signals[n:] if s.max_hold is None):
+        columns = [j for j, s in enumerate(signals) if j >= n and s.topic == topic]
         for source in range(int(problem.source[-1]) + 1):
-            u = problem.z[problem.source == source, j]
-            changes = np.flatnonzero(np.diff(u)) + 1
+            u = problem.z[problem.source == source][:, columns]
+            changes = np.flatnonzero(np.diff(u, axis=0).any(axis=1)) + 1
             if len(changes) < 20:
                 continue
             tail = len(u) - int(changes[-1])
             if tail > 0.2 * len(u) and tail > 5 * float(np.diff(changes).max()):
                 name = transients[source].name if source < len(transients) else f"recording {source + 1}"
                 messages.append(
-                    f"control '{signal.name}' changes all the time and then not at all for the last {tail} samples of "
-                    f"{name}: commands that have ended are no constant input; give it a max_hold, or cut the recording"
+                    f"{quoted([signals[j].name for j in columns])} {'change' if len(columns) > 1 else 'changes'} all "
+                    f"the time and then not at all for the last {tail} samples of {name}: commands that have ended are "
+                    f"no constant input; give a max_hold, or cut the recording"
                 )
                 break
     return messages
