@@ -98,6 +98,12 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
         metavar="K",
         help="leave at most K transitions outside (or a share such as 0.001), chosen by effect and listed",
     )
+    fit.add_argument(
+        "--count",
+        choices=("sample", "transient"),
+        default="sample",
+        help="let every sample weigh the same (default), or every recording however long it is",
+    )
     fit.add_argument("--cache", metavar="FOLDER", help="more recordings than memory: keep the arrays in this folder")
     fit.add_argument("--scheduler", metavar="ADDRESS", help="fit on the workers of this Dask scheduler")
     fit.add_argument("--workers", type=int, metavar="N", help="fit on a Dask cluster of N workers on this machine")
@@ -230,7 +236,7 @@ def _fit(options: argparse.Namespace) -> int:
             _say(transient.notes)
             print(recording_text(transient))
     began = time.perf_counter()
-    model = fit(transients, options.criterion, additive=options.additive, discard=options.discard)
+    model = fit(transients, options.criterion, additive=options.additive, discard=options.discard, count=options.count)
     sources = [{"file": name, "sha256": _sha256(name)} for t in transients for name in t.sources]
     model = model.with_(fit={**model.fit, "sources": sources})
     left_out = leave_out_cheaply(transients, model, time.perf_counter() - began)
@@ -256,6 +262,8 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
 
     if options.discard:
         raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
+    if options.count != "sample":
+        raise FitError("--count transient needs all recordings in memory; leave out --cache, --scheduler and --workers")
     if options.cache and (options.scheduler or options.workers):
         raise FitError("--cache keeps the arrays on disk and --scheduler or --workers on a cluster; choose one")
     with ExitStack() as stack:

@@ -400,6 +400,23 @@ def test_moments_are_plain_sums():
     assert second.root_weight == pytest.approx(np.sqrt(weights[::7, 1]))
 
 
+def test_transients_weigh_as_the_user_says():
+    """Counting a transient twice, or weighing it twice, is the same; short ones may count as much as long ones."""
+    plant = small_plant(65)
+    one, two = drawn(plant, 100, 1, noise=1e-3), drawn(plant, 300, 2, noise=1e-3)
+    twice = fit([one, two, Transient(two.t_ns, two.x, two.u)], additive="noise")
+    weighed = fit([one, two], additive="noise", transient_weights=[1.0, 2.0])
+    assert weighed.fit["objective"] == pytest.approx(twice.fit["objective"], rel=1e-8)
+    assert weighed.dA == pytest.approx(twice.dA, rel=1e-4, abs=1e-6)
+    as_said = fit([one, two], additive="noise", weights=[np.full((100, 2), 2.0), np.full((300, 2), 2 / 3)])
+    fair = fit([one, two], additive="noise", count="transient")
+    assert fair.fit["objective"] == pytest.approx(as_said.fit["objective"], rel=1e-8)
+    assert count_outside(fair, [one, two]) == 0
+    for options in (dict(count="run"), dict(transient_weights=[1.0]), dict(transient_weights=[1.0, -1.0])):
+        with pytest.raises(FitError, match=r"count is|2 positive numbers"):
+            fit([one, two], **options)
+
+
 # --- structure ---
 
 

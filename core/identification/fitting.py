@@ -35,6 +35,8 @@ def fit(
     additive: Additive | None = None,
     operating_point: OperatingPoint | None = None,
     *,
+    transient_weights: Sequence[float] | None = None,
+    count: Literal["sample", "transient"] = "sample",
     structure: Structure | None = None,
     discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
@@ -61,6 +63,10 @@ def fit(
         Default: what the signals file says, else none.
     operating_point : OperatingPoint, optional
         Steady state and scales; default: those of the transients' signals, or values used as they are.
+    transient_weights : sequence of float, optional
+        One factor per transient on the weights of all its samples.
+    count : {"sample", "transient"}
+        In (10) and (11), every sample weighs the same, or every transient does, however long it is.
     structure : Structure, optional
         Elements that are known, or bounded. Default: the rules of the signals file, if it has any.
     discard : int or float
@@ -115,7 +121,7 @@ def fit(
             raise FitError("method cvxpy takes no structure; use the working-set method")
     if additive is None:
         additive = signals.additive or "none"
-    problem = assemble(transients, operating_point, weights, additive)
+    problem = assemble(transients, operating_point, weights, additive, transient_weights=transient_weights, count=count)
     check_solvable(problem, transients, [s.name for s in signals.states])
 
     def name(error: InfeasibleError) -> FitError:

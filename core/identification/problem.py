@@ -231,6 +231,8 @@ def assemble(
     weights: ArrayLike | Sequence[ArrayLike] | None,
     additive: Additive,
     empty: bool = False,
+    transient_weights: Sequence[float] | None = None,
+    count: Literal["sample", "transient"] = "sample",
 ) -> Problem:
     """Put the usable transitions of all recordings into one problem.
 
@@ -243,6 +245,10 @@ def assemble(
     additive : {"none", "disturbance", "noise", "both"}
     empty : bool
         No transition at all is no error.
+    transient_weights : sequence of float, optional
+        One factor per transient on all its weights.
+    count : {"sample", "transient"}
+        Every transition weighs the same, or every transient does, however long it is.
 
     Raises
     ------
@@ -271,7 +277,29 @@ def assemble(
         _normalise(s.u, point.u_s, point.U, z[n:, part])
         _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
     columns = Columns.of(additive, is_constant(dt))
-    return Problem(z, x_next, dt, source, k, _weights(weights, transients, k, source, n), columns)
+    chosen = _weights(weights, transients, k, source, n)
+    factors = _factors(transient_weights, count, source, len(transients))
+    if factors is not None:
+        factors = factors[source]
+        chosen = factors[:, None] * chosen if chosen.ndim < 3 else factors[:, None, None] * chosen
+    return Problem(z, x_next, dt, source, k, chosen, columns)
+
+
+def _factors(
+    transient_weights: Sequence[float] | None, count: str, source: NDArray[np.intp], transients: int
+) -> Array | None:
+    """Factor on the weights of each transient; None where all are 1."""
+    if count not in ("sample", "transient"):
+        raise FitError(f"count is {count!r}; it must be sample or transient")
+    factors = np.ones(transients)
+    if transient_weights is not None:
+        factors = np.asarray(transient_weights, dtype=np.float64)
+        if factors.shape != (transients,) or not (np.isfinite(factors).all() and (factors > 0).all()):
+            raise FitError(f"transient_weights must be {transients} positive numbers, one per transient")
+    if count == "transient":
+        lengths = np.bincount(source, minlength=transients)
+        factors = factors * len(source) / (np.maximum(lengths, 1) * np.count_nonzero(lengths))
+    return None if (factors == 1.0).all() else factors
 
 
 def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> None:
