@@ -1,0 +1,319 @@
+"""Identification against its peers, side by side in one run: time as ratios, the same optimum, nothing outside.
+
+python benchmarks/fit.py million      # n = 5, m = 4, 1e6 transitions, against numpy.linalg.lstsq
+python benchmarks/fit.py joint        # 1e5 transitions, against the joint problem in cvxpy with Clarabel
+python benchmarks/fit.py pyipm        # n = 10, m = 3, 1e5 transitions, against PyIPM (pip install PyIPM)
+python benchmarks/fit.py large        # n = 50, m = 10, 1e5 transitions
+python benchmarks/fit.py coupled      # off-diagonal weights, 1e5 transitions
+python benchmarks/fit.py growth       # 1e4 to 1e7 transitions; writes a figure
+python benchmarks/fit.py disk         # 2e7 transitions from disk, with peak memory
+python benchmarks/fit.py all --quick  # everything, a tenth of the size
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from uncertain_lti import OperatingPoint
+from uncertain_lti.identification import formulation
+from uncertain_lti.identification.cache import CacheWriter
+from uncertain_lti.identification.fitting import fit_fleet
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.problem import Columns, Problem, assemble
+from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.transient import Transient
+
+DT = 0.025
+
+
+def drawn(N, seed=0, noise=0.0, model=None):
+    """N independent transitions of matrices drawn anew inside their intervals at each step: (x, u, x_next)."""
+    rng = np.random.default_rng(seed)
+    model = model or leibov2006()
+    x, u = rng.uniform(-1, 1, (N, model.n)), rng.uniform(-1, 1, (N, model.m))
+    z = np.hstack([x, u])
+    nominal, spread = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
+    x_next = x.copy()
+    for i in range(model.n):
+        for j in range(z.shape[1]):
+            x_next[:, i] += DT * (nominal[i, j] + spread[i, j] * rng.uniform(-1, 1, N)) * z[:, j]
+    if noise:
+        x = x + noise * rng.standard_normal(x.shape)
+        x_next += noise * rng.standard_normal(x.shape)
+    return x, u, x_next
+
+
+def excited(N, n, m, seed=0):
+    """Random excitation of a random interval plant."""
+    rng = np.random.default_rng(seed)
+    A = -np.diag(rng.uniform(1, 10, n)) + rng.uniform(-1, 1, (n, n))
+    from uncertain_lti import UncertainLTI
+
+    plant = UncertainLTI(A, rng.uniform(-3, 3, (n, m)), rng.uniform(0, 1, (n, n)), rng.uniform(0, 1, (n, m)))
+    return drawn(N, seed + 1, model=plant)
+
+
+def problem_of(x, u, x_next, additive="none", weights=None):
+    """Arrays as an identification problem, as `fit` assembles them."""
+    n, N = x.shape[1], len(x)
+    columns = Columns.of(additive, True)
+    z = np.hstack([x, u]).T.copy()
+    origin = np.zeros(N, dtype=np.intp)
+    return Problem(
+        z, x_next.T.copy(), np.full(N, DT), origin, np.arange(N), np.ones(n) if weights is None else weights, columns
+    )
+
+
+def names(n, m):
+    """Signals without topics."""
+    return SignalMap(
+        tuple(Signal(f"x{i}", "", f"x{i}") for i in range(n)), tuple(Signal(f"u{j}", "", f"u{j}") for j in range(m))
+    )
+
+
+def best(function, runs=3):
+    """Least wall time of some runs, s, and the last result."""
+    times = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        result = function()
+        times.append(time.perf_counter() - began)
+    return min(times), result
+
+
+def outside(problem, model):
+    """Samples outside by `UncertainLTI.bounds`, independent of the fit."""
+    lower, upper = model.bounds(problem.z[:, : problem.n], problem.z[:, problem.n :], problem.dt)
+    return int((~((lower <= problem.x_next) & (problem.x_next <= upper))).any(axis=1).sum())
+
+
+def solve(problem, criterion):
+    """Fit, repair and tie-breaks included; the messages in words are not."""
+    signals = names(problem.n, problem.p - problem.n)
+    return fit_fleet(Fleet([problem]), signals, criterion, dt_median=DT)
+
+
+def million(scale):
+    """Against least squares on the same regressors, which only finds a centre."""
+    N = int(1e6 * scale)
+    rows = []
+    for noise in (0.0, 1e-4):
+        x, u, x_next = drawn(N, noise=noise)
+        z, rate = np.hstack([x, u]), (x_next - x) / DT
+        peer, _ = best(lambda z=z, rate=rate: np.linalg.lstsq(z, rate, rcond=None), 5)
+        for additive in ("none",) if not noise else ("noise", "both"):
+            problem = problem_of(x, u, x_next, additive)
+            for criterion in ("qp", "lp"):
+                ours, model = best(lambda p=problem, c=criterion: solve(p, c), 4)
+                rows.append(
+                    [f"{noise:g}", additive, criterion, f"{peer:.3f} s", f"{ours:.3f} s", f"{ours / peer:.2f}"]
+                    + [str(model.fit["solver"]["passes"]), f"{model.fit['gap']:.0e}", str(outside(problem, model))]
+                )
+    header = ["noise", "additive", "criterion", "lstsq", "ours", "ratio", "passes", "gap", "outside"]
+    table(f"{N} transitions of the published matrices, n = 5, m = 4, all rows", header, rows)
+    # what a user of `fit` waits for besides: recordings into arrays, and the messages in words
+    x, u, x_next = drawn(N)
+    t = np.repeat(np.arange(N, dtype=np.int64) * 10**9, 2) + np.tile([0, round(DT * 1e9)], N)
+    pairs = np.empty((2 * N, 5))
+    pairs[::2], pairs[1::2] = x, x_next
+    transient = Transient(t, pairs, np.repeat(u, 2, axis=0), max_gap=0.1)
+    point = OperatingPoint.identity(5, 4)
+    took, _ = best(lambda: assemble([transient], point, None, "none"))
+    print(f"assembling the arrays from a transient of {len(transient)} samples: {took:.3f} s")
+
+
+def joint(scale):
+    """Against the problem as written, all rows, in cvxpy with Clarabel."""
+    import cvxpy as cp
+
+    N = int(1e5 * scale)
+    problem = problem_of(*drawn(N))
+    rows = []
+    for criterion in ("qp", "lp"):
+        ours, model = best(lambda c=criterion: solve(problem, c))
+        peer, (_, _, objective) = best(lambda c=criterion: formulation.solve(problem, c, cp.CLARABEL), 1)
+        difference = np.max(np.abs(np.asarray(model.fit["objective"]) / objective - 1))
+        rows.append(
+            [
+                criterion,
+                f"{peer:.1f} s",
+                f"{ours:.3f} s",
+                f"{peer / ours:.0f}",
+                f"{difference:.0e}",
+                str(outside(problem, model)),
+            ]
+        )
+    table(
+        f"{N} transitions, n = 5, m = 4, against cvxpy with Clarabel",
+        ["criterion", "cvxpy", "ours", "times faster", "difference of objectives", "outside"],
+        rows,
+    )
+
+
+def pyipm(scale):
+    """Against PyIPM on the same rows; its linear programme minimises the mean width."""
+    try:
+        from PyIPM import IPM
+    except ImportError:
+        print("PyIPM is not installed here (pip install PyIPM); this comparison is left out")
+        return
+    N = int(1e5 * scale)
+    x, u, x_next = excited(N, 10, 3)
+    problem = problem_of(x, u, x_next)
+    z, rate = np.hstack([x, u]), (x_next - x) / DT
+
+    def peer():
+        for i in range(10):
+            IPM(polynomial_degree=1).fit(z, rate[:, i])
+
+    slow, _ = best(peer, 1)
+    rows = []
+    for criterion in ("qp", "lp"):
+        ours, model = best(lambda c=criterion: solve(problem, c))
+        rows.append([criterion, f"{slow:.1f} s", f"{ours:.3f} s", f"{slow / ours:.0f}", str(outside(problem, model))])
+    table(f"{N} transitions, n = 10, m = 3, ten rows", ["criterion", "PyIPM", "ours", "times faster", "outside"], rows)
+
+
+def large(scale):
+    """Many states."""
+    N = int(1e5 * scale)
+    problem = problem_of(*excited(N, 50, 10))
+    rows = []
+    for criterion in ("qp", "lp"):
+        ours, model = best(lambda c=criterion: solve(problem, c), 1)
+        rows.append([criterion, f"{ours:.1f} s", f"{model.fit['gap']:.0e}", str(outside(problem, model))])
+    table(f"{N} transitions, n = 50, m = 10", ["criterion", "ours", "gap", "outside"], rows)
+
+
+def coupled(scale):
+    """Full weights per sample couple the rows of (10)."""
+    N = int(1e5 * scale)
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((N, 5, 5))
+    weights = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(5)
+    problem = problem_of(*drawn(N), weights=weights)
+    ours, model = best(lambda: solve(problem, "qp"), 1)
+    rows = [[f"{ours:.2f} s", f"{model.fit['gap']:.0e}", str(outside(problem, model))]]
+    table(f"{N} transitions, n = 5, m = 4, full W(t_k)", ["ours", "gap", "outside"], rows)
+
+
+def growth(scale):
+    """Time against the number of transitions."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    sizes = [int(s * scale) for s in (1e4, 3e4, 1e5, 3e5, 1e6, 3e6, 1e7)]
+    times = {"qp": [], "lp": [], "lstsq": []}
+    rows = []
+    for N in sizes:
+        x, u, x_next = drawn(N)
+        problem = problem_of(x, u, x_next)
+        z, rate = np.hstack([x, u]), (x_next - x) / DT
+        times["lstsq"].append(best(lambda z=z, rate=rate: np.linalg.lstsq(z, rate, rcond=None), 3)[0])
+        for criterion in ("qp", "lp"):
+            times[criterion].append(best(lambda c=criterion, p=problem: solve(p, c), 2)[0])
+        rows.append([str(N), *(f"{times[name][-1]:.3f} s" for name in ("lstsq", "qp", "lp"))])
+    table("growth with the number of transitions, n = 5, m = 4", ["transitions", "lstsq", "qp", "lp"], rows)
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    for (name, values), colour in zip(times.items(), ("#0072B2", "#D55E00", "#000000"), strict=True):
+        axis.loglog(sizes, values, marker="o", color=colour, label={"qp": "(10)", "lp": "(11)"}.get(name, name))
+    axis.set_xlabel("transitions")
+    axis.set_ylabel("time [s]")
+    axis.grid(alpha=0.3, which="both")
+    axis.legend()
+    path = Path("benchmark-output")
+    path.mkdir(exist_ok=True)
+    figure.savefig(path / "growth.png", dpi=120)
+    print(f"figure: {path / 'growth.png'}")
+
+
+def disk(scale):
+    """More than memory: arrays on disk, passes block by block, in a process whose peak memory is measured."""
+    N, parts = int(2e7 * scale), 20
+    with tempfile.TemporaryDirectory() as folder:
+        for stage in ("write", "fit"):
+            code = (
+                f"import sys; sys.path.insert(0, {os.path.dirname(os.path.abspath(__file__))!r}); "
+                f"import fit; fit.disk_{stage}({folder!r}, {N}, {parts})"
+            )
+            subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def disk_write(folder, N, parts):
+    """Fill the cache, a twentieth at a time."""
+    began = time.perf_counter()
+    with CacheWriter(Path(folder) / "cache") as writer:
+        for part in range(parts):
+            writer.add(problem_of(*drawn(N // parts, seed=part)))
+    print(f"wrote {N} transitions in {time.perf_counter() - began:.1f} s, drawing them included")
+
+
+def disk_fit(folder, N, parts):
+    """Fit from the cache; one part in memory is fitted beside it for comparison."""
+    from uncertain_lti.identification.cache import DiskPartition
+
+    partition = DiskPartition(Path(folder) / "cache", N // parts * parts, 5, 9, np.ones(5), Columns.of("none", True))
+    rows = []
+    for criterion in ("qp", "lp"):
+        began = time.perf_counter()
+        model = fit_fleet(Fleet([partition]), names(5, 4), criterion, dt_median=DT)
+        took = time.perf_counter() - began
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        count = int(Fleet([partition]).count_outside(model).sum())
+        rows.append(
+            [
+                criterion,
+                f"{took:.1f} s",
+                str(model.fit["solver"]["passes"]),
+                f"{peak:.0f} MiB",
+                f"{model.fit['gap']:.0e}",
+                str(count),
+            ]
+        )
+    table(
+        f"{partition.N} transitions from disk, n = 5, m = 4",
+        ["criterion", "ours", "passes", "peak memory", "gap", "outside"],
+        rows,
+    )
+
+
+def table(title, header, rows):
+    """Print a Markdown table."""
+    print(f"\n**{title}**\n")
+    for line in (header, ["---"] * len(header), *rows):
+        print("| " + " | ".join(line) + " |")
+    print(flush=True)
+
+
+CLAIMS = {f.__name__: f for f in (million, joint, pyipm, large, coupled, growth, disk)}
+
+
+def main():
+    """Run the claims that are named."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("claims", nargs="+", choices=[*CLAIMS, "all"])
+    parser.add_argument("--quick", action="store_true", help="a tenth of the size")
+    options = parser.parse_args()
+    print(f"{os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}")
+    warm = problem_of(*drawn(2000))
+    for criterion in ("qp", "lp"):
+        solve(warm, criterion)  # the solvers are imported on first use
+    for claim in CLAIMS if "all" in options.claims else options.claims:
+        CLAIMS[claim](0.1 if options.quick else 1.0)
+
+
+if __name__ == "__main__":
+    main()
