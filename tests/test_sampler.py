@@ -62,6 +62,8 @@ class Reference:
         self.n = len(signals.states)
         self.counters: Counter[str] = Counter()
         self.dropped: dict[int, tuple[Status, int]] = {}
+        self.by_topic = {t: [i for i, m in enumerate(messages) if m.topic == t] for t in signals.topics}
+        self.jumps = {t: self._jumps(t) for t in signals.topics}
         self.others = [t for t in signals.topics if t != signals.clock]
         self.samples = self._samples()
         self.values = {t: self._values(t) for t in signals.topics}
@@ -76,13 +78,10 @@ class Reference:
         usable = self.signals.time[self.sent[index].topic] == "header" and stamp is not None and stamp > 0
         return stamp if usable else None
 
-    def of(self, topic: str) -> list[int]:
-        return [i for i, m in enumerate(self.sent) if m.topic == topic]
-
     def _samples(self) -> list[Sample]:
         samples: list[Sample] = []
         resets = 0
-        for index in self.of(self.signals.clock):
+        for index in self.by_topic[self.signals.clock]:
             by_header = self.signals.time[self.signals.clock] == "header"
             instant = self.stamp(index) if by_header else self.sent[index].arrival
             if instant is None:
@@ -116,11 +115,11 @@ class Reference:
         self.dropped[index] = (status, instant)
         self.counters[status.value] += 1
 
-    def steps_back(self, topic: str) -> list[int]:
+    def _jumps(self, topic: str) -> list[int]:
         """Messages with which a topic's own time steps back by more than max_gap."""
         found = []
         for stamped in (True, False):
-            mine = [i for i in self.of(topic) if (self.stamp(i) is not None) == stamped]
+            mine = [i for i in self.by_topic[topic] if (self.stamp(i) is not None) == stamped]
             instants = [self.stamp(i) if stamped else self.sent[i].arrival for i in mine]
             found += [
                 i for i, now, last in zip(mine[1:], instants[1:], instants, strict=False) if last - now > self.max_gap
@@ -131,8 +130,8 @@ class Reference:
         """Values of each message with angles unwrapped from where the stream starts anew."""
         where = self.signals.on(topic)
         clock = topic == self.signals.clock
-        starts = {s.index for s in self.samples if s.status.opens_segment} if clock else {*self.steps_back(topic)}
-        taken = [s.index for s in self.samples] if clock else self.of(topic)
+        starts = {s.index for s in self.samples if s.status.opens_segment} if clock else {*self.jumps[topic]}
+        taken = [s.index for s in self.samples] if clock else self.by_topic[topic]
         values = {i: list(self.sent[i].values) for i in taken}
         for column, position in enumerate(where):
             signal = self.signals.signals[position]
@@ -155,7 +154,7 @@ class Reference:
 
     def jump(self, sample: Sample, topic: str) -> int:
         """The last message with which the topic stepped back before the sample closed; -1 without any."""
-        return max([i for i in self.steps_back(topic) if i < sample.closed_by], default=-1)
+        return max([i for i in self.jumps[topic] if i < sample.closed_by], default=-1)
 
     def passed_over(self, topic: str, before: Sample) -> set[int]:
         gone: set[int] = set()
@@ -167,7 +166,7 @@ class Reference:
             )
             if closing.status is Status.RESET or self.jump(sample, topic) > reset:
                 continue
-            arrived = [i for i in self.of(topic) if self.jump(sample, topic) <= i < sample.closed_by]
+            arrived = [i for i in self.by_topic[topic] if self.jump(sample, topic) <= i < sample.closed_by]
             gone |= {i for i in arrived if self.age(sample, i) >= 0} - {sample.chosen[topic]}
         return gone
 
@@ -178,7 +177,7 @@ class Reference:
             if topic == self.signals.clock:
                 chosen, age = sample.index, 0
             else:
-                candidates = [i for i in self.of(topic) if self.jump(sample, topic) <= i < sample.closed_by]
+                candidates = [i for i in self.by_topic[topic] if self.jump(sample, topic) <= i < sample.closed_by]
                 if self.forgets:
                     gone = self.passed_over(topic, sample)
                     candidates = [i for i in candidates if i not in gone]
@@ -214,8 +213,8 @@ class Reference:
     def _late(self) -> None:
         """Messages that came after a sample closed, and would have been chosen for it."""
         for topic in self.others:
-            jumps = self.steps_back(topic)
-            for index in self.of(topic):
+            jumps = self.jumps[topic]
+            for index in self.by_topic[topic]:
                 passed = sum(s.status is Status.RESET and s.index < index for s in self.samples)
                 for sample in self.samples:
                     if sample.closed_by is None or sample.closed_by > index or sample.reset_by != passed:
@@ -305,7 +304,7 @@ def maps(draw: st.DrawFn) -> SignalMap:
         tuple(states),
         tuple(controls),
         clock="/c",
-        max_gap=draw(st.sampled_from([0.02, 0.05, 0.2])),
+        max_gap=draw(st.sampled_from([0.02, 0.05])),
         min_step=draw(st.sampled_from([0.0, 0.0, 0.02])),
         max_skew=draw(st.sampled_from([None, None, 0.02, 1.0])),
         time={t: draw(st.sampled_from(["header", "header", "log"])) for t in topics},
@@ -332,7 +331,7 @@ def streams(draw: st.DrawFn, signals: SignalMap, tame: bool = False) -> list[Sen
         topic = draw(st.sampled_from([*signals.topics, "/c"]))
         stray = draw(st.integers(0, 9)) < rough
         if not tame and draw(st.integers(0, 14)) == 0:  # time jumps, for all topics or for one
-            jump = draw(st.sampled_from([-30, -8, -4, 40]))
+            jump = draw(st.sampled_from([-30, -6, -5, -3, -2, 40]))
             for each in draw(st.sampled_from([list(signals.topics), [topic]])):
                 shift[each] += jump
             if now >= 130 and draw(st.booleans()):
@@ -361,17 +360,18 @@ def hold_against(reference: Reference, signals: SignalMap, messages: list[Sent])
     assert +sampler.counters == +reference.counters
 
 
-@settings(max_examples=500)
+@settings(max_examples=300)
 @given(cases(tame=True))
 def test_tame_streams_follow_the_letter_of_the_rules(case: tuple[SignalMap, list[Sent]]) -> None:
     """Several topics, late and out of order, equal stamps, gaps, NaN, stale, delayed: nothing is left to memory."""
     signals, messages = case
-    resets = any(s.status is Status.RESET for s in Reference(signals, messages, forgets=False).samples)
-    jumps = any(Reference(signals, messages, forgets=False).steps_back(t) for t in signals.topics)
+    letter = Reference(signals, messages, forgets=False)
+    resets = any(s.status is Status.RESET for s in letter.samples)
+    jumps = any(letter.jumps.values())
     hold_against(Reference(signals, messages, forgets=resets or jumps), signals, messages)
 
 
-@settings(max_examples=700)
+@settings(max_examples=600)
 @given(cases())
 def test_wild_streams_follow_the_rules_too(case: tuple[SignalMap, list[Sent]]) -> None:
     """With zero stamps, jumps of one topic or of all, a node clock that jumps back, in any combination."""
@@ -386,6 +386,7 @@ def test_wild_streams_follow_the_rules_too(case: tuple[SignalMap, list[Sent]]) -
 def loops(draw: st.DrawFn) -> tuple[SignalMap, list[Sent]]:
     """Two passes of one bag that overlap where they meet; the second arrives 100 ticks after the first."""
     signals = draw(maps())
+    signals = replace(signals, controls=(*signals.controls, Signal("always", "/w", "data")))
     signals = replace(signals, time=dict.fromkeys(signals.topics, "header"))
     merged = sorted(
         (tick * TICK, topic)
@@ -413,6 +414,20 @@ def test_each_pass_of_a_looped_bag_is_as_on_its_own(case: tuple[SignalMap, list[
     wanted = [plain(step) for step in only(alone) if not step.status.dropped]
     assert steps[0] == (Status.RESET, *wanted[0][1:])
     assert steps[1:] == wanted[1:]
+
+
+@settings(max_examples=80)
+@given(loops())
+def test_arrival_times_that_loop_do_as_stamps_that_loop(case: tuple[SignalMap, list[Sent]]) -> None:
+    """A bag played anew with /clock to topics without stamps: the node's clock steps back as stamps would."""
+    signals, messages = case
+    by_stamp, stamped = run(signals, [m._replace(arrival=m.stamp) for m in messages])
+    by_arrival, unstamped = run(
+        replace(signals, time=dict.fromkeys(signals.topics, "log")),
+        [m._replace(arrival=m.stamp, stamp=None) for m in messages],
+    )
+    assert [plain(s) for s in only(by_arrival)] == [plain(s) for s in only(by_stamp)]
+    assert unstamped.counters == stamped.counters
 
 
 # --- the rules one by one, as DESIGN.md states them ----------------------------------------------------------
