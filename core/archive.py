@@ -14,6 +14,7 @@ from uncertain_lti.bag import Bag, group_recordings
 from uncertain_lti.errors import BagError, FitError, SignalError
 from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.identification.cluster import DaskFleet
+from uncertain_lti.identification.diagnosis import too_few
 from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, is_constant
@@ -210,9 +211,9 @@ def _constant_dt(recording: Recording, signals: SignalMap) -> bool:
 
 def _check(fleet: Fleet, signals: SignalMap) -> None:
     """What `diagnosis.check_solvable` refuses."""
-    unknowns = fleet.p + fleet.columns.drift
+    unknowns = fleet.columns.unknowns(fleet.p)
     if fleet.N < unknowns:
-        raise FitError(f"{fleet.N} usable transitions for {unknowns} unknown nominal elements per row; record more")
+        raise FitError(too_few(fleet.N, unknowns))
     if fleet.columns.disturbance or fleet.columns.noise:
         return
     count, state, step = fleet.moving_from_rest()

@@ -286,9 +286,11 @@ def test_domain_and_steps_are_those_of_the_data():
 
 
 def test_too_few_transitions():
-    t = drawn(small_plant(1, 3, 2), 4, 1)
-    with pytest.raises(FitError, match="4 usable transitions for 5 unknown"):
+    t = drawn(small_plant(1, 3, 2), 9, 1)
+    with pytest.raises(FitError, match="9 usable transitions for 10 unknowns per row"):
         fit(t)
+    with pytest.raises(FitError, match="9 usable transitions for 12 unknowns per row"):
+        fit(t, additive="disturbance")
 
 
 def test_rest_with_a_moving_successor_names_sample_and_remedy():

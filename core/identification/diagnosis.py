@@ -28,6 +28,14 @@ WORTH = 1.3
 """Gain in mean width from which on the additive term is suggested."""
 
 
+def too_few(transitions: int, unknowns: int) -> str:
+    """The sentence for fewer transitions than unknowns."""
+    return (
+        f"{transitions} usable transitions for {unknowns} unknowns per row (nominal elements and half-widths); record "
+        f"at least {unknowns}, better a hundred times as many, or use fewer signals"
+    )
+
+
 def check_solvable(problem: Problem, transients: Sequence[Transient], names: Sequence[str]) -> None:
     """Refuse data to which no envelope can be fitted.
 
@@ -38,12 +46,9 @@ def check_solvable(problem: Problem, transients: Sequence[Transient], names: Seq
         additive term: the width there is 0 whatever the matrices; names the sample and the remedy.
     """
     columns = problem.columns
-    unknowns = problem.p + columns.drift
+    unknowns = columns.unknowns(problem.p)
     if problem.N < unknowns:
-        raise FitError(
-            f"{problem.N} usable transitions for {unknowns} unknown nominal elements per row; "
-            f"record at least {unknowns}, better a hundred times as many, or use fewer signals"
-        )
+        raise FitError(too_few(problem.N, unknowns))
     if columns.disturbance or columns.noise:
         return
     rest: NDArray[np.bool_] = np.asarray(~problem.z.any(axis=1))

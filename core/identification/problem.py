@@ -28,6 +28,10 @@ class Columns:
     disturbance: bool  # dc
     noise: bool  # v
 
+    def unknowns(self, p: int) -> int:
+        """Number of unknowns per row with p states and controls."""
+        return 2 * p + self.drift + self.disturbance + self.noise
+
     @classmethod
     def of(cls, additive: Additive, constant_dt: bool) -> Columns:
         """For an `additive` option.
