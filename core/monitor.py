@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,11 +78,13 @@ class EnvelopeMonitor:
     model : UncertainLTI
     violations, window, margin : optional
         In place of those in the model.
+    masked : sequence of str
+        States that are judged like the others, and whose violations never count for the alarm.
 
     Raises
     ------
     ModelError
-        violations, window or margin are out of range.
+        violations, window or margin are out of range, or masked names no state of the model, or all.
     """
 
     def __init__(
@@ -90,6 +93,7 @@ class EnvelopeMonitor:
         violations: int | None = None,
         window: int | None = None,
         margin: float | None = None,
+        masked: Sequence[str] = (),
     ) -> None:
         said = model.alarm
         self.model = model
@@ -98,12 +102,22 @@ class EnvelopeMonitor:
             said.window if window is None else window,
             said.margin if margin is None else margin,
         )
+        names = model.state_names
+        for name in masked:
+            if name not in names:
+                raise ModelError(f"masked state '{name}' is not in the model; its states are {', '.join(names)}")
+        self.masked = tuple(name for name in names if name in masked)
+        if len(self.masked) == len(names):
+            raise ModelError("every state of the model is masked; leave at least one that can raise the alarm")
+        self._counted = np.array([name not in masked for name in names])
         self.alarm = False
-        self._recent: deque[bool] = deque(maxlen=self.rule.window)
+        self._recent: deque[bool] = deque()
+        self._violations = 0  # among the recent verdicts
 
     def reset(self) -> None:
         """Forget the recent verdicts and the alarm."""
         self._recent.clear()
+        self._violations = 0
         self.alarm = False
 
     def predict(self, x: Array, u: Array, dt: float) -> tuple[Array, Array]:
@@ -112,9 +126,12 @@ class EnvelopeMonitor:
         lower, upper = self.model.bounds(point.normalise_x(x), point.normalise_u(u), dt, margin=self.rule.margin)
         return point.recorded_x(lower), point.recorded_x(upper)
 
-    def judge(self, step: Step) -> Verdict:
-        """Verdict on one step of the sampler."""
-        if step.status is Status.RESET:
+    def judge(self, step: Step, armed: bool = True) -> Verdict:
+        """Verdict on one step of the sampler.
+
+        armed: whether it may count for the alarm; otherwise there is none, and the window starts anew.
+        """
+        if step.status is Status.RESET or not armed:
             self.reset()
         n = self.model.n
         flags = np.full(n, np.nan)
@@ -125,8 +142,8 @@ class EnvelopeMonitor:
             x, u = point.normalise_x(step.x), point.normalise_u(step.u)
             flags, lower, upper, utilisation = self._judge(x, u, np.float64(step.dt), point.normalise_x(step.x_next))
             outside = bool(self.model.domain.outside(x, u))
-            self._recent.append(bool((flags == 1.0).any()))
-            self.alarm = sum(self._recent) >= self.rule.violations
+            if armed:
+                self._count(bool(((flags == 1.0) & self._counted).any()))
             lower, upper = point.recorded_x(lower), point.recorded_x(upper)
         return Verdict(
             step.t_ns,
@@ -140,6 +157,14 @@ class EnvelopeMonitor:
             outside,
             self.alarm,
         )
+
+    def _count(self, violated: bool) -> None:
+        recent = self._recent
+        if len(recent) == self.rule.window:
+            self._violations -= recent.popleft()
+        recent.append(violated)
+        self._violations += violated
+        self.alarm = self._violations >= self.rule.violations
 
     def check(self, transient: Transient) -> Verdicts:
         """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.
@@ -167,7 +192,7 @@ class EnvelopeMonitor:
         lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
         judged[arrival] = True
         outside[arrival] = model.domain.outside(x, u)
-        violated = (flags == 1.0).any(axis=1)
+        violated = ((flags == 1.0) & self._counted).any(axis=1)
         alarm = np.zeros(count, dtype=bool)
         resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
         for start, stop in zip([0, *resets], [*resets, count], strict=True):

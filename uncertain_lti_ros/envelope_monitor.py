@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import struct
 import time
-from array import array
-from collections.abc import Iterable, Sequence
-from functools import partial
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -26,19 +30,46 @@ from std_srvs.srv import Trigger
 from uncertain_lti.errors import ModelError, UncertainLTIError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdict
-from uncertain_lti_ros.messages import live_fields, message_class, stamp_ns
+from uncertain_lti.signals import FieldPath
+from uncertain_lti_ros.arming import Condition
+from uncertain_lti_ros.layout import MessageReader
+from uncertain_lti_ros.messages import live_fields, message_class
+from uncertain_lti_ros.outputs import FALSE, TRUE, NamedVector
+from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living
-from uncertain_lti_ros.subscriptions import DEPTH, DURABILITY, RELIABILITY, MatchedSubscription, Wish
+from uncertain_lti_ros.snapshot import JUDGED, Album, Entry, Recent, Scene
+from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, MatchedSubscription, Wish
 from uncertain_lti_ros.watch import ERROR, STALE, Report, Rule, Watch, topic_types
 
 NAME = "envelope_monitor"
-VECTORS = ("flags", "lower", "upper", "state", "utilisation", "predicted_lower", "predicted_upper")
+VECTORS = ("flags", *JUDGED, "predicted_lower", "predicted_upper")
 """Topics below the node's name that carry one number per state as sensor_msgs/JointState."""
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
 _OUTPUT_DEPTH = 1000
+_SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
+_LOGGED = 5.0  # s between two log entries on unexpected errors
+_MIB = 1 << 20
 _NAN = float("nan")
 
-_RULE = ("violations", "window", "margin")
+_type_fields = cache(live_fields)
+
+
+class _Output:
+    """One topic of the node, and how many listen to it; takes serialised messages."""
+
+    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
+        events = PublisherEventCallbacks(matched=self._matched)
+        self.publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
+        self.listeners = 0
+        # Past the check of the lifecycle state: the node publishes only while it is active.
+        self.send = self.publisher.handle.publish_raw
+
+    def _matched(self, event: Any) -> None:
+        self.listeners = event.current_count
+
+    def look(self) -> None:
+        """Ask how many listen; events tell as well, and sooner."""
+        self.listeners = self.publisher.get_subscription_count()
 
 
 class EnvelopeMonitorNode(LifecycleNode):
@@ -46,19 +77,30 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        self._declare()
+        for parameter in PARAMETERS:
+            self.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
         self.watch: Watch | None = None
         self.active = False
         self._reason = ""  # why the last configure failed
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self._inputs: dict[str, MatchedSubscription] = {}
-        self._outputs: dict[str, Any] = {}
+        self._outputs: dict[str, _Output] = {}
+        self._enable_problem = ""
         self._candidate: Watch | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
         self._published = self._looked = self._reported = time.monotonic()
-        self._joint_state = JointState()
+        self._failures, self._failed_how, self._failure_told, self._failure_logged = 0, "", 0, -_LOGGED
+        self._clock = self.get_clock()
+        self._largest = round(self._real("largest_message") * _MIB)
+        self._recent: Recent | None = None  # kept while snapshots can be asked for
+        self._album: Album | None = None
+        self._snapshot_due: float | None = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_service(Trigger, "~/status", self._on_status)
+        services = {
+            "status": self._on_status, "reset": self._on_reset, "reload": self._on_reload, "snapshot": self._on_snapshot
+        }  # fmt: skip
+        for name, serve in services.items():
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._on_have_set)
         tick = min(0.1, self._real("heartbeat") / 4, self._real("diagnostics_period") / 2)
@@ -68,71 +110,11 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     # --- parameters ---
 
-    def _declare(self) -> None:
-        def say(text: str, read_only: bool = False, **limits: Any) -> ParameterDescriptor:
-            return ParameterDescriptor(description=text, read_only=read_only, **limits)
-
-        def whole(low: int, high: int) -> dict[str, Any]:
-            return {"integer_range": [IntegerRange(from_value=low, to_value=high, step=0)]}
-
-        def real(low: float, high: float) -> dict[str, Any]:
-            return {"floating_point_range": [FloatingPointRange(from_value=low, to_value=high, step=0.0)]}
-
-        self.declare_parameter(
-            "model", "", say("Path of the model file. Setting it while running swaps the model, or is refused.")
-        )
-        self.declare_parameter("autostart", True, say("Configure and activate without being asked.", True))
-        self.declare_parameter(
-            "violations", 0,
-            say("Alarm while this many of the last `window` verdicts are violations; 0: as the model says. "
-                "Setting it starts the alarm anew.", **whole(0, 10**6)),
-        )  # fmt: skip
-        self.declare_parameter(
-            "window", 0,
-            say("Verdicts that the alarm looks at; 0: as the model says. Setting it starts the alarm anew.",
-                **whole(0, 10**6)),
-        )  # fmt: skip
-        self.declare_parameter(
-            "margin", 0.0,
-            say("Factor on the half-widths of the bounds that are judged; 0: as the model says. "
-                "Setting it starts the alarm anew.", **real(0.0, 1e6)),
-        )  # fmt: skip
-        self.declare_parameter(
-            "heartbeat", 1.0,
-            say("~/violation is published at least this often, s of wall time; also the deadline it offers.", True,
-                **real(0.05, 3600.0)),
-        )  # fmt: skip
-        self.declare_parameter(
-            "state_timeout",
-            1.0,
-            say("Without a verdict for this long, s of wall time, states are reported STALE.", **real(0.01, 86400.0)),
-        )
-        self.declare_parameter(
-            "diagnostics_period",
-            1.0,
-            say("Time between two messages on /diagnostics, s of wall time.", True, **real(0.05, 3600.0)),
-        )
-        self.declare_parameter(
-            "hardware_id", "", say("hardware_id in /diagnostics; empty: the name of this node.", True)
-        )
-        self.declare_parameter(
-            "qos.depth", DEPTH,
-            say("Messages kept per subscription until they are taken.", True, **whole(1, 10**6)),
-        )  # fmt: skip
-        self.declare_parameter(
-            "qos.reliability", "match",
-            say(f"Of the subscriptions: match (what publishers offer), {' or '.join(RELIABILITY)}.", True),
-        )  # fmt: skip
-        self.declare_parameter(
-            "qos.durability", "match",
-            say(f"Of the subscriptions: match (what publishers offer), {' or '.join(DURABILITY)}.", True),
-        )  # fmt: skip
-
     def _real(self, name: str) -> float:
         return float(self.get_parameter(name).value)
 
     def _rule(self, changes: dict[str, Any]) -> Rule:
-        return Rule(**{name: changes.get(name, self.get_parameter(name).value) for name in _RULE})
+        return Rule(**{name: changes.get(name, self.get_parameter(name).value) for name in RULE})
 
     def _wish(self) -> Wish:
         chosen: dict[str, Any] = {}
@@ -147,35 +129,66 @@ class EnvelopeMonitorNode(LifecycleNode):
         if not path:
             raise ModelError("parameter 'model' is empty; give the path of a model file")
         model = UncertainLTI.load(path)
-        return Watch(model, rule, topic_types(model, path, live_fields), time.monotonic())
+        types = topic_types(model, path, _type_fields)
+        for names in (model.state_names, model.control_names):
+            NamedVector(names)
+        arming = self.watch.arming if self.watch else None
+        return Watch(model, rule, types, _type_fields, self._make_reader, time.monotonic(), arming)
+
+    def _make_reader(self, type_name: str, paths: Sequence[FieldPath]) -> MessageReader:
+        kind = message_class(type_name)
+
+        def decode(data: bytes) -> Any:
+            if len(data) > self._largest:
+                raise ValueError(f"{len(data)} bytes are more than parameter largest_message allows")
+            return deserialize_message(data, kind)
+
+        return MessageReader(type_name, paths, _type_fields, decode)
 
     def _on_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Make what the new values ask for, or say why not; it takes its place in `_on_have_set`."""
-        changes = {p.name: p.value for p in parameters if p.name in ("model", *_RULE)}
+        changes = {p.name: p.value for p in parameters if p.name in ("model", *RULE)}
         self._candidate = None
         try:
             if "model" in changes:
                 self._candidate = self._make_watch(changes["model"], self._rule(changes))
             elif changes and self.watch is not None:
                 self._candidate = self._rule(changes)
-                self._candidate.monitor(self.watch.model)
+                self.watch.check(self._candidate)
+            elif "enable" in changes:
+                Condition.parse(changes["enable"])
         except UncertainLTIError as error:
             self._candidate = None
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:  # a file can be wrong in ways that nobody thought of
+            self._candidate = None
+            self.note_failure("while parameters were set", error)
+            return SetParametersResult(successful=False, reason=f"unexpected: {error!r}")
         return SetParametersResult(successful=True)
 
-    def _on_have_set(self, _: Sequence[Parameter]) -> None:
+    def _on_have_set(self, parameters: Sequence[Parameter]) -> None:
+        if any(p.name == "largest_message" for p in parameters):
+            self._largest = round(self._real("largest_message") * _MIB)
         candidate, self._candidate = self._candidate, None
         if isinstance(candidate, Rule) and self.watch is not None:
             self.watch.follow(candidate)
+            if self.active:
+                self._subscribe()
         elif isinstance(candidate, Watch):
             if self.watch is not None:
-                self.watch = candidate
-                if self.active:
-                    self._subscribe()
-                self.get_logger().info(f"model swapped: {candidate.model}")
+                self._swap(candidate)
             elif self._starts_itself:
                 self.start()
+
+    def _swap(self, watch: Watch) -> None:
+        """Put another model in place, between two messages."""
+        self.watch = watch
+        self._prepare_outputs()
+        if self._recent is not None:
+            self._recent.clear()
+        if self.active:
+            self._subscribe()
+        self.get_logger().info(f"model swapped: {watch.model}")
 
     # --- lifecycle ---
 
@@ -203,21 +216,41 @@ class EnvelopeMonitorNode(LifecycleNode):
         try:
             self._wish()
             self.watch = self._make_watch(path, self._rule({}))
-        except UncertainLTIError as error:
-            self._reason = str(error)
+            self._open_album()
+        except Exception as error:
+            self.watch = None
+            self._reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
             self.get_logger().error(f"not configured: {self._reason}")
             self._report()
             return TransitionCallbackReturn.FAILURE
         self._reason = ""
         qos = QoSProfile(depth=_OUTPUT_DEPTH)
         for name in VECTORS:
-            self._outputs[name] = self.create_lifecycle_publisher(JointState, f"~/{name}", qos)
+            self._outputs[name] = _Output(self, JointState, name, qos)
         beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=self._real("heartbeat")))
-        self._outputs["violation"] = self.create_lifecycle_publisher(Bool, "~/violation", beat)
+        self._outputs["violation"] = _Output(self, Bool, "violation", beat)
+        self._prepare_outputs()
         self.get_logger().info(f"configured with {Path(path).name}: {self.watch.model}")
         if self.watch.model.sampling.dt_median is None:
             self.get_logger().info("the model has no median step, so nothing is predicted")
         return super().on_configure(state)
+
+    def _open_album(self) -> None:
+        folder = str(self.get_parameter("snapshot.folder").value)
+        if folder:
+            limit = round(self._real("snapshot.megabytes") * _MIB)
+            self._album = Album(
+                folder, self.get_fully_qualified_name(), self.get_parameter("snapshot.keep").value, limit
+            )
+            self._recent = Recent(self._real("snapshot.seconds"), round(self._real("snapshot.memory") * _MIB))
+
+    def _prepare_outputs(self) -> None:
+        assert self.watch is not None
+        names = self.watch.model.state_names
+        self._plain, self._marked = NamedVector(names), NamedVector(names, velocities=True)
+        n = len(names)
+        self._marks = {mark: struct.pack(f"<{n}d", *[mark] * n) for mark in (0.0, 1.0)}
+        self._no_mark = struct.pack(f"<{n}d", *[_NAN] * n)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start with no sample and no verdict, and subscribe."""
@@ -226,6 +259,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.watch.restart(time.monotonic())
         self._subscribe()
         self.active = True
+        for output in self._outputs.values():
+            output.look()
         self._beat()
         return result
 
@@ -255,8 +290,13 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _put_away(self) -> None:
         self._unsubscribe()
-        for publisher in self._outputs.values():
-            self.destroy_lifecycle_publisher(publisher)
+        if self._snapshot_due is not None:
+            self._take_due_snapshot()
+        if self._album is not None:
+            self._album.close()
+        self._album = self._recent = self._snapshot_due = None
+        for output in self._outputs.values():
+            self.destroy_lifecycle_publisher(output.publisher)
         self._outputs.clear()
         self.watch = None
 
@@ -267,19 +307,33 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._reason = ""
         self._report()
 
+    # --- what nobody thought of ---
+
+    def note_failure(self, where: str, error: Exception) -> None:
+        """Count an error that nobody foresaw, log it, and have it in the next diagnostics; the node goes on."""
+        self._failures += 1
+        self._failed_how = f"{where}: {error!r}"[:300]
+        now = time.monotonic()
+        if now - self._failure_logged >= _LOGGED:
+            self._failure_logged = now
+            trace = "".join(traceback.format_exception(error))
+            self.get_logger().error(f"unexpected error {self._failures}, {where}; the node goes on\n{trace}")
+
     # --- messages ---
 
     def _subscribe(self) -> None:
-        """Listen to exactly the topics of the model; what is listened to already goes on undisturbed."""
+        """Listen to exactly the topics wanted; what is listened to already goes on undisturbed."""
         assert self.watch is not None
+        types = self.watch.types
         for topic in list(self._inputs):
-            if self._inputs[topic].type_name != self.watch.types.get(topic):
+            if self._inputs[topic].type_name != types.get(topic):
                 self._inputs.pop(topic).destroy()
-        for topic, type_name in self.watch.types.items():
+        for topic, type_name in types.items():
             if topic not in self._inputs:
                 self._inputs[topic] = MatchedSubscription(
-                    self, topic, type_name, message_class(type_name), partial(self._on_message, topic), self._wish()
-                )
+                    self, topic, type_name, message_class(type_name), partial(self._on_message, topic), self._wish(),
+                    raw=True,
+                )  # fmt: skip
 
     def _unsubscribe(self) -> None:
         self.active = False
@@ -287,70 +341,144 @@ class EnvelopeMonitorNode(LifecycleNode):
             subscription.destroy()
         self._inputs.clear()
 
-    def _on_message(self, topic: str, message: Any) -> None:
-        arrival = self.get_clock().now().nanoseconds
+    def _on_message(self, topic: str, data: bytes) -> None:
         if not self.active or self.watch is None:
             return
-        watch = self.watch
-        alarm = watch.monitor.alarm
-        verdicts, opened = watch.take(topic, arrival, stamp_ns(message), message, time.monotonic())
+        try:
+            self._take(self.watch, topic, data)
+        except Exception as error:
+            self.note_failure(f"on a message of {topic}", error)
+            self.watch.failed()
+
+    def _take(self, watch: Watch, topic: str, data: bytes) -> None:
+        clock = self._clock
+        # The clock's own call makes three objects; without simulated time it says the same.
+        arrival = clock.now().nanoseconds if clock.ros_time_is_active else time.time_ns()
+        now = time.monotonic()
+        alarms, alarm = watch.alarms, watch.alarm
+        verdicts, opened = watch.take(topic, arrival, data, now)
+        beat = watch.alarm != alarm
         for verdict in verdicts:
+            beat |= verdict.judged
             self._publish(verdict)
-        if any(verdict.judged for verdict in verdicts) or watch.monitor.alarm != alarm:
+        if beat:
             self._beat()
-        if opened and self._wanted("predicted_lower", "predicted_upper"):
+        outputs = self._outputs
+        if opened and (outputs["predicted_lower"].listeners or outputs["predicted_upper"].listeners):
             if (prediction := watch.predict()) is not None:
                 t_ns, lower, upper = prediction
-                self._send("predicted_lower", t_ns, lower)
-                self._send("predicted_upper", t_ns, upper)
+                outputs["predicted_lower"].send(self._plain(t_ns, lower.tobytes()))
+                outputs["predicted_upper"].send(self._plain(t_ns, upper.tobytes()))
+        if self._recent is not None:
+            self._recent.add(Entry(now, arrival, topic, data, verdicts, watch.alarm))
+            if watch.alarms > alarms and self._snapshot_due is None:
+                self._snapshot_due = now + self._real("snapshot.after")
 
     def _publish(self, verdict: Verdict) -> None:
-        if self._wanted("flags"):
-            outside = float(verdict.outside_domain) if verdict.judged else _NAN
-            self._joint_state.velocity = array("d", [outside] * len(verdict.flags))
-            self._send("flags", verdict.t_ns, verdict.flags)
-            self._joint_state.velocity = array("d")
-        if verdict.judged:
-            for name in ("lower", "upper", "state", "utilisation"):
-                if self._wanted(name):
-                    self._send(name, verdict.t_ns, getattr(verdict, name))
-
-    def _wanted(self, *names: str) -> bool:
-        return any(self._outputs[name].get_subscription_count() for name in names)
-
-    def _send(self, name: str, t_ns: int, values: Any) -> None:
-        assert self.watch is not None
-        message = self._joint_state
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 1_000_000_000)
-        message.name = self.watch.model.state_names
-        message.position = array("d", values.tobytes())
-        self._outputs[name].publish(message)
+        outputs, judged = self._outputs, verdict.judged
+        if outputs["flags"].listeners:
+            mark = self._marks[verdict.outside_domain] if judged else self._no_mark
+            outputs["flags"].send(self._marked(verdict.t_ns, verdict.flags.tobytes(), mark))
+        if judged:
+            for name in JUDGED:
+                output = outputs[name]
+                if output.listeners:
+                    output.send(self._plain(verdict.t_ns, getattr(verdict, name).tobytes()))
 
     def _beat(self) -> None:
         assert self.watch is not None
         self._published = time.monotonic()
-        self._outputs["violation"].publish(Bool(data=self.watch.monitor.alarm))
+        self._outputs["violation"].send(TRUE if self.watch.alarm else FALSE)
 
     # --- heartbeat, graph, diagnostics ---
 
     def _on_tick(self) -> None:
-        now = time.monotonic()
-        if self.active and now - self._published >= self._real("heartbeat") / 2:
+        for task in (self._keep_beating, self._look_around, self._keep_reporting, self._keep_album):
+            try:
+                task()
+            except Exception as error:
+                self.note_failure("between messages", error)
+
+    def _keep_beating(self) -> None:
+        if self.active and time.monotonic() - self._published >= self._real("heartbeat") / 2:
             self._beat()
-        if now - self._looked >= _LOOK or any(s.look_soon for s in self._inputs.values()):
-            self._looked = now
-            for subscription in self._inputs.values():
-                subscription.look()
-        if now - self._reported >= self._real("diagnostics_period"):
+
+    def _look_around(self) -> None:
+        now = time.monotonic()
+        if now - self._looked < _LOOK and not any(s.look_soon for s in self._inputs.values()):
+            return
+        self._looked = now
+        for subscription in self._inputs.values():
+            subscription.look()
+        for output in self._outputs.values():
+            output.look()
+        self._find_enable_type()
+
+    def _find_enable_type(self) -> None:
+        watch = self.watch
+        if watch is None or not self.active or not watch.enable_topic or watch.enable_type:
+            return
+        infos = self.get_publishers_info_by_topic(watch.enable_topic)
+        if infos:
+            try:
+                watch.found_enable_type(infos[0].topic_type)
+            except UncertainLTIError as error:
+                self._enable_problem = f"parameter enable: {error}"
+                return
+            self._subscribe()
+        self._enable_problem = ""
+
+    def _keep_reporting(self) -> None:
+        if time.monotonic() - self._reported >= self._real("diagnostics_period"):
             self._report()
 
+    def _keep_album(self) -> None:
+        if self._snapshot_due is not None and time.monotonic() >= self._snapshot_due:
+            self._take_due_snapshot()
+
+    def _take_due_snapshot(self) -> None:
+        assert self._album is not None
+        if not self.get_parameter("snapshot.on_alarm").value:
+            self._snapshot_due = None
+        elif not self._album.busy:
+            self._snapshot_due = None
+            try:
+                self.get_logger().info(f"alarm: {self._album.take(self._scene('alarm'), 0.0)}")
+            except UncertainLTIError as error:
+                self.get_logger().error(str(error))
+
+    def _scene(self, why: str) -> Scene:
+        assert self.watch is not None and self._recent is not None
+        watch = self.watch
+        rule = watch.monitor.rule
+        return Scene(
+            self._recent.entries(),
+            watch.model.state_names,
+            watch.types,
+            {name: self.resolve_topic_name(f"~/{name}") for name in ("flags", "violation", *JUDGED)},
+            {
+                "node": self.get_fully_qualified_name(),
+                "why": why,
+                "model": str(self.get_parameter("model").value),
+                "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
+            },
+        )
+
     def _problems(self) -> list[str]:
-        """What keeps messages from coming, beside silence."""
+        """What keeps messages from coming, beside silence, and what went wrong here."""
         problems = []
         for subscription in self._inputs.values():
             problems += subscription.problems
             if subscription.lost:
                 problems.append(f"{subscription.topic}: {subscription.lost} messages lost on the way")
+            if subscription.late:
+                problems.append(f"{subscription.topic}: {subscription.late} deadlines missed by its publishers")
+        if self._enable_problem:
+            problems.append(self._enable_problem)
+        if self._album is not None and self._album.problem:
+            problems.append(self._album.problem)
+        if self._failures > self._failure_told:
+            problems.append(f"{self._failures} unexpected errors, the last {self._failed_how}")
         return problems
 
     def _report(self) -> None:
@@ -362,20 +490,25 @@ class EnvelopeMonitorNode(LifecycleNode):
                 extra |= {
                     f"publishers {topic}": str(subscription.publishers),
                     f"lost {topic}": str(subscription.lost),
+                    f"deadlines missed {topic}": str(subscription.late),
                     f"qos {topic}": f"{subscription.qos.reliability.name} {subscription.qos.durability.name}".lower(),
                 }
+            extra["unexpected errors"] = str(self._failures)
+            if self._album is not None:
+                extra |= {"snapshots": str(self._album.written), "last snapshot": self._album.last}
             reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
         else:
             state = self._state_machine.current_state[1]
             message = f"{state}: {self._reason}" if self._reason else f"{state}: no verdicts are given"
             level = ERROR if self._reason else STALE
-            reports = [Report(level, "monitor", message, {})]
+            reports = [Report(level, "monitor", message, {"unexpected errors": str(self._failures)})]
             if self.watch is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.watch.model.state_names]
+        self._failure_told = self._failures
         full_name = self.get_fully_qualified_name().lstrip("/")
         hardware = str(self.get_parameter("hardware_id").value) or self.get_name()
         message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = self._clock.now().to_msg()
         path = str(self.get_parameter("model").value)
         for report in reports:
             values = {"model": path, **report.values} if report is reports[0] else report.values
@@ -390,7 +523,48 @@ class EnvelopeMonitorNode(LifecycleNode):
             )
         self._diagnostics.publish(message)
 
-    def _on_status(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    # --- services ---
+
+    def _serve(
+        self, serve: Callable[[Trigger.Response], None], _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Answer a call; what is refused is told, and what nobody foresaw as well."""
+        try:
+            serve(response)
+        except UncertainLTIError as error:
+            response.success, response.message = False, str(error)
+        except Exception as error:
+            self.note_failure("in a service", error)
+            response.success, response.message = False, f"unexpected: {error!r}"
+        return response
+
+    def _on_reset(self, response: Trigger.Response) -> None:
+        """End a latched alarm, and let the alarm look at verdicts from now on only."""
+        if self.watch is None or not self.active:
+            raise ModelError("the node is not active, so there is no alarm to reset")
+        response.message = "the alarm is reset" if self.watch.alarm else "there was no alarm; its window starts anew"
+        self.watch.reset()
+        self._beat()
+        response.success = True
+
+    def _on_reload(self, response: Trigger.Response) -> None:
+        """Read the model file once more."""
+        if self.watch is None:
+            raise ModelError("the node is not configured; configure it, which reads the model file")
+        path = str(self.get_parameter("model").value)
+        self._swap(self._make_watch(path, self._rule({})))
+        response.success, response.message = True, f"{Path(path).name}: {self.watch.model}"
+
+    def _on_snapshot(self, response: Trigger.Response) -> None:
+        """Write the last seconds to a file."""
+        if self._album is None or self.watch is None:
+            if self.get_parameter("snapshot.folder").value:
+                raise ModelError("the node is not configured, so there is nothing to write")
+            raise ModelError("parameter snapshot.folder is empty; start the node with a folder for snapshots")
+        response.message = self._album.take(self._scene("asked for"), _SERVICE_WAIT)
+        response.success = True
+
+    def _on_status(self, response: Trigger.Response) -> None:
         """Counters as JSON; success says whether verdicts are given."""
         watch = self.watch
         response.success = self.active
@@ -399,18 +573,24 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "state": self._state_machine.current_state[1],
                 "reason": self._reason,
                 "model": self.get_parameter("model").value,
-                "now_ns": self.get_clock().now().nanoseconds,
+                "now_ns": self._clock.now().nanoseconds,
                 "use_sim_time": self.get_parameter("use_sim_time").value,
                 "received": {s.topic: s.received for s in self._inputs.values()},
                 "lost": {s.topic: s.lost for s in self._inputs.values()},
                 "verdicts": watch.verdicts if watch else 0,
                 "violations": dict(zip(watch.model.state_names, watch.violations, strict=True)) if watch else {},
-                "alarm": watch.monitor.alarm if watch else False,
+                "alarm": watch.alarm if watch else False,
+                "latched": watch.latched if watch else False,
+                "armed": watch.arming.on if watch else None,
                 "counters": dict(watch.sampler.counters) if watch else {},
+                "unreadable": dict(watch.unreadable) if watch else {},
+                "future": dict(watch.future) if watch else {},
+                "decoded": watch.decoded if watch else {},
+                "unexpected_errors": self._failures,
+                "snapshot": self._album.last if self._album else "",
                 "problems": self._problems(),
             }
         )
-        return response
 
 
 def main(args: list[str] | None = None) -> int:
@@ -421,7 +601,9 @@ def main(args: list[str] | None = None) -> int:
         node.get_logger().info(f"runs on the {life.executor_name}")
         if node.get_parameter("autostart").value:
             node.start()
-        life.spin()
+        gc.collect()
+        gc.freeze()  # what is here stays: the collector need not look at it again and again
+        life.spin(node.note_failure)
         node.finish()
     return 0
 

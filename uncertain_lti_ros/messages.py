@@ -109,12 +109,3 @@ def definition(type_name: str) -> str:
         package, _, short = name.split("/")
         parts.append(f"{'=' * 80}\nMSG: {package}/{short}\n{body}")
     return "".join(parts)
-
-
-def stamp_ns(message: Any) -> int | None:
-    """Header stamp of a message in ns; None where it has no header or the stamp is zero."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None:
-        return None
-    time: int = stamp.sec * 1_000_000_000 + stamp.nanosec
-    return time or None

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,6 +14,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 _PATIENCE = 0.1  # s that a signal waits at most
+_RESPITE = 0.01  # s of rest after an error, which may come again at once
 
 
 class Life:
@@ -46,10 +48,15 @@ class Life:
         """Wait for work at most this long, and do what is there."""
         self.executor.spin_once(timeout_sec=min(seconds, _PATIENCE))
 
-    def spin(self) -> None:
-        """Work until the end."""
+    def spin(self, note: Callable[[str, Exception], None]) -> None:
+        """Work until the end; an error that a callback lets through is noted, and the work goes on."""
         while self.alive:
-            self.spin_once()
+            try:
+                self.spin_once()
+            except Exception as error:
+                if self.alive:
+                    note("in the executor", error)
+                    time.sleep(_RESPITE)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -17,6 +18,8 @@ DEPTH = 1000
 """Messages kept until they are taken: the graph does not tell how deep the publishers' queues are."""
 RELIABILITY = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
 DURABILITY = {"volatile": DurabilityPolicy.VOLATILE, "transient_local": DurabilityPolicy.TRANSIENT_LOCAL}
+_NEVER_NS = 2**62
+"""A deadline from here on is none."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +34,17 @@ class Wish:
 def choose_qos(offers: Iterable[QoSProfile], wish: Wish, history: bool = True) -> QoSProfile:
     """Reliable only if every publisher is, transient local only if every publisher is; without any, reliable, volatile.
 
+    The deadline is the longest that publishers offer, and none where one of them offers none.
+
     history: whether messages sent before may still be asked for; where some have come, that would repeat them.
     """
     offers = list(offers)
     reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
     lasting = bool(offers) and all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+    deadlines = [o.deadline.nanoseconds for o in offers]
+    promised = bool(deadlines) and all(0 < d < _NEVER_NS for d in deadlines)
     return QoSProfile(
+        deadline=Duration(nanoseconds=max(deadlines)) if promised else Duration(),
         history=HistoryPolicy.KEEP_LAST,
         depth=wish.depth,
         reliability=wish.reliability or (ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
@@ -53,6 +61,11 @@ def incompatible(asked: QoSProfile, offered: QoSProfile) -> list[str]:
     if asked.durability == DurabilityPolicy.TRANSIENT_LOCAL != offered.durability:
         found.append("durability: volatile is offered, transient local asked")
     return found
+
+
+def _policies(qos: QoSProfile) -> tuple[Any, ...]:
+    """What publishers and subscribers must agree on."""
+    return qos.reliability, qos.durability, qos.deadline.nanoseconds % _NEVER_NS
 
 
 class MatchedSubscription:
@@ -73,8 +86,8 @@ class MatchedSubscription:
 
     Attributes
     ----------
-    received, lost : int
-        Messages that came, and those that the middleware says were lost.
+    received, lost, late : int
+        Messages that came, those that the middleware says were lost, and deadlines missed by publishers.
     publishers : int
         Publishers of this type that the graph knows.
     problems : list of str
@@ -94,7 +107,7 @@ class MatchedSubscription:
         self._node, self._asked_topic, self.type_name = node, topic, full_name(type_name)
         self._class, self._callback, self._wish, self._raw = message_class, callback, wish, raw
         self.topic: str = node.resolve_topic_name(topic)
-        self.received = self.lost = self.publishers = 0
+        self.received = self.lost = self.late = self.publishers = 0
         self.problems: list[str] = []
         self.look_soon = False
         self._subscription: Subscription | None = None
@@ -116,7 +129,7 @@ class MatchedSubscription:
         elif offers:  # when the last publisher leaves, the next one is likely to offer the same
             lasting = self._qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
             qos = choose_qos(offers, self._wish, history=lasting or not self.received)
-            if (qos.reliability, qos.durability) != (self._qos.reliability, self._qos.durability):
+            if _policies(qos) != _policies(self._qos):
                 self._node.destroy_subscription(self._subscription)
                 self._subscribe(qos)
         self.problems = sorted(
@@ -137,7 +150,10 @@ class MatchedSubscription:
     def _subscribe(self, qos: QoSProfile) -> None:
         self._qos = qos
         events = SubscriptionEventCallbacks(
-            incompatible_qos=self._changed, matched=self._changed, message_lost=self._lost
+            incompatible_qos=self._changed,
+            matched=self._changed,
+            message_lost=self._lost,
+            deadline=self._missed,
         )
         self._subscription = self._node.create_subscription(
             self._class, self._asked_topic, self._take, qos, event_callbacks=events, raw=self._raw
@@ -149,6 +165,9 @@ class MatchedSubscription:
 
     def _changed(self, _: Any) -> None:
         self.look_soon = True  # the owner looks from a timer: a subscription is not destroyed in its own callback
+
+    def _missed(self, event: Any) -> None:
+        self.late += event.total_count_change
 
     def _lost(self, event: Any) -> None:
         self.lost += event.total_count_change

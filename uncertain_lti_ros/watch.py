@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,26 +13,45 @@ from numpy.typing import NDArray
 from uncertain_lti.errors import ModelError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import EnvelopeMonitor, Verdict
-from uncertain_lti.sampler import Sampler, Status
+from uncertain_lti.sampler import Sampler, Status, to_ns
 from uncertain_lti.signals import FieldPath, TypeFields
+from uncertain_lti_ros.arming import Arming, Condition
+from uncertain_lti_ros.layout import MessageReader, UnreadableError
 
 Array = NDArray[np.float64]
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of diagnostic_msgs/DiagnosticStatus."""
+FUTURE = 1.0
+"""s that a stamp may be ahead of the clock before it is reported."""
+
+_FUTURE_NS = to_ns(FUTURE)
+
+MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
+"""Type name and paths -> reader."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """Alarm rule as the parameters give it; 0 stands for what the model says."""
+    """Alarm rule as the parameters give it; 0 stands for what the model says.
+
+    masked: states that do not count, separated by commas; enable: see `Condition`, enable_type its topic's message
+    type, empty where the model or the graph tells; grace in s; latch: an alarm stands until it is reset.
+    """
 
     violations: int = 0
     window: int = 0
     margin: float = 0.0
+    masked: str = ""
+    enable: str = ""
+    enable_type: str = ""
+    grace: float = 0.0
+    latch: bool = False
 
     def monitor(self, model: UncertainLTI) -> EnvelopeMonitor:
         """Monitor of this model under this rule; raises ModelError where the two do not fit."""
-        return EnvelopeMonitor(model, self.violations or None, self.window or None, self.margin or None)
+        masked = [name.strip() for name in self.masked.split(",") if name.strip()]
+        return EnvelopeMonitor(model, self.violations or None, self.window or None, self.margin or None, masked)
 
 
 @dataclass(frozen=True)
@@ -57,6 +75,8 @@ class _Period:
     violations: Counter[int] = field(default_factory=Counter)
     statuses: Counter[Status] = field(default_factory=Counter)
     late: int = 0
+    unreadable: int = 0
+    future: int = 0
 
 
 def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> dict[str, str]:
@@ -94,8 +114,17 @@ class Watch:
     rule : Rule
     types : mapping
         From `topic_types`.
+    type_fields : TypeFields
+    make_reader : MakeReader
     now : float
         A steady time in s, as everywhere below.
+    arming : Arming, optional
+        Of the watch before: where the condition stays the same, so does what is known of it.
+
+    Attributes
+    ----------
+    latched : bool
+        An alarm has been raised that stands until `reset`.
 
     Raises
     ------
@@ -105,27 +134,46 @@ class Watch:
         The model does not say how samples are cut.
     """
 
-    def __init__(self, model: UncertainLTI, rule: Rule, types: Mapping[str, str], now: float) -> None:
-        self.model, self.types = model, types
-        self.monitor = rule.monitor(model)
+    def __init__(
+        self,
+        model: UncertainLTI,
+        rule: Rule,
+        types: Mapping[str, str],
+        type_fields: TypeFields,
+        make_reader: MakeReader,
+        now: float,
+        arming: Arming | None = None,
+    ) -> None:
+        self.model, self._model_types = model, types
+        self._type_fields, self._make_reader = type_fields, make_reader
         signals = model.signals
-        self._read: dict[str, list[Callable[[Any], float]]] = {
-            topic: [FieldPath(signals.signals[i].field).read for i in signals.on(topic)] for topic in signals.topics
+        self._readers = {
+            topic: make_reader(types[topic], [FieldPath(signals.signals[i].field) for i in signals.on(topic)])
+            for topic in signals.topics
         }
+        self._unknown = {topic: [math.nan] * len(signals.on(topic)) for topic in signals.topics}
+        self.arming = arming if arming is not None else Arming(None, 0)
+        self.follow(rule)
         self.restart(now)
 
     def restart(self, now: float) -> None:
-        """Forget every message, verdict and count."""
-        self.sampler = Sampler(self.model.signals)
-        self.monitor.reset()
+        """Forget every message, verdict and count; what the enable condition last said stands."""
+        self._anew()
         self.unreadable: Counter[str] = Counter()
+        self.why_unreadable: dict[str, str] = {}
+        self.future: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
-        self.verdicts = self.alarms = 0
+        self.verdicts = self.alarms = self.failures = 0
         self.violations = [0] * self.model.n
         self.last: Verdict | None = None
         self._heard: dict[str, float] = {}
         self._began, self._judged = now, -math.inf
         self._period = _Period(now)
+
+    def _anew(self) -> None:
+        self.sampler = Sampler(self.model.signals)
+        self.reset()
+        self.arming.restart()
 
     def follow(self, rule: Rule) -> None:
         """Judge by another alarm rule from now on; the alarm starts anew.
@@ -134,43 +182,141 @@ class Watch:
         ------
         ModelError
             The rule does not fit; the old one stays.
+        SignalError
+            The condition's field is not in its type.
         """
-        self.monitor = rule.monitor(self.model)
+        monitor, condition, enable_type, reader = self._prepared(rule)
+        self.monitor, self.rule = monitor, rule
+        self.enable_type, self._reads_condition = enable_type, reader
+        known = self.arming.on if self.arming.condition == condition else None
+        self.arming = Arming(condition, to_ns(rule.grace), known)
+        self.latched = False
 
-    def take(
-        self, topic: str, arrival_ns: int, stamp_ns: int | None, message: Any, now: float
-    ) -> tuple[list[Verdict], bool]:
-        """Take one message; return the clock messages it decided, and whether it opened a sample."""
+    def check(self, rule: Rule) -> None:
+        """Raise what `follow` would raise."""
+        self._prepared(rule)
+
+    def _prepared(self, rule: Rule) -> tuple[EnvelopeMonitor, Condition | None, str, MessageReader | None]:
+        monitor = rule.monitor(self.model)
+        condition = Condition.parse(rule.enable)
+        enable_type, reader = "", None
+        if condition is not None:
+            enable_type = rule.enable_type or self._model_types.get(condition.topic, "")
+            if enable_type:
+                reader = self._condition_reader(condition, enable_type)
+        return monitor, condition, enable_type, reader
+
+    def _condition_reader(self, condition: Condition, type_name: str) -> MessageReader:
+        if self._model_types.get(condition.topic, type_name) != type_name:
+            raise ModelError(
+                f"parameter enable: {condition.topic} carries {self._model_types[condition.topic]} in the model, and "
+                f"enable_type says {type_name}; leave enable_type empty"
+            )
+        condition.field.check(condition.topic, type_name, self._type_fields)
+        return self._make_reader(type_name, [condition.field])
+
+    def found_enable_type(self, type_name: str) -> None:
+        """The graph tells the type of the condition's topic; raises SignalError where its field is not in it."""
+        assert self.arming.condition is not None
+        self._reads_condition = self._condition_reader(self.arming.condition, type_name)
+        self.enable_type = type_name
+
+    @property
+    def enable_topic(self) -> str:
+        """Topic of the enable condition; empty without one."""
+        return self.arming.condition.topic if self.arming.condition else ""
+
+    @property
+    def types(self) -> dict[str, str]:
+        """Topics to listen to with their types, as far as these are known."""
+        types = dict(self._model_types)
+        if self.enable_type:
+            types[self.enable_topic] = self.enable_type
+        return types
+
+    @property
+    def decoded(self) -> dict[str, int]:
+        """Messages per topic that were decoded by the middleware, as they fitted no layout."""
+        return {topic: reader.decoded for topic, reader in self._readers.items()}
+
+    @property
+    def alarm(self) -> bool:
+        """What ~/violation says."""
+        return self.monitor.alarm or self.latched
+
+    def reset(self) -> None:
+        """End a latched alarm, and forget the verdicts that the alarm looks at."""
+        self.monitor.reset()
+        self.latched = False
+
+    def failed(self) -> None:
+        """Something unexpected happened between messages: what was half done must not be joined to what follows."""
+        latched, counters = self.latched, self.sampler.counters
+        self._anew()
+        self.latched, self.sampler.counters = latched, counters
+        self.failures += 1
+
+    def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[list[Verdict], bool]:
+        """Take one serialised message; return the clock messages it decided, and whether it opened a sample."""
         self.received[topic] += 1
         self._heard[topic] = now
+        if topic == self.enable_topic and self._reads_condition is not None:
+            self._learn_condition(topic, data)
+        if topic not in self._readers:
+            return [], False
         try:
-            values = [read(message) for read in self._read[topic]]
-        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
-            self.unreadable[topic] += 1  # the topic's type was checked, so this is a message that fills it oddly
-            values = [math.nan] * len(self._read[topic])
+            stamp_ns, values = self._readers[topic].read(data)
+        except UnreadableError as error:
+            self._note_unreadable(topic, error)
+            stamp_ns, values = None, self._unknown[topic]
+        if stamp_ns is not None and stamp_ns > arrival_ns + _FUTURE_NS:
+            self.future[topic] += 1
         samples = self.sampler.counters["samples"]
         verdicts = []
         for step in self.sampler.push(topic, arrival_ns, stamp_ns, values):
-            before = self.monitor.alarm
-            verdict = self.monitor.judge(step)
+            before = self.alarm
+            if step.status is Status.RESET:
+                self.arming.restart()
+            verdict = self.monitor.judge(step, step.status.dropped or self.arming.at(step.t_ns))
+            self.latched = self.latched or (self.rule.latch and verdict.alarm)
             verdicts.append(verdict)
             self._count(verdict, before, now)
         return verdicts, self.sampler.counters["samples"] > samples
 
+    def _learn_condition(self, topic: str, data: bytes) -> None:
+        assert self._reads_condition is not None
+        try:
+            (value,) = self._reads_condition.read(data)[1]
+        except UnreadableError as error:
+            value = math.nan
+            if topic not in self._readers:
+                self._note_unreadable(topic, error)
+        self.arming.learn(value)
+        if not self.arming.on:
+            self.monitor.reset()
+
+    def _note_unreadable(self, topic: str, error: UnreadableError) -> None:
+        self.unreadable[topic] += 1
+        self.why_unreadable[topic] = str(error)[:200]
+
     def _count(self, verdict: Verdict, alarm_before: bool, now: float) -> None:
         period = self._period
         period.statuses[verdict.status] += 1
-        self.alarms += verdict.alarm and not alarm_before
-        period.alarm |= verdict.alarm
+        alarm = self.alarm
+        self.alarms += alarm and not alarm_before
+        period.alarm |= alarm
         if not verdict.judged:
             return
         self.last, self._judged = verdict, now
         self.verdicts += 1
         period.verdicts += 1
         period.outside += verdict.outside_domain
-        for i in np.flatnonzero(verdict.flags == 1.0).tolist():
-            self.violations[i] += 1
-            period.violations[i] += 1
+        flags = verdict.flags.tolist()
+        if 1.0 in flags:
+            for i, flag in enumerate(flags):
+                if flag == 1.0:
+                    self.violations[i] += 1
+                    period.violations[i] += 1
 
     def predict(self) -> tuple[int, Array, Array] | None:
         """(t_ns, lower (n,), upper (n,)) for one median step after the open sample, in recorded units.
@@ -202,8 +348,10 @@ class Watch:
         to say (publishers that cannot be heard, lost messages); they make the monitor's status at least WARN.
         """
         period, self._period = self._period, _Period(now)
-        self._period.alarm = self.monitor.alarm
+        self._period.alarm = self.alarm
         self._period.late = self.late
+        self._period.unreadable = self.unreadable.total()
+        self._period.future = self.future.total()
         without = now - max(self._judged, self._began)
         reports = [self._report_monitor(period, now, without, state_timeout, problems)]
         for i, name in enumerate(self.model.state_names):
@@ -214,7 +362,7 @@ class Watch:
         self, period: _Period, now: float, without: float, timeout: float, problems: Sequence[str]
     ) -> Report:
         never = [topic for topic in self.types if topic not in self._heard]
-        complaints = list(problems)
+        complaints, calm = list(problems), list[str]()
         if period.outside:
             complaints.append(f"outside the fitted domain in {period.outside} of {period.verdicts} verdicts")
         for status in (Status.GAP, Status.RESET, Status.MISSING):
@@ -226,8 +374,18 @@ class Watch:
             complaints.append(f"{dropped} messages dropped ({which})")
         if late := self.late - period.late:
             complaints.append(f"{late} messages came too late")
+        if self.unreadable.total() > period.unreadable:
+            complaints += [f"{topic}: a message {why}" for topic, why in self.why_unreadable.items()]
+        if self.future.total() > period.future:
+            complaints.append(f"{self.future.total() - period.future} stamps lie over {FUTURE:g} s in the future")
+        if off := self.arming.why_off():
+            (complaints if self.arming.on is None else calm).append(off)
+        if self.monitor.masked:
+            calm.append(f"masked: {', '.join(self.monitor.masked)}")
+        if self.latched and not self.monitor.alarm:
+            complaints.insert(0, "alarm: latched until ~/reset")
         if without > timeout:
-            level = STALE
+            level = ERROR if self.latched else STALE
             silent = self.silent_for(now)
             if silent > timeout and self.sampler.clock in self._heard:
                 complaints.insert(0, f"no message on {self.sampler.clock} for {silent:.1f} s")
@@ -237,10 +395,11 @@ class Watch:
                 complaints.insert(1, f"nothing ever received on {', '.join(never)}")
         elif period.alarm:
             level = ERROR
-            complaints.insert(0, f"alarm: {self._rule_text()}")
+            if self.monitor.alarm or not self.latched:
+                complaints.insert(0, f"alarm: {self._rule_text()}")
         else:
             level = WARN if complaints else OK
-        message = "; ".join(complaints) or f"{period.verdicts} verdicts, all well"
+        message = "; ".join([*(complaints or [f"{period.verdicts} verdicts, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
 
     def _rule_text(self) -> str:
@@ -249,6 +408,8 @@ class Watch:
 
     def _report_state(self, i: int, name: str, period: _Period, without: float, timeout: float) -> Report:
         values = {"verdicts": str(self.verdicts), "violations": str(self.violations[i])}
+        masked = name in self.monitor.masked
+        values["masked"] = str(int(masked))
         violated = period.violations[i]
         if self.last is not None:
             for key in ("state", "lower", "upper", "utilisation"):
@@ -259,7 +420,7 @@ class Watch:
         if without > timeout:
             level, message = STALE, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet"
         elif violated:
-            level = ERROR if period.alarm else WARN
+            level = OK if masked else ERROR if period.alarm else WARN
             message = f"outside its bounds in {violated} of {period.verdicts} verdicts"
             message = message if period.verdicts else f"{age}outside its bounds"
         elif self.last is None:
@@ -268,15 +429,18 @@ class Watch:
             level, message = OK, f"{age}within its bounds"
             if period.verdicts:
                 message = f"within its bounds in {period.verdicts} verdicts"
-        return Report(level, name, message, values)
+        return Report(level, name, f"{message} (masked)" if masked else message, values)
 
     def counts(self, now: float) -> dict[str, str]:
         """Counters by name: what was received, judged, dropped, late and missing, and how old each topic is."""
         counters = self.sampler.counters
         rule = self.monitor.rule
         counts = {
-            "alarm": str(int(self.monitor.alarm)),
+            "alarm": str(int(self.alarm)),
+            "latched": str(int(self.latched)),
+            "armed": {True: "1", False: "0", None: "unknown"}[self.arming.on],
             "alarms": str(self.alarms),
+            "unexpected errors": str(self.failures),
             "verdicts": str(self.verdicts),
             "violations": repr(rule.violations),
             "window": repr(rule.window),
@@ -292,6 +456,8 @@ class Watch:
             counts[f"received {topic}"] = str(self.received[topic])
             if self.unreadable[topic]:
                 counts[f"unreadable {topic}"] = str(self.unreadable[topic])
+            if self.future[topic]:
+                counts[f"future {topic}"] = str(self.future[topic])
             if topic in self._heard:
                 counts[f"age {topic}"] = repr(round(now - self._heard[topic], 3))
         return counts

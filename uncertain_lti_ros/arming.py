@@ -1,0 +1,108 @@
+"""When alarms count: a condition on a field of some topic, and a time of grace after the start."""
+
+from __future__ import annotations
+
+import operator
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from uncertain_lti.errors import ModelError, SignalError
+from uncertain_lti.signals import FieldPath
+
+_OPERATORS: Mapping[str, Callable[[float, float], bool]] = {
+    "==": operator.eq, "!=": operator.ne, "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
+}  # fmt: skip
+_TEXT = re.compile(r"\s*(?P<topic>[~/\w]+)\s+(?P<field>.+?)\s*(?P<operator>==|!=|<=|>=|<|>)\s*(?P<value>\S+)\s*")
+_WORDS = {"true": 1.0, "false": 0.0}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """`TOPIC FIELD OPERATOR NUMBER`, for example `/engine/mode data == 3` or `/engine/state position[fan] > 0.2`."""
+
+    topic: str
+    field: FieldPath
+    operator: str
+    value: float
+
+    @classmethod
+    def parse(cls, text: str) -> Condition | None:
+        """Read a condition; None where the text is empty. Raises ModelError for what is not one."""
+        if not text.strip():
+            return None
+        match = _TEXT.fullmatch(text)
+        try:
+            if match is None:
+                raise ValueError
+            word = match["value"].lower()
+            value = _WORDS[word] if word in _WORDS else float(word)
+            path = FieldPath(match["field"])
+        except (ValueError, SignalError):
+            raise ModelError(
+                f"parameter enable is {text!r}; write TOPIC FIELD OPERATOR NUMBER, for example "
+                f"'/engine/mode data == 3', with one of {' '.join(_OPERATORS)}"
+            ) from None
+        if path.unwrap:
+            raise ModelError(f"parameter enable: {path.text} cannot be compared, as unwrapping needs a history")
+        return cls(match["topic"], path, match["operator"], value)
+
+    def holds(self, value: float) -> bool | None:
+        """Whether it holds; None where the value is not a number."""
+        return _OPERATORS[self.operator](value, self.value) if value == value else None
+
+    def __str__(self) -> str:
+        return f"{self.topic} {self.field.text} {self.operator} {self.value:g}"
+
+
+class Arming:
+    """Whether a verdict may raise the alarm.
+
+    Parameters
+    ----------
+    condition : Condition or None
+    grace_ns : int
+        No alarm this long, in the samples' own time, after the first sample, after time jumped back, and after
+        the condition began to hold.
+    on : bool or None
+        What is known of the condition already.
+
+    Attributes
+    ----------
+    on : bool or None
+        Whether the condition holds; None while nothing, or nothing that is a number, is known. Without a condition
+        True.
+    """
+
+    def __init__(self, condition: Condition | None, grace_ns: int, on: bool | None = None) -> None:
+        self.condition = condition
+        self.on: bool | None = on if condition else True
+        self._grace = grace_ns
+        self._from: int | None = None  # the first instant that counts
+
+    def learn(self, value: float) -> None:
+        """The condition's field has this value."""
+        assert self.condition is not None
+        before, self.on = self.on, self.condition.holds(value)
+        if self.on and not before:
+            self._from = None
+
+    def restart(self) -> None:
+        """The next sample is the first."""
+        self._from = None
+
+    def at(self, t_ns: int) -> bool:
+        """Whether a verdict at this instant counts."""
+        if not self.on:
+            return False
+        if self._from is None:
+            self._from = t_ns + self._grace
+        return t_ns >= self._from
+
+    def why_off(self) -> str:
+        """What keeps alarms off, in words; empty where they are on."""
+        if self.on is None:
+            return f"alarms are off: it is not known whether {self.condition}"
+        if not self.on:
+            return f"alarms are off until {self.condition}"
+        return ""

@@ -1,0 +1,122 @@
+"""Parameters of envelope_monitor: what each means, its default, its range, and whether it can be set while running."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+
+from uncertain_lti_ros.subscriptions import DEPTH, DURABILITY, RELIABILITY
+
+
+@dataclass(frozen=True)
+class Declared:
+    """One parameter; fixed: it can be given at the start only."""
+
+    name: str
+    default: str | bool | int | float
+    text: str
+    fixed: bool = False
+    low: float | None = None
+    high: float | None = None
+
+    def descriptor(self) -> ParameterDescriptor:
+        """What `ros2 param describe` tells."""
+        descriptor = ParameterDescriptor(description=self.text, read_only=self.fixed)
+        if self.low is not None and self.high is not None:
+            if isinstance(self.default, int):
+                limits = IntegerRange(from_value=int(self.low), to_value=int(self.high), step=0)
+                descriptor.integer_range = [limits]
+            else:
+                descriptor.floating_point_range = [FloatingPointRange(from_value=self.low, to_value=self.high)]
+        return descriptor
+
+
+_ANEW = "Setting it starts the alarm anew."
+RULE = ("violations", "window", "margin", "masked", "enable", "enable_type", "grace", "latch")
+"""Parameters that make up the alarm rule."""
+PARAMETERS = (
+    Declared("model", "", "Path of the model file. Setting it while running swaps the model, or is refused."),
+    Declared("autostart", True, "Configure and activate without being asked.", fixed=True),
+    Declared(
+        "violations", 0,
+        f"Alarm while this many of the last `window` verdicts are violations; 0: as the model says. {_ANEW}",
+        low=0, high=10**6,
+    ),
+    Declared("window", 0, f"Verdicts that the alarm looks at; 0: as the model says. {_ANEW}", low=0, high=10**6),
+    Declared(
+        "margin", 0.0,
+        f"Factor on the half-widths of the bounds that are judged; 0: as the model says. {_ANEW}",
+        low=0.0, high=1e6,
+    ),
+    Declared(
+        "masked", "",
+        f"States, separated by commas, whose violations do not count for the alarm; they are judged and published "
+        f"all the same. {_ANEW}",
+    ),
+    Declared(
+        "enable", "",
+        f"No alarm unless this holds: TOPIC FIELD OPERATOR NUMBER, for example '/engine/mode data == 3', with "
+        f"== != < <= > >=. Empty: alarms always count. {_ANEW}",
+    ),
+    Declared(
+        "enable_type", "",
+        f"Message type of the topic in `enable`; empty: as the model or the graph tells. {_ANEW}",
+    ),
+    Declared(
+        "grace", 0.0,
+        f"No alarm this long, in s of the samples' own time, after the first sample, after time jumped back, and "
+        f"after `enable` began to hold. {_ANEW}",
+        low=0.0, high=86400.0,
+    ),
+    Declared("latch", False, f"An alarm stands until ~/reset is called. {_ANEW}"),
+    Declared(
+        "heartbeat", 1.0,
+        "~/violation is published at least this often, s of wall time; also the deadline it offers.",
+        fixed=True, low=0.05, high=3600.0,
+    ),
+    Declared(
+        "state_timeout", 1.0,
+        "Without a verdict for this long, s of wall time, states are reported STALE.",
+        low=0.01, high=86400.0,
+    ),
+    Declared(
+        "diagnostics_period", 1.0,
+        "Time between two messages on /diagnostics, s of wall time.",
+        fixed=True, low=0.05, high=3600.0,
+    ),
+    Declared("hardware_id", "", "hardware_id in /diagnostics; empty: the name of this node.", fixed=True),
+    Declared("qos.depth", DEPTH, "Messages kept per subscription until they are taken.", fixed=True, low=1, high=10**6),
+    Declared(
+        "qos.reliability", "match",
+        f"Of the subscriptions: match (what publishers offer), {' or '.join(RELIABILITY)}.", fixed=True,
+    ),
+    Declared(
+        "qos.durability", "match",
+        f"Of the subscriptions: match (what publishers offer), {' or '.join(DURABILITY)}.", fixed=True,
+    ),
+    Declared(
+        "largest_message", 16.0,
+        "Messages of more than this, MiB, are counted as unreadable and not looked into.", low=0.001, high=1024.0,
+    ),
+    Declared(
+        "snapshot.folder", "",
+        "Folder that ~/snapshot writes to, and nowhere else; empty: there are no snapshots.", fixed=True,
+    ),
+    Declared("snapshot.seconds", 10.0, "What a snapshot holds, s of wall time.", fixed=True, low=0.1, high=3600.0),
+    Declared("snapshot.on_alarm", False, "Write a snapshot when the alarm is raised."),
+    Declared(
+        "snapshot.after", 1.0, "How long after the alarm that snapshot ends, s of wall time.", low=0.0, high=3600.0
+    ),
+    Declared(
+        "snapshot.keep", 20, "Most snapshots of this node in the folder; the oldest go first.",
+        fixed=True, low=1, high=10**6,
+    ),
+    Declared(
+        "snapshot.megabytes", 200.0, "Most MiB of this node's snapshots in the folder.", fixed=True, low=0.1, high=1e6
+    ),
+    Declared(
+        "snapshot.memory", 64.0, "Most MiB of memory for what a snapshot holds; the oldest go first.",
+        fixed=True, low=0.1, high=1e5,
+    ),
+)  # fmt: skip

@@ -1,0 +1,222 @@
+"""Snapshots: the last seconds of what came in and of what was said of it, kept in memory and written to MCAP files."""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from uncertain_lti.errors import ModelError, UncertainLTIError
+from uncertain_lti.monitor import Verdict
+from uncertain_lti_ros.mcap_writer import McapWriter
+from uncertain_lti_ros.messages import definition
+from uncertain_lti_ros.outputs import FALSE, TRUE, NamedVector
+
+VECTOR_TYPE, FLAG_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
+JUDGED = ("lower", "upper", "state", "utilisation")
+_OVERHEAD = 500  # bytes that one kept message takes beside its data, a verdict on it included
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One message as it came, the clock messages it decided, and the alarm after it."""
+
+    now: float
+    arrival_ns: int
+    topic: str
+    data: bytes
+    verdicts: Sequence[Verdict]
+    alarm: bool
+
+
+class Recent:
+    """The messages of the last `seconds` s that fit into `limit` bytes; the oldest go first."""
+
+    def __init__(self, seconds: float, limit: int) -> None:
+        self._seconds, self._limit = seconds, limit
+        self._entries: deque[Entry] = deque()
+        self._bytes = 0
+
+    def add(self, entry: Entry) -> None:
+        """Keep one more."""
+        entries = self._entries
+        entries.append(entry)
+        self._bytes += len(entry.data) + _OVERHEAD + sum(6 * v.flags.nbytes for v in entry.verdicts)
+        oldest = entry.now - self._seconds
+        while entries and (entries[0].now < oldest or self._bytes > self._limit):
+            gone = entries.popleft()
+            self._bytes -= len(gone.data) + _OVERHEAD + sum(6 * v.flags.nbytes for v in gone.verdicts)
+
+    def entries(self) -> list[Entry]:
+        """All, in order of arrival."""
+        return list(self._entries)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._entries.clear()
+        self._bytes = 0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a file holds: entries, the names of the states, and the topics with their types."""
+
+    entries: Sequence[Entry]
+    names: Sequence[str]
+    inputs: Mapping[str, str]
+    outputs: Mapping[str, str]  # flags, violation, lower, ...: topic
+    notes: Mapping[str, str]
+
+    def write(self, path: Path) -> int:
+        """Write an MCAP file; returns the number of messages. Raises OSError."""
+        count = 0
+        plain, marked = NamedVector(self.names), NamedVector(self.names, velocities=True)
+        with open(path, "xb") as stream:
+            writer = McapWriter(stream, "uncertain-lti")
+            writer.metadata("uncertain_lti", self.notes)
+            inputs = {t: writer.channel(t, kind, definition(kind)) for t, kind in self.inputs.items()}
+            outputs = {
+                name: writer.channel(topic, FLAG_TYPE if name == "violation" else VECTOR_TYPE, text)
+                for name, topic in self.outputs.items()
+                for text in [definition(FLAG_TYPE if name == "violation" else VECTOR_TYPE)]
+            }
+            log_time = 0
+            for entry in self.entries:
+                log_time = max(log_time, entry.arrival_ns)  # a clock that is set back must not reorder what came
+                if entry.topic not in inputs:
+                    continue  # of the model before
+                writer.message(inputs[entry.topic], log_time, entry.data)
+                count += 1
+                for verdict in entry.verdicts:
+                    if len(verdict.flags) != len(self.names):
+                        continue
+                    outside = float(verdict.outside_domain) if verdict.judged else float("nan")
+                    velocity = (0.0 * verdict.flags + outside).tobytes()
+                    writer.message(outputs["flags"], log_time, marked(verdict.t_ns, verdict.flags.tobytes(), velocity))
+                    writer.message(outputs["violation"], log_time, TRUE if entry.alarm else FALSE)
+                    count += 2
+                    for name in JUDGED if verdict.judged else ():
+                        data = plain(verdict.t_ns, getattr(verdict, name).tobytes())
+                        writer.message(outputs[name], log_time, data)
+                        count += 1
+            writer.finish()
+            stream.flush()
+            os.fsync(stream.fileno())
+        return count
+
+
+class Album:
+    """Snapshot files in one folder, bounded in number and in bytes; written one at a time, beside the node's work.
+
+    Parameters
+    ----------
+    folder : str
+        Made where it is not there. Only files in it that bear this node's name and a time are ever removed.
+    node_name : str
+    keep : int
+        Most files of this node; the oldest go first.
+    limit : int
+        Most bytes of the files of this node.
+
+    Attributes
+    ----------
+    written : int
+    last, problem : str
+        Path of the last file, and why the last attempt failed; empty where there was none, or it did not.
+
+    Raises
+    ------
+    ModelError
+        The folder cannot be written to.
+    """
+
+    def __init__(self, folder: str, node_name: str, keep: int, limit: int) -> None:
+        self._folder = Path(folder)
+        stem = re.sub(r"\W+", "_", node_name.strip("/"), flags=re.ASCII)
+        self._stem, self._keep, self._limit = stem, keep, limit
+        self._pattern = re.compile(rf"{re.escape(stem)}-\d{{8}}T\d{{6}}\.\d{{6}}Z\.mcap(\.part)?", re.ASCII)
+        self._thread: threading.Thread | None = None
+        self.written = 0
+        self.last = self.problem = ""
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            if not os.access(self._folder, os.W_OK | os.X_OK):
+                raise PermissionError(13, "Permission denied")
+            for path in self._files(".part"):
+                path.unlink()  # of a process that was killed
+        except OSError as error:
+            raise ModelError(
+                f"snapshot.folder {folder}: cannot be written to: {error.strerror}; choose another folder"
+            ) from None
+
+    @property
+    def busy(self) -> bool:
+        """A file is being written."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def take(self, scene: Scene, patience: float) -> str:
+        """Begin to write a file and wait this long, s; returns what became of it.
+
+        Raises
+        ------
+        ModelError
+            A file is being written, nothing has come yet, or writing failed; says why.
+        """
+        if self.busy:
+            raise ModelError("a snapshot is being written; ask again in a moment")
+        if not scene.entries:
+            raise ModelError("there is nothing to write: no message has come")
+        name = f"{self._stem}-{datetime.now(UTC):%Y%m%dT%H%M%S.%f}Z.mcap"
+        path = self._folder / name
+        self.problem = ""
+        self._thread = threading.Thread(target=self._write, args=(scene, path), name="snapshot", daemon=True)
+        self._thread.start()
+        self._thread.join(patience)
+        if self.busy:
+            return f"writing {path}; ~/status says when it is there"
+        if self.problem:
+            raise ModelError(self.problem)
+        return f"wrote {path}"
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        if self._thread is not None:
+            self._thread.join(10.0)
+
+    def _write(self, scene: Scene, path: Path) -> None:
+        part = path.with_name(f"{path.name}.part")
+        try:
+            scene.write(part)
+            size = part.stat().st_size
+            if size > self._limit:
+                raise ModelError(f"{path.name}: {size} bytes are more than snapshot.megabytes allows; raise it")
+            self._make_room(size)
+            os.replace(part, path)
+            self.last = str(path)
+            self.written += 1
+        except (OSError, UncertainLTIError) as error:
+            why = error.strerror if isinstance(error, OSError) else str(error)
+            self.problem = f"snapshot {path}: not written: {why}"
+        except Exception as error:  # the node goes on, and says so
+            self.problem = f"snapshot {path}: not written: {error!r}"
+        finally:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+
+    def _files(self, ending: str) -> list[Path]:
+        """Files of this node, oldest first."""
+        found = [p for p in self._folder.iterdir() if p.name.endswith(ending) and self._pattern.fullmatch(p.name)]
+        return sorted((p for p in found if p.is_file() and not p.is_symlink()), key=lambda p: p.name)
+
+    def _make_room(self, size: int) -> None:
+        files = self._files(".mcap")
+        sizes = [path.stat().st_size for path in files]
+        while files and (len(files) >= self._keep or sum(sizes) + size > self._limit):
+            files.pop(0).unlink(missing_ok=True)
+            sizes.pop(0)
