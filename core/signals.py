@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 import os
 import re
+import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from uncertain_lti.errors import SignalError
+
+LONGEST_DELAY = 1_000_000
+"""Samples by which a control may be delayed at most."""
 
 Number = float | Literal["auto"]
 TimeSource = Literal["header", "log"]
@@ -49,26 +53,28 @@ def numeric_paths(type_name: str, type_fields: TypeFields, depth: int = 6) -> It
 # --- field paths --------------------------------------------------------------------------------------------
 
 _FUNCTIONS = ("roll", "pitch", "yaw", "norm", "unwrap")
-_STEP = re.compile(r"""\.?([A-Za-z_]\w*)|\[\s*(\d+)\s*\]|\[\s*"([^"]+)"\s*\]|\[\s*([^\[\]"]+?)\s*\]""")
+_STEP = re.compile(
+    r"""\.?([A-Za-z_]\w*)|\[\s*(\d{1,18})\s*\]|\[\s*"([^"]+)"\s*\]|\[\s*([^\[\]"\s](?:[^\[\]"]*[^\[\]"\s])?)\s*\]"""
+)
 _NAN = math.nan
 
 
 def _roll(q: Any) -> float:
     x, y, z, w = q.x, q.y, q.z, q.w
     norm2 = x * x + y * y + z * z + w * w
-    return math.atan2(2.0 * (w * x + y * z), norm2 - 2.0 * (x * x + y * y)) if norm2 > 0.0 else _NAN
+    return math.atan2(2.0 * (w * x + y * z), norm2 - 2.0 * (x * x + y * y)) if 0.0 < norm2 < math.inf else _NAN
 
 
 def _pitch(q: Any) -> float:
     x, y, z, w = q.x, q.y, q.z, q.w
     norm2 = x * x + y * y + z * z + w * w
-    return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x) / norm2))) if norm2 > 0.0 else _NAN
+    return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x) / norm2))) if 0.0 < norm2 < math.inf else _NAN
 
 
 def _yaw(q: Any) -> float:
     x, y, z, w = q.x, q.y, q.z, q.w
     norm2 = x * x + y * y + z * z + w * w
-    return math.atan2(2.0 * (w * z + x * y), norm2 - 2.0 * (y * y + z * z)) if norm2 > 0.0 else _NAN
+    return math.atan2(2.0 * (w * z + x * y), norm2 - 2.0 * (y * y + z * z)) if 0.0 < norm2 < math.inf else _NAN
 
 
 def _norm(value: Any) -> float:
@@ -320,15 +326,22 @@ class SignalMap:
             if signal.name in seen:
                 raise SignalError(f"{where} is listed twice; give each state and control its own name")
             seen.add(signal.name)
-            FieldPath(signal.field)
+            try:
+                FieldPath(signal.field)
+            except SignalError as error:
+                raise SignalError(f"{where}: {error}") from None
             if signal.scale != "auto" and not (math.isfinite(signal.scale) and signal.scale > 0):
                 raise SignalError(f"{where}: scale is {signal.scale}; it must be a positive number or auto")
             if signal.steady != "auto" and not math.isfinite(signal.steady):
                 raise SignalError(f"{where}: steady is {signal.steady}; it must be a finite number or auto")
-            if signal.max_hold is not None and not signal.max_hold >= 0:
-                raise SignalError(f"{where}: max_hold is {signal.max_hold}; it must be 0 s or more")
-            if signal.delay < 0:
-                raise SignalError(f"{where}: delay is {signal.delay}; it must be 0 samples or more")
+            if signal.max_hold is not None and not 0 <= signal.max_hold < math.inf:
+                raise SignalError(
+                    f"{where}: max_hold is {signal.max_hold}; it must be 0 s or more, or left out for no limit"
+                )
+            if not 0 <= signal.delay <= LONGEST_DELAY:
+                raise SignalError(
+                    f"{where}: delay is {reprlib.repr(signal.delay)}; it must be 0 to {LONGEST_DELAY} samples"
+                )
         for signal in self.states:
             if signal.max_hold is not None or signal.delay:
                 raise SignalError(
@@ -348,7 +361,7 @@ class SignalMap:
                 )
         for name in ("max_gap", "max_skew"):
             value = getattr(self, name)
-            if value is not None and not (value > 0):
+            if value is not None and not 0 < value < math.inf:
                 raise SignalError(f"{self.source}: {name} is {value}; it must be a positive number of seconds")
         if not (math.isfinite(self.min_step) and self.min_step >= 0):
             raise SignalError(f"{self.source}: min_step is {self.min_step}; it must be 0 s or more")
@@ -393,15 +406,22 @@ class SignalMap:
 
         try:
             with open(path, encoding="utf-8") as stream:
-                data = yaml.safe_load(stream)
+                node = yaml.compose(stream, Loader=yaml.SafeLoader)
+            if repeated := _repeated_key(node):
+                raise SignalError(
+                    f"{path}: key '{repeated.value}' stands twice in one mapping, again at line "
+                    f"{repeated.start_mark.line + 1}; keep one"
+                )
+            data = yaml.SafeLoader("").construct_document(node) if node else None
         except FileNotFoundError:
             raise SignalError(f"{path}: there is no such signals file; check the path") from None
         except OSError as error:
             raise SignalError(f"{path}: cannot be read: {error.strerror}; check the path") from None
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+        except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date 2001-99-99
             mark = getattr(error, "problem_mark", None)
             line = f" at line {mark.line + 1}" if mark else ""
-            raise SignalError(f"{path}: is not YAML{line}: {getattr(error, 'problem', error)}; mend it") from None
+            problem = str(getattr(error, "problem", None) or error).splitlines()[0]
+            raise SignalError(f"{path}: is not YAML{line}: {problem}; mend it") from None
         return cls.from_dict(data, source=os.fspath(path))
 
     @classmethod
@@ -419,14 +439,14 @@ class SignalMap:
         for topic, options in _keys(top.get("topics") or {}, f"{source}: topics", None).items():
             said = _keys(options, f"{source}: topics: {topic}", {"time"}).get("time")
             if said not in ("header", "log"):
-                raise SignalError(f"{source}: topics: {topic}: time is {said!r}; write header or log")
+                raise SignalError(f"{source}: topics: {topic}: time is {reprlib.repr(said)}; write header or log")
             time[topic] = said
         additive = top.get("additive")
         if additive not in (None, "none", "disturbance", "noise", "both"):
-            raise SignalError(f"{source}: additive is {additive!r}; write none, disturbance, noise or both")
+            raise SignalError(f"{source}: additive is {reprlib.repr(additive)}; write none, disturbance, noise or both")
         clock = top.get("clock")
         if clock is not None and not isinstance(clock, str):
-            raise SignalError(f"{source}: clock is {clock!r}; write the name of a state topic")
+            raise SignalError(f"{source}: clock is {reprlib.repr(clock)}; write the name of a state topic")
         return cls(
             states=_signals(top.get("states"), f"{source}: states", need_topics),
             controls=_signals(top.get("controls"), f"{source}: controls", need_topics),
@@ -441,12 +461,34 @@ class SignalMap:
         )
 
 
+def _repeated_key(top: Any) -> Any:
+    """The first key node that stands twice in its mapping, of which YAML readers keep the last; None without any."""
+    waiting, seen = [top], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen or not isinstance(getattr(node, "value", None), list):
+            continue  # an alias, or a scalar
+        seen.add(id(node))
+        keys = set()
+        for entry in node.value:
+            if not isinstance(entry, tuple):
+                waiting.append(entry)
+                continue
+            key, value = entry
+            waiting += [key, value]
+            if isinstance(key.value, str):
+                if key.value in keys:
+                    return key
+                keys.add(key.value)
+    return None
+
+
 def _keys(data: Any, where: str, known: set[str] | None) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise SignalError(f"{where}: a mapping is wanted here, not {type(data).__name__}; see config/signals/")
     for key in data:
         if known is not None and key not in known:
-            raise SignalError(f"{where}: unknown key '{key}'; known are {', '.join(sorted(known))}")
+            raise SignalError(f"{where}: unknown key {reprlib.repr(key)}; known are {', '.join(sorted(known))}")
     return data
 
 
@@ -458,9 +500,13 @@ def _number(value: Any, where: str) -> float | None:
             value = float(value)
         except ValueError:
             pass
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
-        raise SignalError(f"{where} is {value!r}; write a number")
-    return float(value)
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
+    except OverflowError:
+        number = math.nan
+    if math.isnan(number):
+        raise SignalError(f"{where} is {reprlib.repr(value)}; write a number")
+    return number
 
 
 def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
@@ -475,7 +521,7 @@ def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
         entry = dict(_keys(entry, here, known))
         for key in ("name", "topic", "field"):
             if not isinstance(entry.get(key), str) or not (entry[key] or (key == "topic" and not need_topics)):
-                raise SignalError(f"{here}: '{key}' is {entry.get(key)!r}; write a text")
+                raise SignalError(f"{here}: '{key}' is {reprlib.repr(entry.get(key))}; write a text, in quotes")
         for key in ("steady", "scale"):
             if key in entry and entry[key] != "auto":
                 number = _number(entry[key], f"{here}: {key}")
@@ -484,8 +530,11 @@ def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
             entry["max_hold"] = _number(entry["max_hold"], f"{here}: max_hold")
         delay = entry.get("delay", 0)
         if isinstance(delay, bool) or not isinstance(delay, int):
-            raise SignalError(f"{here}: delay is {delay!r}; write a whole number of samples")
+            raise SignalError(f"{here}: delay is {reprlib.repr(delay)}; write a whole number of samples")
         for key in ("unit", "type"):
-            entry[key] = str(entry.get(key) or "")
+            text = entry.get(key)
+            if isinstance(text, bool) or not isinstance(text, (str, int, float, type(None))):
+                raise SignalError(f"{here}: {key} is {reprlib.repr(text)}; write a text, in quotes")
+            entry[key] = "" if text is None else str(text)  # a unit of 1 is read as a number
         signals.append(Signal(**entry))
     return tuple(signals)
