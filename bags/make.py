@@ -12,9 +12,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from uncertain_lti.bag import Bag
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, STATE_TOPIC
 from uncertain_lti.plants.turbofan_faults import KINDS
-from uncertain_lti.plants.turbofan_runs import RECORDINGS
+from uncertain_lti.plants.turbofan_runs import RECORDINGS, make_run
 
 LEIBOV = {
     "leibov_fit": {"steps": 6000, "seed": 1, "fault_at": -1},
@@ -48,6 +49,10 @@ def make(name: str, folder: Path) -> None:
         recorder.send_signal(signal.SIGINT)
         if recorder.wait(30):
             sys.exit("the recorder failed, as said above")
+    samples = parameters["steps"] if node == "plant" else make_run(**parameters).samples
+    for topic, info in Bag(folder / f"{name}.mcap").topics.items():
+        if info.count != samples:
+            sys.exit(f"{name}: {info.count} messages on {topic}, not {samples}; does another plant publish here?")
 
 
 if __name__ == "__main__":

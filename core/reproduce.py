@@ -234,8 +234,8 @@ def width_text(cases: Sequence[Case]) -> str:
     rows.append(["rms step of the check", "", "", *(f"{1e4 * s:.2f}" for s in step)] + [""] * 6)
     header = ("identified from", "", "additive", *SHORT, "(4)", *(f"(5) {s}" for s in SHORT))
     return (
-        "Mean width of the bounds over the check, and discrepancies (4) and (5) of the nominal model's free run; widths and\n"
-        "(5) in 1e-4 of the scale\n" + table(header, rows)
+        "Mean width of the bounds over the check, and discrepancies (4) and (5) of the nominal model's free run;\n"
+        "widths and (5) in 1e-4 of the scale\n" + table(header, rows)
     )
 
 
@@ -310,7 +310,8 @@ def check_figure(case: Case, path: str | os.PathLike[str]) -> None:
         left.set_ylabel(f"{signal.name.replace('_', ' ')}\n[{signal.unit}]")
         centre = 0.5 * (lower + upper)
         scale = 1e3 / X[i]
-        right.fill_between(t, (lower - centre) * scale, (upper - centre) * scale, color=ENVELOPE, alpha=0.6, linewidth=0)
+        low, high = (lower - centre) * scale, (upper - centre) * scale
+        right.fill_between(t, low, high, color=ENVELOPE, alpha=0.6, linewidth=0)
         right.plot(t, (x[:, i] - centre) * scale, color=RECORDED, linewidth=1.0)
         right.plot(t[bad], (x[bad, i] - centre[bad]) * scale, ".", color=VIOLATED, label=f"outside ({int(bad.sum())})")
         right.set_ylabel("from the centre\n[1e-3 of the scale]")

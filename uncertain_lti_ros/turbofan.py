@@ -24,7 +24,8 @@ class Turbofan(Node):
         super().__init__("turbofan")
 
         def text(name: str, default: str, says: str) -> str:
-            return str(self.declare_parameter(name, default, ParameterDescriptor(description=says, read_only=True)).value)
+            descriptor = ParameterDescriptor(description=says, read_only=True)
+            return str(self.declare_parameter(name, default, descriptor).value)
 
         def integer(name: str, default: int, low: int, says: str) -> int:
             bounds = [IntegerRange(from_value=low, to_value=10**9, step=0)]
@@ -37,7 +38,7 @@ class Turbofan(Node):
             return float(self.declare_parameter(name, default, descriptor).value)
 
         self.planned = make_run(
-            text("manoeuvre", "levels", "pulses (open loop), check (lever 68 to 60 deg) or levels (lever between them)."),
+            text("manoeuvre", "levels", "pulses (open loop), check (lever 68 to 60 deg) or levels (lever in between)."),
             real("amplitude", 0.0, -1.0, 1.0, "Of the pulses, over the scale of each control; only for pulses."),
             real("noise", 0.0, 0.0, 1.0, "Standard deviation of each reading, over its scale."),
             integer("seed", 0, 0, "Seed of the noise."),

@@ -1,16 +1,17 @@
 """The paper's own solver for (10), as a baseline: direct search whose line searches are golden-section searches.
 
-Historical, not offered as a choice of `fit`: it ends on a ridge of the piecewise smooth objective, above the optimum.
-Only what the paper states: constant weights of one, no additive terms.
+Historical, not offered as a choice of `fit`: it ends on a ridge of the piecewise smooth objective, above the
+optimum. Only what the paper states: constant weights of one, no additive terms.
 
-A row's constraints are removed exactly. For a nominal row a and half-widths d the smallest factor that makes them contain
-every sample is s(a, d) = max_k |r_k - z_k a| / (|z_k| d), so the row of (10) is the unconstrained minimum over (a, d) of
+A row's constraints are removed exactly. For a nominal row a and half-widths d the smallest factor that makes them
+contain every sample is s(a, d) = max_k |r_k - z_k a| / (|z_k| d), so the row of (10) is the unconstrained minimum over
+(a, d) of
 
     F(a, d) = 4 s(a, d)^2 d^T G d,     G = sum_k (Δt_k |z_k|)(Δt_k |z_k|)^T.
 
-F is searched along each coordinate in turn, then along the way the whole round went (Hooke and Jeeves 1961). The maximum
-in s makes ridges that no coordinate descends, so it is approached by power means of rising exponent; the values
-reported are those of F itself.
+F is searched along each coordinate in turn, then along the way the whole round went (Hooke and Jeeves 1961). The
+maximum in s makes ridges that no coordinate descends, so it is approached by power means of rising exponent; the
+values reported are those of F itself.
 """
 
 from __future__ import annotations
@@ -87,8 +88,8 @@ def direct_search(
     resting = ~z.any(axis=1)
     if rate[resting].any():
         raise FitError(
-            "a sample at rest (x = u = 0) has a moving successor, which no interval matrices can contain; the direct search "
-            "has no additive terms"
+            "a sample at rest (x = u = 0) has a moving successor, which no interval matrices can contain; the direct "
+            "search has no additive terms"
         )
     moving = ~resting
     z, rate, dt = z[moving], rate[moving], dt[moving]
@@ -166,7 +167,8 @@ class _Row:
         largest = float(ratio.max())
         if np.isinf(self._exponent) or not 0.0 < largest < np.inf:
             return largest
-        return largest * float(np.sum((ratio / largest) ** self._exponent)) ** (1.0 / self._exponent)
+        total = float(np.sum((ratio / largest) ** self._exponent))
+        return largest * float(total ** (1.0 / self._exponent))
 
     def _value(self, q: Array) -> float:
         self.evaluations += 1

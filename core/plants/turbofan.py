@@ -227,11 +227,13 @@ class Engine:
 
     # --- gas path ---
 
-    def _path(self, q: Sequence[float], x: Sequence[float], u: Sequence[float], health: Health) -> tuple[Array, GasPath]:
+    def _path(
+        self, q: Sequence[float], x: Sequence[float], u: Sequence[float], health: Health
+    ) -> tuple[Array, GasPath]:
         """Mismatch of the five flow balances and all stations at a trial q.
 
-        q: flow coefficients of fan and compressor, ideal drops of both turbines and static pressure in the mixing plane,
-        each over its design value.
+        q: flow coefficients of fan and compressor, ideal drops of both turbines and static pressure in the mixing
+        plane, each over its design value.
         """
         d = self.design
         fuel, area, fan_vane, compressor_vane = u
@@ -425,7 +427,7 @@ class GasPathSolver:
                 return None
             jacobian[:, j] = (column - mismatch) / step
         try:
-            inverse: Array = np.linalg.inv(jacobian)
+            inverse = np.linalg.inv(jacobian).astype(np.float64)
         except np.linalg.LinAlgError:
             return None
         return inverse

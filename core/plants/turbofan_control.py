@@ -116,9 +116,9 @@ def operating_point() -> OperatingPoint:
 class Controller:
     """Fan speed follows the lever; compressor speed, turbine temperature and the fuel's rate are limited.
 
-    One step per sample. Fuel is changed by the least of three proportional-integral laws, on the fan speed's error and on
-    the distances to both limits; the velocity form needs no protection of an integrator. Gains are chosen for a response
-    of about a second.
+    One step per sample. Fuel is the lesser of a proportional-integral law on the fan speed's error and of a cap that
+    integrates the distance to the nearer limit; the cap has no proportional part and stays above the law while no limit
+    is near, so that noise is not rectified. Gains are chosen for a response of about a second.
 
     Parameters
     ----------
@@ -130,10 +130,11 @@ class Controller:
     """
 
     PROPORTIONAL, INTEGRAL = 2.0, 4.0  # relative fuel over relative speed: 1, 1/s
+    CAP, CLEARANCE = 4.0, 0.05  # relative fuel over relative distance, 1/s; relative fuel
     FUEL_RATE = 0.35  # kg/s^2
     AREA_RATE = 0.04  # m^2/s
     VANE_RATE = 40.0  # deg/s
-    LEAST_FUEL = 0.07  # share of the design's
+    LEAST_FUEL = 0.07  # of the design's
     COMPRESSOR_LIMIT = 1.01  # of the design speed
     TEMPERATURE_LIMIT = 1.03  # of the design's
 
@@ -145,26 +146,27 @@ class Controller:
         )
         self._command = start.u.copy()
         self._offset = start.x[0] - fan_speed(start.pla, plant)  # a steady state is one of the loop, to the last bit
-        self._errors = self._distances(start.pla, start.x)
-
-    def _distances(self, pla: float, x: Array) -> Array:
-        demand = fan_speed(pla, self._plant) + self._offset
-        return np.array([(demand - x[0]) / demand, 1.0 - x[1] / self._limits[0], 1.0 - x[4] / self._limits[1]])
+        self._correction = 0.0  # of the integral, relative fuel, from the steady state
+        self._start = float(start.u[0])
+        self._cap = self._start / plant.fuel + self.CLEARANCE
 
     def step(self, pla: float, x: Array) -> Array:
         """Commands (4,) from the lever and the measured states (5,), recorded units."""
-        errors = self._distances(pla, x)
-        wanted = self.PROPORTIONAL * (errors - self._errors) + self.INTEGRAL * self._dt * errors
-        self._errors = errors
-        u = self._command.copy()
-        change = float(wanted.min()) * self._plant.fuel
-        u[0] += min(max(change, -self.FUEL_RATE * self._dt), self.FUEL_RATE * self._dt)
-        u[0] = max(u[0], self.LEAST_FUEL * self._plant.fuel)
+        fuel, dt, u = self._plant.fuel, self._dt, self._command.copy()
+        demand = fan_speed(pla, self._plant) + self._offset
+        error = float((demand - x[0]) / demand)
+        distance = min(1.0 - float(x[1]) / self._limits[0], 1.0 - float(x[4]) / self._limits[1])
+        self._correction += self.INTEGRAL * dt * error
+        wanted = self._start + fuel * (self._correction + self.PROPORTIONAL * error)
+        self._cap = min(self._cap + self.CAP * dt * distance, wanted / fuel + self.CLEARANCE)
+        limited = max(min(wanted, self._cap * fuel), self.LEAST_FUEL * fuel)
+        u[0] += min(max(limited - u[0], -self.FUEL_RATE * dt), self.FUEL_RATE * dt)
+        if u[0] != wanted:  # the integral does not run on while something else holds the fuel
+            self._correction -= self.INTEGRAL * dt * error
         targets = (nozzle_area(pla, self._plant), *vanes(float(x[0]), float(x[1]), self._plant))
         for j, (target, rate) in enumerate(
             zip(targets, (self.AREA_RATE, self.VANE_RATE, self.VANE_RATE), strict=True), start=1
         ):
-            limit = rate * self._dt
-            u[j] += min(max(target - u[j], -limit), limit)
+            u[j] += min(max(target - u[j], -rate * dt), rate * dt)
         self._command = u
         return u.copy()

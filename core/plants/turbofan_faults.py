@@ -44,6 +44,11 @@ class Fault:
         if self.kind not in KINDS:
             raise UncertainLTIError(f"turbofan: there is no fault '{self.kind}'; there are {', '.join(KINDS)}")
 
+    def first_sample(self, dt: float) -> int:
+        """The first sample that can show it: a sensor's at the onset, anything else one step later."""
+        onset = int(np.ceil(self.at / dt - 1e-9))
+        return onset if self.kind.startswith("sensor") else onset + 1
+
     def health(self, t: float) -> Health:
         """Efficiency factors at the instant t, s."""
         if self.kind == "compressor_wear" and t > self.at:

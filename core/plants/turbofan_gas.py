@@ -52,7 +52,7 @@ def isentropic_temperature(T1: float, ratio: float, w: float) -> float:
     """T2 of an isentropic change by the pressure ratio p2 / p1, K."""
     a, b = AIR_A + w * FUEL_A, AIR_B + w * FUEL_B
     target = a * log(T1) + b * T1 + R * log(ratio)
-    T2 = T1 * ratio ** (R / cp(T1, w))
+    T2: float = T1 * ratio ** (R / cp(T1, w))
     for _ in range(5):  # Newton's method on a nearly linear function of log T: quadratic from the first step
         T2 -= T2 * (a * log(T2) + b * T2 - target) / (a + b * T2)
     return T2
@@ -69,5 +69,5 @@ def mass_flow(area: float, P: float, T: float, w: float, p: float) -> float:
     if ratio >= 1.0:
         return -area * P / sqrt(R * T) * sqrt(2.0 * (ratio - 1.0))
     ratio = max(ratio, (2.0 / (g + 1.0)) ** (g / (g - 1.0)))
-    x = ratio ** (1.0 / g)
+    x: float = ratio ** (1.0 / g)
     return area * P / sqrt(R * T) * x * sqrt(2.0 * g / (g - 1.0) * (1.0 - ratio / x))

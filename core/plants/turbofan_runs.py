@@ -1,7 +1,7 @@
 """Recordings of the turbofan: what is commanded, what goes wrong, and the transient that results.
 
-Every run is sampled at 0.025 s; controls are recorded as commands and held between samples. Readings are rounded to 1e-9
-of their scale, so that a steady state is steady to the last bit.
+Every run is sampled at 0.025 s; controls are recorded as commands and held between samples. Readings are rounded to
+1e-9 of their scale, so that a steady state is steady to the last bit.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ def make_run(
 
 
 SMALL, LARGE = 0.05, 0.30
-"""Amplitudes: of the paper's transient (the paper gives none; this is chosen), and larger than the check's excursion."""
+"""Amplitudes: of the paper's transient (it gives none; this is chosen), and larger than the check's excursion."""
 NOISE = 1e-4
 RECORDINGS: dict[str, dict[str, str | float | int]] = {
     "turbofan_pulses_up": {"manoeuvre": "pulses", "amplitude": SMALL},

@@ -1,0 +1,133 @@
+"""The paper's experiment, and the paper's solver beside the exact one."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy", reason="scipy, which the experiment needs, is not installed")
+pytest.importorskip("matplotlib", reason="matplotlib, which draws the figures, is not installed")
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti.cli import main
+from uncertain_lti.errors import FitError
+from uncertain_lti.identification.direct_search import direct_search
+from uncertain_lti.plants.leibov import leibov2006, transient
+
+
+def objective(model, transients):
+    """(10) as written: the sum of squared widths over all steps."""
+    total = 0.0
+    for t in transients:
+        s = t.transitions()
+        point = model.operating_point
+        lower, upper = model.bounds(point.normalise_x(s.x), point.normalise_u(s.u), s.dt)
+        total += float(np.sum((upper - lower) ** 2))
+    return total
+
+
+@pytest.mark.parametrize("steps, seed", [(80, 1), (400, 2)])
+def test_the_direct_search_contains_every_sample_and_never_beats_the_exact_solver(steps, seed):
+    runs = [transient(steps, seed), transient(steps, seed + 10)]
+    exact, found = fit(runs), direct_search(runs)
+    monitor = EnvelopeMonitor(found.model)
+    assert not any(monitor.check(run).violated.any() for run in runs)
+    assert found.objective == pytest.approx(objective(found.model, runs), rel=1e-6)
+    assert exact.fit["objective"] <= found.objective * (1 + 1e-9)
+    assert found.objective < 1.5 * exact.fit["objective"]  # and it is no straw man
+    assert found.rows.sum() == pytest.approx(found.objective)
+
+
+def test_the_direct_search_finds_an_interval_that_can_be_told_by_hand():
+    """One state, dx/dt = a x with a drawn from {-1.5, -0.5}: a = -1 ± 0.5 and nothing narrower."""
+    x = [1.0]
+    for k in range(60):
+        x.append(x[-1] * (1.0 + 0.01 * (-1.5 if k % 2 else -0.5)))
+    run = Transient(0.01 * np.arange(61), np.array(x)[:, None], np.zeros((61, 0)))
+    run = Transient(run.t, run.x, run.u, signals=fit([run]).signals)
+    found = direct_search([run])
+    assert found.model.A[0, 0] == pytest.approx(-1.0, abs=1e-3)
+    assert found.model.dA[0, 0] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_direct_search_refuses_what_it_cannot_do():
+    run = transient(60, 1)
+    with pytest.raises(FitError, match="no signals"):
+        direct_search([Transient(run.t, run.x, run.u)])
+    x = run.x.copy()
+    x[1] += 0.01  # at rest before
+    with pytest.raises(FitError, match="at rest"):
+        direct_search([Transient(run.t_ns, x, run.u, signals=run.signals)])
+
+
+def test_the_published_model_can_be_checked_simulated_and_drawn(tmp_path):
+    from uncertain_lti.plots import envelope_figure
+
+    model, run = leibov2006(), transient(300, 3)
+    verdicts = EnvelopeMonitor(model).check(run)
+    assert not verdicts.violated.any()
+    assert model.simulate(run.x[0], run.u[:-1], run.dt).shape == run.x.shape
+    envelope_figure(model, verdicts, tmp_path / "f.png")
+    assert (tmp_path / "f.png").stat().st_size > 10_000
+    narrower = UncertainLTI(model.A, model.B, 0.5 * model.dA, 0.5 * model.dB, signals=model.signals)
+    assert EnvelopeMonitor(narrower).check(replace_name(run)).violated.any()
+
+
+def replace_name(run):
+    return Transient(run.t_ns, run.x, run.u, signals=replace(run.signals, source="copy"))
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reproduce")
+    assert main(["reproduce", "--output", str(folder / "new")]) == 0
+    return folder / "new", json.loads((folder / "new" / "reproduce.json").read_text())
+
+
+def case(data, name, criterion="qp", additive="none"):
+    (found,) = [
+        c
+        for c in data["cases"]
+        if (c["identified_from"], c["criterion"], c["additive"]) == (name, criterion, additive)
+    ]
+    return found
+
+
+@pytest.mark.slow
+def test_the_experiment_shows_what_it_must(experiment):
+    _, data = experiment
+    assert all(c["outside_identification"] == 0 for c in data["cases"])
+    for criterion in ("qp", "lp"):
+        paper, wide = case(data, "+5% (the paper's)", criterion), case(data, "±30%", criterion)
+        assert wide["inside_all"] >= 0.97 and wide["outside_domain"] == 0
+        assert paper["inside_all"] < 0.2 and paper["outside_domain"] > 90
+        assert max(wide["mean_width"]) < 0.01  # inside, and not because the bounds are wide
+        noisy = case(data, "±30%, noise 0.0001", criterion, "noise")
+        assert noisy["inside_all"] >= 0.97 and max(noisy["mean_width"]) < 0.02
+        assert max(case(data, "±30%, noise 0.0001", criterion)["mean_width"]) > 0.05  # what pure intervals cost
+        spools = [v[0] for v in wide["eigenvalues"][:2]]
+        assert spools == pytest.approx([-1.6, -2.0], rel=0.1)
+    for search in data["direct_search"]:
+        assert search["exact"] <= search["direct_search"] < 1.1 * search["exact"]
+        assert search["direct_search_seconds"] > search["exact_seconds"]
+
+
+@pytest.mark.slow
+def test_the_experiment_leaves_figures_models_and_numbers(experiment):
+    folder, data = experiment
+    for name in ("check.png", "check_paper_pulses.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    text = (folder / "reproduce.txt").read_text()
+    for word in ("-15.59", "published", "direct search", "thrust", "outside domain"):
+        assert word in text
+    models = list(folder.glob("*.model.json"))
+    assert len(models) == len(data["cases"])
+    for path in models:
+        UncertainLTI.load(path)
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    assert main(["reproduce", "--output", str(tmp_path / "file")]) == 2
+    assert "cannot be written" in capsys.readouterr().err

@@ -1,0 +1,361 @@
+"""The nonlinear turbofan: balances, plausibility, modes, control, faults, and the recordings made with it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy", reason="scipy, which integrates the turbofan, is not installed")
+
+from uncertain_lti import SignalMap, read_transients
+from uncertain_lti.bag import Bag
+from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.plants import turbofan_gas as gas
+from uncertain_lti.plants.turbofan import CONTROLS, STATES, Engine, GasPathSolver, Health, engine
+from uncertain_lti.plants.turbofan_components import P_STANDARD, T_STANDARD
+from uncertain_lti.plants.turbofan_control import Controller, fan_speed, operating_point, trim
+from uncertain_lti.plants.turbofan_faults import KINDS, Fault
+from uncertain_lti.plants.turbofan_runs import (
+    DT,
+    LEVELS,
+    RECORDINGS,
+    START_NS,
+    Run,
+    _advance,
+    make_run,
+    pulses,
+    simulate,
+    turbofan_signals,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+LEVERS = (68.0, 64.0, 60.0, 50.0, 40.0, 25.0, 12.0)
+WALSH_FLETCHER_AIR = (0.992313, 0.236688, -1.852148, 6.083152, -8.893933, 7.097112, -3.234725, 0.794571, -0.081873)
+
+
+@pytest.fixture(scope="module")
+def plant() -> Engine:
+    return engine()
+
+
+# --- gas ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("w", [0.0, 0.02, 0.05])
+def test_gas_relations_are_inverse_to_one_another(w):
+    for T in (250.0, 600.0, 1700.0):
+        assert gas.temperature(gas.enthalpy(T, w), w) == pytest.approx(T, rel=1e-13)
+        for ratio in (0.1, 0.7, 3.0, 30.0):
+            T2 = gas.isentropic_temperature(T, ratio, w)
+            assert gas.pressure_ratio(T, T2, w) == pytest.approx(ratio, rel=1e-12)
+        slope = (gas.enthalpy(T + 0.5, w) - gas.enthalpy(T - 0.5, w)) / 1.0
+        assert slope == pytest.approx(gas.cp(T, w), rel=1e-12)
+
+
+def test_specific_heat_of_air_is_that_of_walsh_and_fletcher_to_three_per_cent():
+    for T in np.linspace(280.0, 1750.0, 50):
+        exact = 1e3 * sum(a * (T / 1e3) ** i for i, a in enumerate(WALSH_FLETCHER_AIR))
+        assert gas.cp(float(T), 0.0) == pytest.approx(exact, rel=0.023)
+
+
+def test_a_choked_passage_passes_no_more_when_the_pressure_behind_it_falls():
+    flows = [gas.mass_flow(0.2, 3e5, 800.0, 0.01, p) for p in (2.9e5, 2.3e5, 1.8e5, 1.6e5, 1.5e5, 1e5, 1e4)]
+    assert flows[0] < flows[1] < flows[2]
+    assert flows[-1] == flows[-2] == flows[-3]
+    # the textbook flow function at Mach 1
+    g = gas.gamma(800.0, 0.01)
+    choked = 0.2 * 3e5 / np.sqrt(800.0) * np.sqrt(g / gas.R) * (2 / (g + 1)) ** ((g + 1) / (2 * (g - 1)))
+    assert flows[-1] == pytest.approx(choked, rel=1e-12)
+
+
+# --- steady states ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pla", LEVERS)
+def test_mass_energy_and_power_balance_at_every_trimmed_point(plant, pla):
+    """To 1e-9 of the flow, of the fuel's heat and of the shaft powers."""
+    t = trim(pla)
+    p, d = t.path, plant.design
+    assert p.W2 == pytest.approx(p.W25 + p.W16, rel=1e-12)
+    assert p.W4 == pytest.approx(p.W25 + p.fuel, rel=1e-12)
+    assert p.W8 == pytest.approx(p.W2 + p.fuel, rel=1e-9)
+    assert p.residual < 1e-9
+    assert p.low_turbine_power * d.mechanical_efficiency == pytest.approx(p.fan_power, rel=1e-9)
+    assert p.high_turbine_power * d.mechanical_efficiency == pytest.approx(p.compressor_power, rel=1e-9)
+    # first law over the whole engine: air, heat of the fuel, bearing losses, exhaust
+    heat = p.fuel * (d.combustion_efficiency * gas.HEATING_VALUE + gas.enthalpy(gas.T_REFERENCE, 1.0))
+    heat -= p.fuel * gas.enthalpy(gas.T_REFERENCE, 0.0)  # the products are counted from the reference temperature
+    losses = (1.0 - d.mechanical_efficiency) * (p.low_turbine_power + p.high_turbine_power)
+    into = p.W2 * gas.enthalpy(T_STANDARD, 0.0) + heat + p.fuel * gas.enthalpy(gas.T_REFERENCE, 0.0)
+    out = p.W8 * gas.enthalpy(p.T6, p.w6) + losses
+    assert abs(into - out) < 1e-9 * p.fuel * gas.HEATING_VALUE
+    rate = plant.derivative(t.x.tolist(), t.u.tolist()) / t.x
+    assert np.abs(rate).max() < 1e-9
+
+
+def test_maximum_regime_is_an_engine_of_its_class():
+    """Beside the published figures of the RD-33; docs/turbofan.md says where and why they differ."""
+    p = trim(68.0).path
+    assert p.W2 == pytest.approx(76.0, rel=1e-6)
+    assert p.overall_pressure_ratio == pytest.approx(21.7, rel=0.01)
+    assert p.bypass_ratio == pytest.approx(0.49, rel=1e-6)
+    assert p.thrust == pytest.approx(49.4e3, rel=0.03)
+    assert 0.68 < p.specific_consumption < 0.79
+
+
+def test_less_lever_means_less_of_everything_down_to_idle():
+    trims = [trim(pla) for pla in LEVERS]
+    for quantity in ("thrust", "W2", "P3", "T3", "T4", "T5", "fuel", "P13"):
+        values = [getattr(t.path, quantity) for t in trims]
+        assert all(a > b for a, b in zip(values, values[1:], strict=False)), quantity
+    for t in trims:
+        assert t.path.T3 > t.path.T13 > T_STANDARD
+        assert t.path.T4 > t.path.T5 > t.path.T6
+        assert t.path.P3 > t.path.P13 > t.path.P6 > P_STANDARD
+
+
+@pytest.mark.parametrize("pla", [68.0, 60.0])
+def test_controls_act_as_they_do_on_an_engine(plant, pla):
+    point, t = operating_point(), trim(pla)
+    B = plant.linearise(t.x, t.u, point.X, point.U)[1]
+    gain = -np.linalg.solve(plant.linearise(t.x, t.u, point.X, point.U)[0], B)
+    fuel, area, fan_vane, _ = gain.T
+    assert (fuel > 0).all()  # more fuel: faster, hotter, more pressure
+    assert area[0] > 0 and area[3] < 0 and area[4] < 0  # a wider nozzle unloads the turbine: the fan runs faster
+    assert fan_vane[0] > 0  # closed vanes unload the fan
+
+
+def test_modes_are_of_the_order_of_the_papers(plant):
+    point = operating_point()
+    A, _ = plant.linearise(point.x_s, point.u_s, point.X, point.U)
+    values = sorted(np.linalg.eigvals(A).real, reverse=True)
+    assert values[:2] == pytest.approx([-1.6, -2.0], rel=0.05)
+    assert all(-23.0 < v < -14.0 for v in values[2:])
+    assert not A[:2, 2:].any()  # as printed in the paper: readings do not act on the spools
+
+
+# --- integration and control --------------------------------------------------------------------------------
+
+
+def test_a_step_is_integrated_to_nine_digits(plant):
+    """One step of the run equals a hundred with Runge and Kutta's classical method."""
+    point, t = operating_point(), trim(66.0)
+    u = t.u * [1.1, 1.05, 1.0, 1.0] + [0.0, 0.0, 2.0, -2.0]
+    once = _advance(plant, GasPathSolver(plant), t.x, u, point.X, Health())
+    x, h = t.x.copy(), DT / 100
+    solver = GasPathSolver(plant)
+
+    def rate(x):
+        return plant.derivative(x.tolist(), u.tolist(), Health(), solver)
+
+    for _ in range(100):
+        a = rate(x)
+        b = rate(x + 0.5 * h * a)
+        c = rate(x + 0.5 * h * b)
+        x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c))
+    assert np.abs((once - x) / point.X).max() < 1e-9
+    assert np.abs((once - t.x) / point.X).max() > 1e-4
+
+
+@pytest.fixture(scope="module")
+def accelerated():
+    """From 60 to 68 deg and back to 62."""
+    return simulate(Run(801, lever=((0.0, 60.0), (1.0, 68.0), (10.0, 62.0))))
+
+
+def test_fan_speed_follows_the_lever(plant, accelerated):
+    x, demand = accelerated.x, [fan_speed(pla, plant) for pla in (60.0, 68.0, 62.0)]
+    for second, target in ((0.9, demand[0]), (9.9, demand[1]), (20.0, demand[2])):
+        assert x[round(second / DT), 0] == pytest.approx(target, rel=2e-3)
+    assert x[:, 0].max() < 1.01 * demand[1]
+    assert x[-1] == pytest.approx(trim(62.0).x, rel=3e-3)
+    assert accelerated.u[-1, 1:] == pytest.approx(trim(62.0).u[1:], rel=1e-2)
+
+
+def test_limits_hold(plant, accelerated):
+    rate = np.abs(np.diff(accelerated.u, axis=0)) / DT
+    limits = [Controller.FUEL_RATE, Controller.AREA_RATE, Controller.VANE_RATE, Controller.VANE_RATE]
+    assert (rate <= np.array(limits) * (1 + 1e-9)).all()
+    assert rate[:, 0].max() == pytest.approx(Controller.FUEL_RATE)
+    assert accelerated.x[:, 4].max() < 1.005 * Controller.TEMPERATURE_LIMIT * operating_point().x_s[4]
+    assert accelerated.x[:, 1].max() < 1.002 * Controller.COMPRESSOR_LIMIT * plant.design.compressor_speed
+
+
+def test_a_worn_engine_is_held_at_its_temperature_limit(monkeypatch):
+    """Where the maximum's fan speed would cost more, the turbine's temperature is what holds the fuel."""
+    lever, fault = ((0.0, 68.0),), Fault("compressor_wear", 0.0)
+    free = simulate(Run(601, lever=lever, fault=fault))
+    monkeypatch.setattr(Controller, "TEMPERATURE_LIMIT", 1.005)
+    held = simulate(Run(601, lever=lever, fault=fault))
+    point = operating_point()
+    assert free.x[-1, 4] > 1.01 * point.X[4]
+    assert held.x[:, 4].max() < 1.01 * point.X[4]
+    assert held.x[-1, 4] == pytest.approx(1.005 * point.X[4], rel=1e-3)
+    assert held.x[-1, 0] < free.x[-1, 0]
+
+
+# --- runs ---------------------------------------------------------------------------------------------------
+
+
+def test_pulses_are_those_of_the_paper():
+    u = np.array([pulses(k * DT, 1.0) for k in range(1201)])
+    for j in range(4):
+        on = np.flatnonzero(u[:, j])
+        assert len(on) == 150 and (np.diff(on) == 1).all()  # 3.75 s
+        assert (u[on][:, np.arange(4) != j] == 0).all()
+    assert (np.count_nonzero(u, axis=1) <= 1).all()
+    assert not u[:75].any() and not u[-75:].any()
+
+
+def test_at_rest_nothing_moves_by_a_single_bit():
+    run = simulate(Run(41, lever=((0.0, 68.0),)))
+    assert (run.x == run.x[0]).all() and (run.u == run.u[0]).all()
+    signals = turbofan_signals()
+    assert run.x[0].tolist() == [s.steady for s in signals.states]
+    assert run.u[0].tolist() == [s.steady for s in signals.controls]
+
+
+def test_a_run_is_the_same_every_time_and_noise_is_what_was_asked_for():
+    quiet = simulate(make_run("levels", samples=201))
+    runs = [simulate(make_run("levels", noise=1e-3, seed=seed, samples=201)) for seed in (5, 5, 6)]
+    assert np.array_equal(runs[0].x, runs[1].x) and np.array_equal(runs[0].u, runs[1].u)
+    assert not np.array_equal(runs[0].x, runs[2].x)
+    error = (runs[0].x - quiet.x)[:150] / operating_point().X  # the lever rests: noise moves the loop little
+    assert error.std(axis=0) == pytest.approx(np.full(5, 1e-3), rel=0.35)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_shows_from_its_onset_and_not_before(kind):
+    fault = Fault(kind, 1.0)
+    lever = ((0.0, 68.0), (1.5, 62.0))
+    healthy, faulty = simulate(Run(121, lever=lever)), simulate(Run(121, lever=lever, fault=fault))
+    onset = fault.first_sample(DT)
+    assert np.array_equal(healthy.x[:onset], faulty.x[:onset])
+    assert np.array_equal(healthy.u[:onset], faulty.u[:onset])
+    last = np.abs((faulty.x[-1] - healthy.x[-1]) / operating_point().X).max()
+    assert last > 1e-4
+    if kind in ("sensor_bias", "fan_damage"):  # sudden: at the very sample
+        assert np.abs((faulty.x[onset] - healthy.x[onset]) / operating_point().X).max() > 1e-5
+
+
+def test_a_stuck_actuator_is_recorded_as_the_command_it_ignores():
+    lever = ((0.0, 68.0), (0.5, 62.0))
+    run = simulate(Run(161, lever=lever, fault=Fault("nozzle_stuck", 0.25)))
+    area = run.u[:, CONTROLS.index("nozzle_throat_area")]
+    assert area[-1] > 1.005 * area[0]
+    # the engine runs as it would with the area it is stuck at
+    free = simulate(Run(161, lever=lever))
+    assert run.x[-1, 3] > 1.01 * free.x[-1, 3]
+
+
+def test_impossible_requests_are_refused_in_a_sentence(plant):
+    for call, words in (
+        (lambda: trim(70.0), "PLA is 70"),
+        (lambda: Fault("gremlins", 1.0), "no fault 'gremlins'"),
+        (lambda: make_run("loop"), "no manoeuvre 'loop'"),
+        (lambda: make_run("check", amplitude=0.1), "amplitude"),
+        (lambda: make_run("pulses"), "amplitude"),
+        (lambda: make_run("check", samples=1), "at least 2"),
+        (lambda: make_run("check", noise=-1.0), "noise"),
+        (lambda: simulate(make_run("pulses", 0.9)), "no matched gas path"),
+    ):
+        with pytest.raises(UncertainLTIError, match=words):
+            call()
+
+
+def test_the_gas_path_does_not_depend_on_where_the_solver_comes_from(plant):
+    t, far = trim(62.0), trim(25.0)
+    solver = GasPathSolver(plant)
+    cold = plant.gas_path(t.x.tolist(), t.u.tolist())
+    solver.solve(far.x.tolist(), far.u.tolist(), Health())
+    warm = plant.gas_path(t.x.tolist(), t.u.tolist(), solver=solver)
+    for name in ("P3", "P5", "T5", "W2", "thrust"):
+        assert getattr(warm, name) == pytest.approx(getattr(cold, name), rel=1e-10)
+
+
+# --- shipped recordings -------------------------------------------------------------------------------------
+
+
+def test_the_signals_file_says_what_the_plant_is():
+    read, made = SignalMap.load(ROOT / "config/signals/turbofan.yaml"), turbofan_signals()
+    for a, b in zip(read.signals, made.signals, strict=True):
+        assert (a.name, a.topic, a.field, a.unit, a.max_hold) == (b.name, b.topic, b.field, b.unit, b.max_hold)
+        assert a.steady == pytest.approx(b.steady, rel=1e-8, abs=1e-12)
+        assert a.scale == pytest.approx(b.scale, rel=1e-8)
+    assert (read.clock, read.max_gap, dict(read.time)) == (made.clock, made.max_gap, dict(made.time))
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in RECORDINGS if n in ("turbofan_check", "turbofan_pulses_up", "turbofan_fan_damage")]
+)
+def test_a_recording_holds_what_a_simulation_gives(name):
+    """Read from the bag that two processes made, beside the same run made here: stamps, readings and commands."""
+    (bag,) = read_transients(ROOT / "bags" / f"{name}.mcap", ROOT / "config/signals/turbofan.yaml")
+    made = simulate(make_run(**RECORDINGS[name]))
+    assert bag.t_ns[0] == START_NS
+    assert np.array_equal(bag.t_ns, made.t_ns)
+    assert bag.usable.all()
+    X, U = operating_point().X, operating_point().U
+    # machines round differently in the last digits, and a reading's last digit is 1e-9
+    assert np.abs((bag.x - made.x) / X).max() < 1e-8
+    assert np.abs((bag.u[:-1] - made.u[:-1]) / U).max() < 1e-8
+
+
+def test_every_recording_is_shipped_and_says_what_happens_in_it():
+    from mcap.reader import make_reader
+
+    for name, parameters in RECORDINGS.items():
+        path = ROOT / "bags" / f"{name}.mcap"
+        with path.open("rb") as stream:
+            (notes,) = [r.metadata for r in make_reader(stream).iter_metadata() if r.name == "uncertain_lti"]
+        assert notes["plant"] == "turbofan"
+        assert {key: notes[key] for key in parameters if key != "fault_at"} == {
+            key: str(value) for key, value in parameters.items() if key != "fault_at"
+        }
+        if "fault" in parameters:
+            assert float(notes["fault_at"].split()[0]) == parameters["fault_at"]
+            assert notes["what happens"] == KINDS[parameters["fault"]]
+        assert set(Bag(path).topics) == {"/engine/state", "/engine/control"}
+    assert sum(p.stat().st_size for p in (ROOT / "bags").iterdir()) < 4 * 2**20
+
+
+def test_faults_begin_while_the_recording_still_has_lever_movements_to_come():
+    for parameters in RECORDINGS.values():
+        if "fault" in parameters:
+            later = [t for t, _ in LEVELS if parameters["fault_at"] < t < parameters["samples"] * DT]
+            assert later
+
+
+@pytest.mark.slow
+def test_recording_anew_gives_identical_payloads(tmp_path):
+    """Node and recorder, two processes, twice: byte for byte the same messages on every topic."""
+    pytest.importorskip("rclpy", reason="neither a ROS 2 installation nor the rclpy wheels are here")
+    from ros_processes import open_world
+
+    parameters = {"manoeuvre": "check", "noise": 1e-4, "seed": 9, "rate": 4.0}
+    payloads = []
+    for number in (1, 2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with open_world(folder) as world:
+            bag = folder / "run.mcap"
+            recorder = world.command("record", "/engine/state", "/engine/control", "--output", bag)
+            world.run_node("turbofan", parameters).succeed(60.0)
+            recorder.signal(2)
+            recorder.succeed()
+        payloads.append({t: [m.data for m in Bag(bag).raw_messages([t])] for t in ("/engine/state", "/engine/control")})
+    assert payloads[0] == payloads[1]
+    assert [len(p) for p in payloads[0].values()] == [101, 101]
+    (read,) = read_transients(bag, ROOT / "config/signals/turbofan.yaml")
+    made = simulate(make_run("check", noise=1e-4, seed=9))
+    assert np.array_equal(read.x, made.x) and np.array_equal(read.t_ns, made.t_ns)
+    assert list(read.state_names) == list(STATES)
+
+
+def test_other_rotors_change_the_modes_and_not_the_steady_state(plant):
+    light = Engine(rotors=replace(plant.rotors, low=plant.rotors.low / 2, high=plant.rotors.high / 2))
+    point, t = operating_point(), trim(68.0, light)
+    assert t.x == pytest.approx(trim(68.0).x, rel=1e-9)
+    A = plant.linearise(t.x, t.u, point.X, point.U)[0]
+    assert light.linearise(t.x, t.u, point.X, point.U)[0][:2] == pytest.approx(2.0 * A[:2], rel=1e-6, abs=1e-9)
