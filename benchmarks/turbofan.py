@@ -31,7 +31,7 @@ def seen(monitor, run, first, healthy):
     share, usual = violated.mean(), monitor.check(healthy).violated[first:].mean()
     if share <= 2.0 * usual + 0.01:
         return f"no ({share:.1%})"
-    raised = str(np.argmax(alarm) + 1) if alarm.any() else "none"
+    raised = "already up" if verdicts.alarm[first - 1] else str(np.argmax(alarm) + 1) if alarm.any() else "none"
     return f"{np.argmax(violated) + 1} / {raised} / {share:.0%}"
 
 
