@@ -1,0 +1,570 @@
+"""What befalls a monitor on a robot, with real publishers in other processes: it survives, tells, and never lies."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_writer import Layout, Message, Topic, write
+
+from uncertain_lti import UncertainLTI
+from uncertain_lti.model import Alarm
+from uncertain_lti.monitor import Verdict
+from uncertain_lti.sampler import Status
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
+from ros_processes import Diagnostics, World, open_world, until
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, UInt8
+from std_srvs.srv import Trigger
+from test_live import (
+    CONTROL,
+    EPOCH_NS,
+    ERROR,
+    JOINT_STATE,
+    OK,
+    STALE,
+    STATE,
+    STEP_NS,
+    VECTOR,
+    WARN,
+    Outputs,
+    Plant,
+    by_hand,
+    header_bag,
+    joint_state,
+    offline,
+    run_of,
+    saved,
+    stamp_of,
+    vector,
+)  # fmt: skip
+
+NODE = "/envelope_monitor"
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+def trigger(world: World, name: str) -> tuple[bool, str]:
+    answer = world.call(Trigger, f"{NODE}/{name}", Trigger.Request())
+    return answer.success, answer.message
+
+
+def stamped(message: Any, t_ns: int) -> Any:
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 10**9)
+    return message
+
+
+def ever(diagnostics: Diagnostics, level: int, saying: str) -> bool:
+    """Whether the monitor's status was ever of this level and message."""
+    statuses = [array.status[0] for array in diagnostics.topic.messages if array.status]
+    return any(s.level == bytes([level]) and saying in s.message for s in statuses)
+
+
+# --- clocks, disorder and bad messages ----------------------------------------------------------------------
+
+
+def faulty_bag(model: UncertainLTI, path: Path, steps: int) -> Path:
+    """Stamps a year ahead on either topic, jumps forward and back, and messages filled oddly for a while."""
+    x, u = run_of(model, steps, 5)
+    messages: list[Message] = []
+    year = 365 * 86400 * 10**9
+    t, log = EPOCH_NS, EPOCH_NS
+    for k in range(steps):
+        state, control = joint_state(t, x[k]), vector(t, *u[k])
+        if k % 97 == 40:
+            state = joint_state(t + year, x[k])
+        elif k % 97 == 50:
+            control = vector(t + year, *u[k])
+        elif k % 97 in (60, 61):
+            state = joint_state(t, [np.inf, -np.inf])
+        elif k % 97 == 63:
+            state = joint_state(t, [1e308, x[k][1]])  # a sentinel: judged, and far outside
+        elif k % 97 in range(65, 70):
+            state = joint_state(t, [*x[k], 0.0], ("c", "b", "a"))
+        elif k % 97 in range(70, 75):
+            state = joint_state(t, x[k][:1])  # two names, one value
+        elif k % 97 == 76:
+            state = joint_state(t, np.zeros(20_000), tuple(f"n{i}" for i in range(20_000)))
+        elif k % 97 in range(78, 82):
+            state = joint_state(t, [], ())
+        elif k % 97 == 84:
+            state = joint_state(t, [*x[k], *x[k]], ("a", "b", "a", "b"))
+        messages += [Message(CONTROL, log, control), Message(STATE, log + 200_000, state)]
+        t += STEP_NS
+        log += STEP_NS
+        if k % 97 == 90:
+            t += 3600 * 10**9
+        elif k % 97 == 95:
+            t -= 2 * 3600 * 10**9
+    topics = [Topic(STATE, JOINT_STATE), Topic(CONTROL, VECTOR)]
+    return write(topics, messages, Layout("zstd", chunk_size=1 << 16)).save(path)
+
+
+def orderly_bag(model: UncertainLTI, path: Path, steps: int) -> Path:
+    """Every control just before the state of the same stamp, so that a monitor may begin anywhere."""
+    x, u = run_of(model, steps, 9)
+    messages = []
+    for k in range(steps):
+        t = EPOCH_NS + k * STEP_NS
+        messages += [Message(CONTROL, t, vector(t, *u[k])), Message(STATE, t + 3_000_000, joint_state(t, x[k]))]
+    return write([Topic(STATE, JOINT_STATE), Topic(CONTROL, VECTOR)], messages).save(path)
+
+
+def test_under_every_disorder_the_verdicts_are_those_of_the_offline_check(world: World, tmp_path: Path) -> None:
+    model = by_hand(alarm=Alarm(2, 5))
+    path = saved(model, tmp_path)
+    bag = faulty_bag(model, tmp_path / "faults.mcap", 400)
+    verdicts = offline(path, bag)
+    assert {v.status for v in verdicts} >= {Status.OK, Status.MISSING, Status.GAP, Status.RESET}
+    process = world.monitor(path)
+    outputs = Outputs.of(world)
+    world.command("play", bag, "--rate", 2).succeed(60)
+    outputs.hold_against(verdicts, ("a", "b"))
+    status = world.status()
+    assert status["counters"]["gaps"] == sum(v.status is Status.GAP for v in verdicts) > 0
+    assert status["counters"]["resets"] == sum(v.status is Status.RESET for v in verdicts) > 0
+    assert status["unexpected_errors"] == 0 and "Traceback" not in process.output
+    assert status["received"] == {STATE: 400, CONTROL: 400}
+
+
+def test_stamps_from_the_future_are_counted_and_told(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
+    diagnostics = world.diagnostics()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(5)
+    assert world.status()["future"] == {}
+    plant.t_ns = time.time_ns() + 3600 * 10**9
+    plant.send(3)
+    until(lambda: ever(diagnostics, WARN, "lie over 1 s in the future"), "a warning", 5)
+    assert world.status()["future"] == {STATE: 3, CONTROL: 3}
+    plant.t_ns = EPOCH_NS
+    plant.send(3)
+    got = [m.position[0] for m in flags.count(11)]
+    np.testing.assert_array_equal(np.isnan(got), [True, *[False] * 4, True, False, False, True, False, False])
+
+
+def test_mutated_messages_do_no_harm(world: World, tmp_path: Path) -> None:
+    """Seeded damage to serialised messages, sent as they are; between them sound ones are judged as ever."""
+    model = by_hand()
+    process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1, largest_message=0.25)
+    diagnostics = world.diagnostics()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model).subscribed()
+    rng = random.Random(11)
+    sound = [
+        serialize_message(stamped(JointState(name=["a", "b"], position=[0.3, 0.3]), EPOCH_NS)),
+        serialize_message(stamped(JointState(name=["b", "a"], position=[0.3, 0.3], effort=[1.0] * 9), EPOCH_NS)),
+    ]
+    for _ in range(400):
+        plant.state.publish(mutated(rng, rng.choice(sound)))
+        time.sleep(0.002)
+    until(lambda: world.status()["received"].get(STATE) == 400, "all of them")
+    assert sum(world.status()["unreadable"].values()) > 50
+    diagnostics.reaches(STALE, saying=f"{STATE}: a message cannot be decoded")
+    plant.state.publish(JointState(name=["a", "b"], position=[0.0] * 100_000))
+    until(lambda: world.status()["received"].get(STATE) == 401, "the huge one")
+    diagnostics.reaches(STALE, saying="more than parameter largest_message allows")
+    plant.t_ns = EPOCH_NS + 10**12  # later than whatever stamp got through, or a step back: a new segment either way
+    heard = len(flags.messages)
+    plant.send(6)
+    plant.send(1, off=2.0)
+    plant.send(1)
+    got = [m for m in flags.count(heard + 8)[heard:]]
+    assert [m.position[0] for m in got[-7:]] == [0, 0, 0, 0, 0, 0, 1]
+    assert process.running and world.status()["unexpected_errors"] == 0 and "Traceback" not in process.output
+
+
+def mutated(rng: random.Random, data: bytes) -> bytes:
+    """A few bytes changed, lengths made to lie, or the end cut off or repeated."""
+    body = bytearray(data)
+    for _ in range(rng.randint(1, 4)):
+        kind = rng.random()
+        if kind < 0.4:
+            body[rng.randrange(len(body))] = rng.randrange(256)
+        elif kind < 0.7:
+            at = rng.randrange(4, max(5, len(body) - 4)) & ~3
+            body[at : at + 4] = rng.choice([b"\xff" * 4, bytes(4), b"\xff\xff\xff\x7f", b"\x03\0\0\0"])
+        elif kind < 0.9:
+            del body[rng.randrange(4, len(body)) :]
+        else:
+            body += body[rng.randrange(len(body)) :]
+        if len(body) < 5:
+            break
+    return bytes(body)
+
+
+def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=0.4, heartbeat=0.2)
+    diagnostics = world.diagnostics()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    violation = world.listen(Bool, f"{NODE}/violation").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(10)
+    flags.count(10)
+
+    u = plant.model.operating_point.u_s
+    for k in range(60):  # the control goes on, the state does not
+        message = stamped(Vector3Stamped(), plant.t_ns + k * STEP_NS)
+        message.vector.x, message.vector.y = float(u[0]), float(u[1])
+        plant.control.publish(message)
+        time.sleep(0.01)
+    status = diagnostics.reaches(STALE, saying=f"no message on {STATE} for", patience=5)
+    values = Diagnostics.values(status)
+    assert float(values[f"age {CONTROL}"]) < 0.4 <= float(values[f"age {STATE}"])
+    assert len(flags.messages) == 10 and violation.messages[-1].data is False
+
+    plant.t_ns += 60 * STEP_NS
+    plant.send(5)
+    flags.count(15)
+    x = plant.model.operating_point.recorded_x(plant.x).tolist()
+    for k in range(80):  # the state goes on, the control does not: held for max_hold, 0.5 s, and no longer
+        plant.state.publish(stamped(JointState(name=["a", "b"], position=x), plant.t_ns + k * STEP_NS))
+        time.sleep(0.01)
+    got = np.isnan([m.position[0] for m in flags.count(95)[15:]])
+    held = np.flatnonzero(got)[0]
+    assert 49 <= held <= 52 and got[held:].all(), held
+    assert ever(diagnostics, WARN, "a signal is missing, stale or not finite")
+    values = Diagnostics.values(diagnostics.reaches(STALE, patience=5))
+    assert float(values[f"age {CONTROL}"]) > 0.5 and int(values["stale p"]) > 20
+
+
+def test_missed_deadlines_are_told(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    plant = Plant(world, model)
+    world.node.destroy_publisher(plant.state)
+    plant.state = world.publisher(JointState, STATE, QoSProfile(depth=100, deadline=Duration(seconds=0.2)))
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
+    diagnostics = world.diagnostics()
+    plant.subscribed().send(5)
+    status = diagnostics.reaches(WARN, saying=f"{STATE}: ", patience=5)
+    assert "deadlines missed by its publishers" in status.message
+
+
+# --- processes that are killed ------------------------------------------------------------------------------
+
+
+def test_a_publisher_that_is_killed_and_comes_back_causes_no_wrong_verdict(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    path = saved(model, tmp_path)
+    bag = header_bag(model, tmp_path / "run.mcap", 150)
+    once = offline(path, bag)
+    world.monitor(path, diagnostics_period=0.1, state_timeout=0.3)
+    diagnostics = world.diagnostics()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    player = world.command("play", bag)
+    flags.count(40)
+    player.kill()
+    diagnostics.reaches(STALE, saying=f"no message on {STATE} for")
+    time.sleep(0.3)
+    heard = len(flags.messages)
+    np.testing.assert_array_equal([m.position for m in flags.messages], [v.flags for v in once[:heard]])
+    world.command("play", bag).succeed(60)
+    again = flags.count(heard + len(once))[heard:]
+    np.testing.assert_array_equal([m.position for m in again], [v.flags for v in once])
+
+
+def test_a_monitor_that_is_killed_is_missed_and_resumes_without_a_wrong_verdict(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    path = saved(model, tmp_path)
+    bag = orderly_bag(model, tmp_path / "run.mcap", 900)
+    expected: dict[int, Verdict] = {v.t_ns: v for v in offline(path, bag) if v.judged}
+    missed: list[Any] = []
+    promised = QoSProfile(depth=5000, deadline=Duration(seconds=0.4))
+    process = world.monitor(path, heartbeat=0.4)
+    events = SubscriptionEventCallbacks(deadline=missed.append)
+    violation = world.listen(Bool, f"{NODE}/violation", promised, event_callbacks=events).connected()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    player = world.command("play", bag)
+    flags.count(200)
+    process.kill()
+    until(lambda: missed, "the missed deadline", 5)
+    before = len(flags.messages)
+    world.run_node("envelope_monitor", {"model": str(path), "heartbeat": 0.4})
+    until(lambda: len(flags.messages) > before + 50 or not player.running, "the second monitor")
+    player.succeed(60)
+    time.sleep(0.3)
+    after = flags.messages[before:]
+    assert len(after) > 50, "the recording ended too soon for this test"
+    assert np.isnan(after[0].position).all(), "the first sample after a start has nothing to be judged by"
+    for message in flags.messages:
+        if not np.isnan(message.position[0]):
+            np.testing.assert_array_equal(message.position, expected[stamp_of(message)].flags)
+    assert violation.messages
+
+
+def test_errors_that_nobody_foresaw_are_counted_told_and_outlived(world: World, tmp_path: Path) -> None:
+    """The judging and the reporting are made to fail now and then, and a timer fails past every guard."""
+    model = by_hand()
+    code = """
+import sys
+from uncertain_lti.monitor import EnvelopeMonitor
+from uncertain_lti_ros import envelope_monitor
+judge, report, count = EnvelopeMonitor.judge, envelope_monitor.EnvelopeMonitorNode._report, [0, 0]
+def judging(*args, **named):
+    count[0] += 1
+    if count[0] % 10 == 0:
+        raise ZeroDivisionError("every tenth")
+    return judge(*args, **named)
+def reporting(node):
+    count[1] += 1
+    if count[1] == 5:
+        node.create_timer(0.3, lambda: 1 / 0)
+    if count[1] % 7 == 0:
+        raise KeyError("every seventh")
+    return report(node)
+EnvelopeMonitor.judge = judging
+envelope_monitor.EnvelopeMonitorNode._report = reporting
+sys.exit(envelope_monitor.main())
+"""
+    path = saved(model, tmp_path)
+    process = world.start(
+        "monitor", "-c", code, "--ros-args", "-p", f"model:={json.dumps(str(path))}", "-p", "diagnostics_period:=0.1"
+    )
+    until(lambda: world.status().get("state") == "active" or not process.running, "an active monitor")
+    diagnostics = world.diagnostics()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(40)
+    got = [m.position[0] for m in flags.count(36)]
+    assert np.isnan(got).sum() == 4  # the first, and the first after each that was lost; nothing was called contained
+    assert not any(value == 1.0 for value in got)
+    status = diagnostics.reaches(STALE, saying="unexpected errors, the last", patience=5)
+    until(lambda: world.status()["unexpected_errors"] > 10, "errors of the timer")
+    assert int(Diagnostics.values(status)["unexpected errors"]) >= 4
+    assert "ZeroDivisionError: every tenth" in process.output
+    assert process.output.count("Traceback") < 6, "a log must not be flooded"
+    assert process.running
+
+
+# --- the alarm ----------------------------------------------------------------------------------------------
+
+
+def test_masks_grace_latch_and_reset(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, masked="b", latch=True, state_timeout=60.0)
+    diagnostics = world.diagnostics()
+    outputs = Outputs.of(world)
+    flags, violation = outputs.topics["flags"], outputs.topics["violation"]
+    plant = Plant(world, model).subscribed()
+    only_b = np.array([0.0, 2.0])
+    plant.send(1)
+    plant.send(3, off=only_b)  # type: ignore[arg-type]
+    plant.send(1)
+    assert [list(m.position) for m in flags.count(5)[1:]] == [[0, 0], [0, 1], [0, 1], [0, 1]]
+    assert not any(m.data for m in violation.messages)
+    status = diagnostics.reaches(OK, saying="masked: b", patience=5)
+    assert diagnostics.latest("envelope_monitor: b").message.endswith("(masked)")
+    plant.send(1, off=2.0)
+    plant.send(5)
+    until(lambda: violation.messages[-1].data, "the alarm")
+    flags.count(11)
+    time.sleep(0.3)
+    assert [m.position[0] for m in flags.messages[-4:]] == [0, 0, 0, 0] and violation.messages[-1].data, "not latched"
+    status = diagnostics.reaches(ERROR, saying="latched until ~/reset", patience=5)
+    assert Diagnostics.values(status)["latched"] == "1"
+    success, message = trigger(world, "reset")
+    assert success and message == "the alarm is reset"
+    until(lambda: not violation.messages[-1].data, "the end of the alarm")
+    plant.send(3)
+    diagnostics.reaches(OK, patience=5)
+    assert trigger(world, "reset")[0]
+
+    for wrong, why in (("c", "masked state 'c' is not in the model"), ("a, b", "every state of the model is masked")):
+        accepted, reason = world.set(masked=wrong)
+        assert not accepted and why in reason
+    heard = len(flags.messages)
+    assert world.set(masked="", latch=False, grace=20 * STEP_NS * 1e-9) == (True, "")
+    before = len(violation.messages)
+    plant.send(15, off=2.0)
+    flags.count(heard + 15)
+    assert not any(m.data for m in violation.messages[before:]), "an alarm within the grace"
+    plant.send(10, off=2.0)
+    until(lambda: violation.messages[-1].data, "an alarm after the grace")
+    assert all(m.position[0] == 1.0 for m in flags.count(heard + 25)[heard + 1 :])
+
+
+def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, enable="/machine/mode data == 3", state_timeout=60.0)
+    diagnostics = world.diagnostics()
+    outputs = Outputs.of(world)
+    flags, violation = outputs.topics["flags"], outputs.topics["violation"]
+    plant = Plant(world, model).subscribed()
+    plant.send(5, off=2.0)
+    assert [m.position[0] for m in flags.count(5)[2:]] == [1, 1, 1]
+    diagnostics.reaches(WARN, saying="alarms are off: it is not known whether /machine/mode data == 3", patience=5)
+    assert world.status()["armed"] is None
+    lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    mode = world.publisher(UInt8, "/machine/mode", lasting)  # its type is found in the graph
+    mode.publish(UInt8(data=1))
+    until(lambda: world.status()["armed"] is False, "the mode")
+    plant.send(5, off=2.0)
+    flags.count(10)
+    diagnostics.reaches(WARN, name="envelope_monitor: a", saying="outside its bounds", patience=5)
+    assert not any(m.data for m in violation.messages)
+    mode.publish(UInt8(data=3))
+    until(lambda: world.status()["armed"], "the mode")
+    plant.send(3, off=2.0)
+    until(lambda: violation.messages[-1].data, "the alarm")
+    mode.publish(UInt8(data=0))
+    until(lambda: not world.status()["alarm"], "the alarm to end with the machine off")
+    plant.send(3, off=2.0)
+    assert world.status()["armed"] is False
+    for wrong in ("/machine/mode", "data == 3", "/m data = 3", "/m data == three", "/m __import__('os') == 3"):
+        accepted, reason = world.set(enable=wrong)
+        assert not accepted and "write TOPIC FIELD OPERATOR NUMBER" in reason
+    accepted, reason = world.set(enable=f"{STATE} positions[0] > 1")
+    assert not accepted and "there is no 'positions'" in reason
+    assert world.set(enable=f"{STATE} position[a] > -1e9") == (True, "")  # a topic that the model reads itself
+    plant.send(3, off=2.0)
+    until(lambda: violation.messages[-1].data, "the alarm")
+    assert world.set(enable="") == (True, "") and world.status()["armed"] is True
+
+
+def test_reload_reads_the_file_again_or_says_why_not(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    path = saved(model, tmp_path)
+    world.monitor(path)
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(1)
+    plant.send(2, off=2.0)
+    text = path.read_text()
+    for broken in (text[: len(text) // 2], "[" * 100_000, text.replace("uncertain-lti/1", "uncertain-lti/9"), ""):
+        path.write_text(broken)
+        success, reason = trigger(world, "reload")
+        assert not success and str(path) in reason, reason
+        plant.send(1, off=2.0)
+    assert [m.position[0] for m in flags.count(7)[1:]] == [0, *[1.0] * 5]
+    wide = UncertainLTI(
+        model.A, model.B, 3 * model.dA, 3 * model.dB, v=3 * model.v, signals=model.signals, sampling=model.sampling
+    )
+    wide.save(path)
+    success, said = trigger(world, "reload")
+    assert success and "2 states: a, b" in said
+    plant.send(3, off=2.0)
+    got = [m.position[0] for m in flags.count(10)[7:]]
+    assert np.isnan(got[0]) and got[1:] == [0, 0]
+
+
+# --- snapshots ----------------------------------------------------------------------------------------------
+
+
+def test_snapshots_hold_what_came_and_what_was_said(world: World, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from rosbags.highlevel import AnyReader
+
+    folder = tmp_path / "snapshots"
+    folder.mkdir()
+    keep = folder / "of someone else.mcap"
+    keep.write_bytes(b"mine")
+    model = by_hand(alarm=Alarm(2, 3))
+    path = saved(model, tmp_path)
+    options: dict[str, Any] = {"snapshot.folder": str(folder), "snapshot.keep": 2, "snapshot.seconds": 30.0}
+    world.monitor(path, **options)
+    outputs = Outputs.of(world)
+    assert trigger(world, "snapshot") == (False, "there is nothing to write: no message has come")
+    plant = Plant(world, model).subscribed()
+    plant.send(30)
+    plant.send(3, off=2.0)
+    plant.send(7)
+    flags = outputs.topics["flags"].count(40)
+    success, said = trigger(world, "snapshot")
+    assert success, said
+    (found,) = until(lambda: [p for p in folder.glob("*.mcap") if p != keep], "the file")
+    assert found.name.startswith("envelope_monitor-") and str(found) in said
+
+    with open(found, "rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        by_topic: dict[str, list[bytes]] = {}
+        times = []
+        for _, channel, message in reader.iter_messages():
+            by_topic.setdefault(channel.topic, []).append(message.data)
+            times.append(message.log_time)
+        assert times == sorted(times) and summary.statistics.message_count == len(times)
+        (notes,) = list(reader.iter_metadata())
+        assert notes.metadata["model"] == str(path)
+    assert [len(by_topic[t]) for t in (STATE, CONTROL, f"{NODE}/flags", f"{NODE}/lower")] == [40, 40, 40, 39]
+    with AnyReader([found]) as reader:
+        decoded: dict[str, list[Any]] = {}
+        for connection, _, data in reader.messages():
+            decoded.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
+    for name in ("flags", "lower", "upper", "state", "utilisation"):
+        there = decoded[f"{NODE}/{name}"]
+        for a, b in zip(there, outputs.topics[name].count(len(there)), strict=True):
+            np.testing.assert_array_equal(a.position, b.position)
+            np.testing.assert_array_equal(a.velocity, b.velocity)
+            assert stamp_of(a) == stamp_of(b) and list(a.name) == list(b.name)
+    assert [m.data for m in decoded[f"{NODE}/violation"]].count(True) == 3
+    # what came in is there as it came, so the offline check can be repeated on it
+    np.testing.assert_array_equal([v.flags for v in offline(path, found)], [m.position for m in flags])
+
+    for _ in range(3):
+        until(lambda: trigger(world, "snapshot")[0], "another")
+    until(lambda: len([p for p in folder.iterdir() if p != keep and p.suffix == ".mcap"]) == 2, "two files")
+    assert keep.read_bytes() == b"mine" and not found.exists() and len(list(tmp_path.glob("*.mcap"))) == 0
+
+
+def test_an_alarm_takes_a_snapshot_when_asked_to(world: World, tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "snapshots"
+    model = by_hand()
+    options: dict[str, Any] = {"snapshot.folder": str(folder), "snapshot.on_alarm": True, "snapshot.after": 0.3}
+    path = saved(model, tmp_path)
+    process = world.monitor(path, **options)
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(10)
+    plant.send(1, off=2.0)
+    plant.send(10)
+    flags.count(21)
+    (found,) = until(lambda: list(folder.glob("*.mcap")), "the file", 5)
+    verdicts = offline(path, found)
+    assert sum(bool((v.flags == 1.0).any()) for v in verdicts) == 1
+    assert len(verdicts) > 13, "what came after the alarm is there as well"
+    until(lambda: world.status()["snapshot"] == str(found), "the status")
+    folder.chmod(0o500)
+    try:
+        if os.geteuid():
+            success, reason = trigger(world, "snapshot")
+            assert not success and "Permission denied" in reason
+    finally:
+        folder.chmod(0o700)
+    assert process.running
+
+
+def test_without_a_folder_there_are_no_snapshots(world: World, tmp_path: Path) -> None:
+    process = world.monitor(saved(by_hand(), tmp_path))
+    success, reason = trigger(world, "snapshot")
+    assert not success and "snapshot.folder is empty" in reason
+    accepted, _ = world.set(**{"snapshot.folder": str(tmp_path)})
+    assert not accepted
+    process.kill()
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    options = {"model": str(saved(by_hand(), tmp_path)), "snapshot.folder": str(blocked)}
+    process = world.run_node("envelope_monitor", options, "-r", "__node:=second")
+    process.says("cannot be written to")
+    assert world.state("/second") == "unconfigured"
