@@ -234,6 +234,7 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
     assert float(values[f"age {CONTROL}"]) < 0.4 <= float(values[f"age {STATE}"])
     assert len(flags.messages) == 10 and violation.messages[-1].data is False
 
+    assert not ever(diagnostics, OK, "0 verdicts")
     plant.t_ns += 60 * STEP_NS
     plant.send(5)
     flags.count(15)
@@ -244,7 +245,7 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
     got = np.isnan([m.position[0] for m in flags.count(95)[15:]])
     held = np.flatnonzero(got)[0]
     assert 49 <= held <= 52 and got[held:].all(), held
-    assert ever(diagnostics, WARN, "a signal is missing, stale or not finite")
+    assert ever(diagnostics, ERROR, "a signal is missing, stale or not finite")
     values = Diagnostics.values(diagnostics.reaches(STALE, patience=5))
     assert float(values[f"age {CONTROL}"]) > 0.5 and int(values["stale p"]) > 20
 

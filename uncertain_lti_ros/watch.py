@@ -384,7 +384,7 @@ class Watch:
             calm.append(f"masked: {', '.join(self.monitor.masked)}")
         if self.latched and not self.monitor.alarm:
             complaints.insert(0, "alarm: latched until ~/reset")
-        if without > timeout:
+        if without > timeout or not self.verdicts:
             level = ERROR if self.latched else STALE
             silent = self.silent_for(now)
             if silent > timeout and self.sampler.clock in self._heard:
@@ -399,7 +399,8 @@ class Watch:
                 complaints.insert(0, f"alarm: {self._rule_text()}")
         else:
             level = WARN if complaints else OK
-        message = "; ".join([*(complaints or [f"{period.verdicts} verdicts, all well"]), *calm])
+        well = f"{period.verdicts} verdicts" if period.verdicts else f"last verdict {without:.1f} s ago"
+        message = "; ".join([*(complaints or [f"{well}, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
 
     def _rule_text(self) -> str:
