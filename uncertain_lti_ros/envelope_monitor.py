@@ -89,7 +89,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._candidate: Watch | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
         self._published = self._looked = self._reported = time.monotonic()
-        self._failures, self._failed_how, self._failure_told, self._failure_logged = 0, "", 0, -_LOGGED
+        self._failures, self._failed_how, self._failures_told = 0, "", 0
+        self._failure_logged: dict[str, float] = {}  # where: when
         self._clock = self.get_clock()
         self._largest = round(self._real("largest_message") * _MIB)
         self._recent: Recent | None = None  # kept while snapshots can be asked for
@@ -314,8 +315,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._failures += 1
         self._failed_how = f"{where}: {error!r}"[:300]
         now = time.monotonic()
-        if now - self._failure_logged >= _LOGGED:
-            self._failure_logged = now
+        if now - self._failure_logged.get(where, -_LOGGED) >= _LOGGED:
+            self._failure_logged[where] = now
             trace = "".join(traceback.format_exception(error))
             self.get_logger().error(f"unexpected error {self._failures}, {where}; the node goes on\n{trace}")
 
@@ -477,7 +478,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             problems.append(self._enable_problem)
         if self._album is not None and self._album.problem:
             problems.append(self._album.problem)
-        if self._failures > self._failure_told:
+        if self._failures > self._failures_told:
             problems.append(f"{self._failures} unexpected errors, the last {self._failed_how}")
         return problems
 
@@ -504,7 +505,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             reports = [Report(level, "monitor", message, {"unexpected errors": str(self._failures)})]
             if self.watch is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.watch.model.state_names]
-        self._failure_told = self._failures
+        self._failures_told = self._failures
         full_name = self.get_fully_qualified_name().lstrip("/")
         hardware = str(self.get_parameter("hardware_id").value) or self.get_name()
         message = DiagnosticArray()
