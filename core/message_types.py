@@ -50,9 +50,34 @@ class Definition:
     def decode(self, data: bytes) -> Any:
         """Decode one CDR message; raises BagError where it does not fit the definition."""
         try:
-            return self.store.deserialize_cdr(_plain(data), self.type_name)
+            data = _plain(data)
+            return self.store.deserialize_cdr(data, self.type_name)
         except Exception as error:  # the generated decoders raise whatever the bytes lead them to
+            if "size mismatch" in str(error) and (message := self._with_more_room(data)) is not None:
+                return message
             raise BagError(_one_line(error)) from None
+
+    def _with_more_room(self, data: bytes) -> Any:
+        """A message with as many bytes after it as `rclpy.serialization` leaves there, or None with more.
+
+        It reserves 4 for each empty sequence of 8-byte numbers, and so does every bag written through rosbag2_py.
+        """
+        layout = self.store.get_msgdef(self.type_name)
+        read = layout.deserialize_cdr_le if data[1] else layout.deserialize_cdr_be
+        message, end = read(data[4:], 0, layout.cls, self.store)
+        more = len(data) - 4 - end
+        return message if more <= 3 + 4 * self._empty_sequences(self.type_name, message) else None
+
+    def _empty_sequences(self, type_name: str, message: Any) -> int:
+        count = 0
+        for name, field in self.fields(type_name).items():
+            value = getattr(message, name)
+            if field.kind == "message":
+                inner = value if field.array is not None else [value]
+                count += sum(self._empty_sequences(field.type_name, each) for each in inner)
+            elif field.array == 0 and field.type_name in ("float64", "int64", "uint64"):
+                count += not len(value)
+        return count
 
     @functools.cached_property
     def has_header(self) -> bool:
