@@ -1,0 +1,558 @@
+"""Field paths on real messages of both decoders, and signals files whatever stands in them."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from bag_writer import JAZZY
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from uncertain_lti.errors import SignalError
+from uncertain_lti.message_types import define
+from uncertain_lti.signals import FieldPath, FieldType, Signal, SignalMap, TypeFields, numeric_paths
+
+NAN, INF = math.nan, math.inf
+
+
+def bag_fields(type_name: str) -> dict[str, FieldType]:
+    """As a recording of this type describes it."""
+    definition = define(type_name, "ros2msg", JAZZY.generate_msgdef(type_name, ros_version=2)[0].encode())
+    return dict(definition.fields(type_name))
+
+
+def live_fields(type_name: str) -> dict[str, FieldType]:
+    """As the installed message class describes it."""
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    return dict(importlib.import_module("uncertain_lti_ros.messages").live_fields(type_name))
+
+
+FIELDS: dict[str, TypeFields] = {"bag": bag_fields, "live": live_fields}
+
+
+def made(type_name: str, content: dict[str, Any]) -> Any:
+    """Message of rclpy with these fields, given as nested plain data."""
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    package, *_, name = type_name.split("/")
+    message = getattr(importlib.import_module(f"{package}.msg"), name)()
+    for field, value in content.items():
+        inner = message.get_fields_and_field_types()[field]
+        if isinstance(value, dict):
+            value = made(inner, value)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            value = [made(inner.removeprefix("sequence<").removesuffix(">"), each) for each in value]
+        setattr(message, field, value)
+    return message
+
+
+def live_message(type_name: str, content: dict[str, Any]) -> Any:
+    """As it comes out of a subscription."""
+    message = made(type_name, content)
+    serialization = importlib.import_module("rclpy.serialization")
+    return serialization.deserialize_message(serialization.serialize_message(message), type(message))
+
+
+def bag_message(type_name: str, content: dict[str, Any]) -> Any:
+    """As it comes out of a recording."""
+    message = made(type_name, content)
+    schema = JAZZY.generate_msgdef(type_name, ros_version=2)[0].encode()
+    serialization = importlib.import_module("rclpy.serialization")
+    return define(type_name, "ros2msg", schema).decode(serialization.serialize_message(message))
+
+
+MESSAGES = {"bag": bag_message, "live": live_message}
+both = pytest.mark.parametrize("side", ["bag", "live"])
+
+QUARTER = {"x": 0.0, "y": 0.0, "z": math.sin(math.pi / 8), "w": math.cos(math.pi / 8)}
+JOINTS = {
+    "name": ["fan", "core", "3", "left wheel", "a.b[c]"],
+    "position": [1.5, -2.0, 3.25, 4.0, 5.0],
+    "velocity": [0.1, 0.2],
+}
+ODOMETRY = {
+    "pose": {"pose": {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": QUARTER}},
+    "twist": {"twist": {"linear": {"x": 3.0, "y": 4.0, "z": 12.0}}, "covariance": [float(i) for i in range(36)]},
+}
+POSES = {"poses": [{"position": {"x": 7.0}}, {"position": {"x": 8.0}, "orientation": QUARTER}]}
+LAYOUT = {"layout": {"dim": [{"label": "x", "size": 3, "stride": 3}], "data_offset": 2}, "data": [3.0, -4.0, 12.0]}
+
+READ = [
+    ("sensor_msgs/msg/JointState", JOINTS, "position[0]", 1.5),
+    ("sensor_msgs/msg/JointState", JOINTS, "position[fan]", 1.5),
+    ("sensor_msgs/msg/JointState", JOINTS, " position[ core ] ", -2.0),
+    ("sensor_msgs/msg/JointState", JOINTS, "position[3]", 4.0),
+    ("sensor_msgs/msg/JointState", JOINTS, 'position["3"]', 3.25),
+    ("sensor_msgs/msg/JointState", JOINTS, "position[left wheel]", 4.0),
+    ("sensor_msgs/msg/JointState", JOINTS, 'position["a.b[c]"]', 5.0),
+    ("sensor_msgs/msg/JointState", JOINTS, "velocity[core]", 0.2),
+    ("sensor_msgs/msg/JointState", JOINTS, "norm(velocity)", math.hypot(0.1, 0.2)),
+    ("sensor_msgs/msg/JointState", JOINTS, "position[5]", NAN),
+    ("sensor_msgs/msg/JointState", JOINTS, "position[hub]", NAN),
+    ("sensor_msgs/msg/JointState", JOINTS, 'velocity["3"]', NAN),
+    ("sensor_msgs/msg/JointState", JOINTS, "effort[fan]", NAN),
+    ("sensor_msgs/msg/JointState", JOINTS, "effort[0]", NAN),
+    ("sensor_msgs/msg/JointState", {}, "position[fan]", NAN),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "twist.twist.linear.x", 3.0),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "norm(twist.twist.linear)", 13.0),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "twist.covariance[35]", 35.0),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "yaw(pose.pose.orientation)", math.pi / 4),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "unwrap(yaw(pose.pose.orientation))", math.pi / 4),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "unwrap( yaw ( pose.pose.orientation ) )", math.pi / 4),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "roll(pose.pose.orientation)", 0.0),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "pitch(pose.pose.orientation)", 0.0),
+    ("nav_msgs/msg/Odometry", ODOMETRY, "norm(pose.pose.orientation)", 1.0),
+    ("std_msgs/msg/Float64MultiArray", LAYOUT, "data[1]", -4.0),
+    ("std_msgs/msg/Float64MultiArray", LAYOUT, "norm(data)", 13.0),
+    ("std_msgs/msg/Float64MultiArray", LAYOUT, "layout.dim[0].size", 3.0),
+    ("std_msgs/msg/Float64MultiArray", LAYOUT, "layout.dim[1].size", NAN),
+    ("std_msgs/msg/Float64MultiArray", LAYOUT, "layout.data_offset", 2.0),
+    ("std_msgs/msg/Float64MultiArray", {}, "norm(data)", 0.0),
+    ("sensor_msgs/msg/Imu", {"orientation": QUARTER}, "yaw(orientation)", math.pi / 4),
+    ("sensor_msgs/msg/Imu", {"orientation": dict.fromkeys("xyzw", 0.0)}, "yaw(orientation)", NAN),
+    ("sensor_msgs/msg/Imu", {"angular_velocity": {"x": 0.0, "y": 0.0, "z": NAN}}, "angular_velocity.z", NAN),
+    ("geometry_msgs/msg/PoseArray", POSES, "poses[1].position.x", 8.0),
+    ("geometry_msgs/msg/PoseArray", POSES, "yaw(poses[1].orientation)", math.pi / 4),
+    ("geometry_msgs/msg/PoseArray", POSES, "poses[2].position.x", NAN),
+    ("geometry_msgs/msg/PoseArray", POSES, "yaw(poses[2].orientation)", NAN),
+    ("std_msgs/msg/Bool", {"data": True}, "data", 1.0),
+    ("std_msgs/msg/Int64", {"data": -(2**53)}, "data", -(2.0**53)),
+    ("std_msgs/msg/Float32", {"data": 0.1}, "data", float(np.float32(0.1))),
+    ("sensor_msgs/msg/BatteryState", {"present": True, "cell_voltage": [3.5, 4.0]}, "cell_voltage[1]", 4.0),
+    ("sensor_msgs/msg/BatteryState", {"present": True}, "present", 1.0),
+    ("std_msgs/msg/UInt8MultiArray", {"data": bytes([7, 200])}, "data[1]", 200.0),
+]
+
+
+@both
+@pytest.mark.parametrize(("type_name", "content", "field", "value"), READ)
+def test_documented_paths_read_alike_from_recordings_and_live(
+    type_name: str, content: dict[str, Any], field: str, value: float, side: str
+) -> None:
+    path = FieldPath(field)
+    path.check("/topic", type_name, FIELDS[side])
+    got = path.read(MESSAGES[side](type_name, content))
+    assert type(got) is float
+    assert got == pytest.approx(value, rel=1e-15, abs=1e-15, nan_ok=True)
+    assert path.unwrap == field.strip().startswith("unwrap")
+
+
+@both
+@pytest.mark.parametrize("type_name", sorted({case[0] for case in READ}))
+def test_every_path_that_is_offered_can_be_read(type_name: str, side: str) -> None:
+    fields = FIELDS[side]
+    offered = list(numeric_paths(type_name, fields))
+    assert offered
+    message = MESSAGES[side](type_name, {})
+    for text in offered:
+        path = FieldPath(text.replace("[]", "[0]"))
+        if any(f"[{n}]" in text for n in (9, 36)):
+            path = FieldPath(text.replace("[9]", "[8]").replace("[36]", "[35]"))
+        path.check("/topic", type_name, fields)
+        assert isinstance(path.read(message), float)
+
+
+def test_recordings_and_classes_describe_types_alike() -> None:
+    """So that a path that fits one fits the other: for every type of the installed packages."""
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    checked = 0
+    for name in sorted(JAZZY.fielddefs):
+        package, kind, _ = name.split("/")
+        if kind != "msg" or package not in ("std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "diagnostic_msgs"):
+            continue
+        live = live_fields(name)
+        live.pop("structure_needs_at_least_one_member", None)
+        recorded = bag_fields(name)
+        assert list(live) == list(recorded)
+        for field, kind_live in live.items():
+            kind_bag = recorded[field]
+            assert (kind_live.kind, kind_live.array) == (kind_bag.kind, kind_bag.array), f"{name}.{field}"
+            if kind_live.kind == "message":
+                assert kind_live.type_name == kind_bag.type_name
+        checked += 1
+    assert checked > 80
+
+
+@both
+def test_a_name_that_moves_in_the_name_array_is_followed(side: str) -> None:
+    path = FieldPath("position[core]")
+    names = ["fan", "core", "burner"]
+    for order in ([0, 1, 2], [1, 0, 2], [2, 0], [0, 2, 1], []):
+        content = {"name": [names[i] for i in order], "position": [float(i) for i in order]}
+        value = path.read(MESSAGES[side]("sensor_msgs/msg/JointState", content))
+        assert value == 1.0 if 1 in order else math.isnan(value)
+
+
+@both
+def test_missing_name_says_what_is_there(side: str) -> None:
+    message = MESSAGES[side]("sensor_msgs/msg/JointState", JOINTS)
+    assert FieldPath("position[hub]").missing_name(message) == ("hub", JOINTS["name"])
+    for field in ("position[fan]", "position[0]", "position[99]", "velocity[left wheel]", "header.stamp.sec"):
+        assert FieldPath(field).missing_name(message) is None
+
+
+# --- angles -------------------------------------------------------------------------------------------------
+
+angle = st.floats(-3.1, 3.1)
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> SimpleNamespace:
+    """Rotation about z, then y, then x (REP 103)."""
+    cr, sr, cp, sp, cy, sy = (f(a / 2) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    return SimpleNamespace(
+        x=sr * cp * cy - cr * sp * sy,
+        y=cr * sp * cy + sr * cp * sy,
+        z=cr * cp * sy - sr * sp * cy,
+        w=cr * cp * cy + sr * sp * sy,
+    )
+
+
+@given(angle, st.floats(-1.5, 1.5), angle, st.floats(-100, 100).filter(lambda s: abs(s) > 1e-3))
+def test_angles_come_back_from_a_quaternion_of_any_norm_and_sign(r: float, p: float, y: float, scale: float) -> None:
+    q = quaternion(r, p, y)
+    message = SimpleNamespace(q=SimpleNamespace(**{c: scale * getattr(q, c) for c in "xyzw"}))
+    assert FieldPath("roll(q)").read(message) == pytest.approx(r, abs=1e-9)
+    assert FieldPath("pitch(q)").read(message) == pytest.approx(p, abs=1e-9)
+    assert FieldPath("yaw(q)").read(message) == pytest.approx(y, abs=1e-9)
+    assert FieldPath("norm(q)").read(message) == pytest.approx(abs(scale), rel=1e-9)
+
+
+@given(st.lists(st.sampled_from([0.0, 1.0, -1.0, NAN, INF, -INF, 1e200, -1e-200]), min_size=4, max_size=4))
+def test_no_angle_comes_from_a_quaternion_that_is_zero_or_not_finite(parts: list[float]) -> None:
+    message = SimpleNamespace(q=SimpleNamespace(**dict(zip("xyzw", parts, strict=True))))
+    for function in ("roll", "pitch", "yaw"):
+        value = FieldPath(f"{function}(q)").read(message)
+        if not any(parts) or not all(map(math.isfinite, parts)):
+            assert not math.isfinite(value)
+        else:
+            assert math.isnan(value) or abs(value) <= math.pi
+    if not all(map(math.isfinite, parts)):
+        assert not math.isfinite(FieldPath("norm(q)").read(message))
+
+
+# --- the text of a path -------------------------------------------------------------------------------------
+
+word = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,6}", fullmatch=True)
+bare_name = st.text(st.characters(exclude_characters='[]"', codec="utf-8"), min_size=1, max_size=8).filter(
+    lambda t: t == t.strip() and not t.isdigit()
+)
+quoted_name = st.text(st.characters(exclude_characters='"', codec="utf-8"), min_size=1, max_size=8)
+
+
+@st.composite
+def path_and_message(draw: st.DrawFn) -> tuple[str, Any, float]:
+    """A path by the grammar, and an object in which it leads to a number: built from the inside out."""
+    value = draw(st.floats(allow_nan=False))
+    inner: Any = value
+    text = ""
+    for number in range(draw(st.integers(1, 4))):
+        kind = draw(st.sampled_from(["plain", "index", "name", "quoted"]))
+        attribute = draw(word.filter(lambda w: w != "name"))
+        node = SimpleNamespace()
+        suffix = ""
+        if kind == "index":
+            index = draw(st.integers(0, 3))
+            inner = [None] * index + [inner]
+            suffix = f"[{index}]"
+        elif kind != "plain":
+            name = draw(bare_name if kind == "name" else quoted_name)
+            node.name = ["\0other", name]
+            inner = [None, inner]
+            suffix = f"[{name}]" if kind == "name" else f'["{name}"]'
+        setattr(node, attribute, inner)
+        text = f"{attribute}{suffix}" + (f".{text}" if number else "")
+        inner = node
+    return text, inner, value
+
+
+@given(path_and_message())
+def test_paths_by_the_grammar_lead_where_they_say(case: tuple[str, Any, float]) -> None:
+    text, message, value = case
+    assert FieldPath(text).read(message) == value
+    assert FieldPath(f"  {text} ").read(message) == value
+    assert FieldPath(f"unwrap({text})").read(message) == value
+    assert FieldPath(text) == FieldPath(text) and hash(FieldPath(text)) == hash(FieldPath(text))
+    assert FieldPath(text).missing_name(message) is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", " ", ".", "a.", ".a", "a..b", "a b", "[0]", "a[0]b", "a[]", "a[ ]", 'a[""]', "a[0", "a0]", "a[[0]]",
+        "a.[0]",
+        "1a", "a-b", "a,b", "a/b", "roll()", "unwrap()", "unwrap(unwrap(a))", "roll(unwrap(a))", "norm(norm(a))",
+        "abs(a)", "roll(a", "roll a)", "roll(a))", "(a)", "a(b", "a[0](b)", "roll(a).x", 'a["x]', "data[0]\n.",
+    ],
+)  # fmt: skip
+def test_a_text_that_is_no_path_is_refused_in_one_sentence(text: str) -> None:
+    with pytest.raises(SignalError, match="^field ") as caught:
+        FieldPath(text)
+    assert text.strip() in str(caught.value)
+
+
+@given(st.text(max_size=30) | st.text('ab.[]()"0 unwrap_roll', max_size=30))
+@example("data[" + "9" * 5000 + "]")
+@example("unwrap(" * 300 + ")" * 300)
+@example("a" + ".a" * 5000)
+def test_any_text_is_a_path_or_a_signal_error(text: str) -> None:
+    try:
+        path = FieldPath(text)
+    except SignalError:
+        return
+    assert path.text == text
+
+
+@both
+@pytest.mark.parametrize(
+    ("type_name", "field", "words"),
+    [
+        ("sensor_msgs/msg/JointState", "positio[0]", "fields there: header, name, position, velocity, effort"),
+        ("sensor_msgs/msg/JointState", "positio", "numeric field paths of /t: header.stamp.sec, "),
+        ("sensor_msgs/msg/JointState", "position", "an array; give an index, for example \\[0\\]"),
+        ("sensor_msgs/msg/JointState", "position.x", "give an index before '.x'"),
+        ("sensor_msgs/msg/JointState", "position[0].x", "a float64 has no fields|a double has no fields"),
+        ("sensor_msgs/msg/JointState", "position[0][1]", "follows something that is not an array"),
+        ("sensor_msgs/msg/JointState", "header[0].stamp", "follows something that is not an array"),
+        ("sensor_msgs/msg/JointState", "name[0]", "not one number but a string; numeric field paths"),
+        ("sensor_msgs/msg/JointState", "header.stamp", "not one number but a builtin_interfaces/msg/Time"),
+        ("sensor_msgs/msg/JointState", "header.frame_id", "not one number but a string"),
+        (
+            "sensor_msgs/msg/JointState",
+            "header.stam",
+            "no 'stam' in std_msgs/msg/Header; fields there: stamp, frame_id",
+        ),
+        ("sensor_msgs/msg/JointState", "roll(position[0])", "wants a quaternion with x, y, z, w"),
+        ("sensor_msgs/msg/JointState", "norm(position[0])", "wants a vector with x, y, z or an array of numbers"),
+        ("sensor_msgs/msg/JointState", "norm(name)", "wants a vector"),
+        ("std_msgs/msg/Float64MultiArray", "data[fan]", "needs an array of strings called 'name' beside it"),
+        ("std_msgs/msg/Float64MultiArray", "data[-1]", "needs an array of strings called 'name' beside it"),
+        ("std_msgs/msg/Float64MultiArray", "data[1:3]", "give an index instead, for example \\[0\\]"),
+        ("geometry_msgs/msg/Twist", "yaw(linear)", "wants a quaternion with x, y, z, w, and geometry_msgs/msg/Vector3"),
+        ("geometry_msgs/msg/Twist", "twist.linear.x", "no 'twist' in geometry_msgs/msg/Twist; .*: linear.x, linear.y"),
+        ("sensor_msgs/msg/Imu", "orientation_covariance[9]", "index 9 is past the end of an array of 9"),
+        ("std_msgs/msg/String", "data", "numeric field paths of /t: none"),
+        ("std_msgs/msg/Byte", "data", "not one number but a byte|not one number but a octet"),
+        ("std_msgs/msg/Empty", "data", "fields there: none|fields there: structure"),
+    ],
+)
+def test_a_path_that_does_not_fit_names_what_is_there(type_name: str, field: str, words: str, side: str) -> None:
+    with pytest.raises(SignalError, match=words) as caught:
+        FieldPath(field).check("/t", type_name, FIELDS[side])
+    sentence = str(caught.value)
+    assert sentence.startswith(f"field '{field}' of /t ({type_name})")
+    assert "\n" not in sentence
+
+
+# --- signals files ------------------------------------------------------------------------------------------
+
+DESIGN = """
+clock: /engine/state
+max_gap: 0.05
+min_step: 0
+topics:
+  /engine/state: {time: header}
+states:
+  - {name: fan_speed, topic: /engine/state, field: "position[fan]", steady: 1.0, scale: 1.0, unit: rpm}
+controls:
+  - {name: fuel_flow, topic: /engine/control, field: "data[0]", max_hold: 0.2, delay: 0}
+"""
+
+
+def saved(folder: Path, text: str | bytes) -> Path:
+    path = folder / "signals.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def test_the_file_of_the_design_says_what_it_says(tmp_path: Path) -> None:
+    signals = SignalMap.load(saved(tmp_path, DESIGN))
+    assert signals == SignalMap(
+        (Signal("fan_speed", "/engine/state", "position[fan]", 1.0, 1.0, "rpm"),),
+        (Signal("fuel_flow", "/engine/control", "data[0]", max_hold=0.2, delay=0),),
+        clock="/engine/state",
+        max_gap=0.05,
+        min_step=0.0,
+        time={"/engine/state": "header"},
+        source=str(tmp_path / "signals.yaml"),
+    )
+
+
+def test_what_is_not_said_has_the_stated_defaults(tmp_path: Path) -> None:
+    signals = SignalMap.load(saved(tmp_path, "states: [{name: x, topic: /a, field: data}]"))
+    assert (signals.clock, signals.max_gap, signals.max_skew, signals.min_step) == (None, None, None, 0.0)
+    assert (signals.controls, signals.time) == ((), {})
+    assert signals.states == (Signal("x", "/a", "data", 0.0, 1.0, "", "", None, 0),)
+
+
+def test_every_shipped_signals_file_loads(signals_folder: Path) -> None:
+    files = sorted(signals_folder.glob("*.yaml"))
+    assert len(files) >= 6
+    for path in files:
+        signals = SignalMap.load(path)
+        assert signals.source == str(path)
+        positions = sorted(i for topic in signals.topics for i in signals.on(topic))
+        assert positions == list(range(len(signals.signals)))
+
+
+X = "states:\n  - {name: x, topic: /a, field: data}\n"
+
+
+def state(entry: str) -> str:
+    return f"states:\n  - {{name: x, topic: /a, field: data, {entry}}}\n"
+
+
+def control(entry: str) -> str:
+    return X + f"controls:\n  - {{name: u, topic: /b, field: data, {entry}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "a mapping is wanted here, not NoneType"),
+        ("- a", "a mapping is wanted here, not list"),
+        ("a: b: c", "is not YAML at line 1"),
+        ("a: [", "is not YAML at line 1"),
+        ("a: 2001-99-99", "is not YAML: month must be in 1..12"),
+        ("a: !!int abc", "is not YAML"),
+        ("a: !!python/object:os.system {}", "is not YAML at line 1"),
+        ("[" * 5000, "is not YAML"),
+        ("a: \x07", "is not YAML"),
+        (b"\xff\xfe\x00", "is not YAML"),
+        ("clocks: /a\n" + X, "unknown key 'clocks'; known are .*clock, controls, max_gap"),
+        ("states: []", "'states' is empty; list at least one state"),
+        ("controls: []", "'states' is empty"),
+        ("states: {name: x}", "states: a list is wanted here, not dict"),
+        ("states: [7]", "states\\[0\\]: a mapping is wanted here, not int"),
+        ("states: [{topic: /a, field: data}]", "states\\[0\\]: 'name' is None; write a text"),
+        ("states: [{name: on, topic: /a, field: data}]", "'name' is True; write a text, in quotes"),
+        ("states: [{name: x, topic: 5, field: data}]", "'topic' is 5; write a text"),
+        ("states: [{name: x, topic: '', field: data}]", "'topic' is ''; write a text"),
+        ("states: [{name: x, topic: /a, field: [data]}]", "'field' is \\['data'\\]; write a text"),
+        ("states: [{name: x, topic: /a, field: 'data['}]", "signal 'x': field 'data\\[' is not a field path"),
+        (X + "  - {name: x, topic: /b, field: data}", "signal 'x' is listed twice"),
+        (control("name: x"), "key 'name' stands twice in one mapping, again at line 4; keep one"),
+        (X + "max_gap: 1\nmax_gap: 2", "key 'max_gap' stands twice in one mapping, again at line 4"),
+        (state("scales: 2"), "states\\[0\\]: unknown key 'scales'; known are delay, field, max_hold, name"),
+        (state("scale: 0"), "signal 'x': scale is 0.0; it must be a positive number or auto"),
+        (state("scale: -1"), "signal 'x': scale is -1.0"),
+        (state("scale: .inf"), "signal 'x': scale is inf"),
+        (state("scale: .nan"), "scale is nan; write a number"),
+        (state("scale: automatic"), "scale is 'automatic'; write a number"),
+        (state("steady: .inf"), "signal 'x': steady is inf; it must be a finite number or auto"),
+        (state("steady: yes"), "steady is True; write a number"),
+        (state("steady: 1" + "0" * 400), "steady is 1000.*; write a number"),
+        (state("unit: {a: 1}"), "unit is {'a': 1}; write a text, in quotes"),
+        (state("max_hold: 1"), "state 'x' has max_hold or delay; both are for controls"),
+        (state("delay: 1"), "state 'x' has max_hold or delay; both are for controls"),
+        (control("max_hold: -1"), "signal 'u': max_hold is -1.0; it must be 0 s or more"),
+        (control("max_hold: .inf"), "signal 'u': max_hold is inf; .* or left out for no limit"),
+        (control("delay: -1"), "signal 'u': delay is -1; it must be 0 to"),
+        (control("delay: 1.5"), "controls\\[0\\]: delay is 1.5; write a whole number of samples"),
+        (control("delay: 1000000000000000000000"), "signal 'u': delay is 1000000000000000000000; it must be 0 to"),
+        (X + "clock: /b", "clock is /b, which carries no state; choose one of /a"),
+        (control("unit: V") + "clock: /b", "clock is /b, which carries no state; choose one of /a"),
+        (X + "clock: [1]", "clock is \\[1\\]; write the name of a state topic"),
+        (X + "topics: {/b: {time: log}}", "'topics' names /b, which carries no signal; signals come from /a"),
+        (X + "topics: {/a: {time: wall}}", "topics: /a: time is 'wall'; write header or log"),
+        (X + "topics: {/a: {}}", "topics: /a: time is None; write header or log"),
+        (X + "topics: {/a: log}", "topics: /a: a mapping is wanted here, not str"),
+        (X + "topics: {/a: {time: log, queue: 1}}", "topics: /a: unknown key 'queue'; known are time"),
+        (X + "max_gap: 0", "max_gap is 0.0; it must be a positive number of seconds"),
+        (X + "max_gap: .inf", "max_gap is inf; it must be a positive number of seconds"),
+        (X + "max_gap: soon", "max_gap is 'soon'; write a number"),
+        (X + "max_skew: -1", "max_skew is -1.0; it must be a positive number of seconds"),
+        (X + "min_step: -1", "min_step is -1.0; it must be 0 s or more"),
+        (X + "min_step: .inf", "min_step is inf; it must be 0 s or more"),
+    ],
+)
+def test_a_wrong_signals_file_is_refused_in_one_sentence(text: str | bytes, words: str, tmp_path: Path) -> None:
+    path = saved(tmp_path, text)
+    with pytest.raises(SignalError, match=words) as caught:
+        SignalMap.load(path)
+    sentence = str(caught.value)
+    assert sentence.startswith(str(path))
+    assert "\n" not in sentence and len(sentence) < 400
+
+
+def test_a_signals_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(SignalError, match="there is no such signals file; check the path"):
+        SignalMap.load(tmp_path / "none.yaml")
+    with pytest.raises(SignalError, match="cannot be read: Is a directory"):
+        SignalMap.load(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["1e-3", "'0.001'", "0.001", "1.0e-3"])
+def test_numbers_that_yaml_reads_as_text_are_numbers(text: str, tmp_path: Path) -> None:
+    assert SignalMap.load(saved(tmp_path, X + f"max_gap: {text}")).max_gap == 0.001
+
+
+scalars = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["auto", "header", "/a", "x", "", "data"])
+)
+anything = st.recursive(
+    scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(scalars, inner, max_size=3)
+)
+
+
+@st.composite
+def damaged(draw: st.DrawFn) -> Any:
+    """The structure of a whole signals file with one to three things replaced, added or taken away."""
+    data = yaml.safe_load(DESIGN)
+    data |= {"max_skew": 0.1, "topics": {"/engine/state": {"time": "header"}, "/engine/control": {"time": "log"}}}
+    for _ in range(draw(st.integers(1, 3))):
+        place: Any = data
+        while True:
+            keys = list(place) if isinstance(place, dict) else list(range(len(place)))
+            if not keys:
+                break
+            key = draw(st.sampled_from(keys))
+            if isinstance(place[key], (dict, list)) and draw(st.booleans()):
+                place = place[key]
+                continue
+            if draw(st.integers(0, 3)):
+                place[key] = draw(anything)
+            elif isinstance(place, dict) and draw(st.booleans()):
+                place[draw(st.sampled_from(["extra", "delay", "max_hold", "unit", 5]))] = draw(anything)
+            else:
+                del place[key]
+            break
+    return data
+
+
+@given(damaged())
+def test_a_damaged_structure_is_a_map_or_a_signal_error(data: Any) -> None:
+    try:
+        signals = SignalMap.from_dict(data, source="file")
+    except SignalError as error:
+        assert str(error).startswith("file")
+        return
+    assert signals.states
+    for signal in signals.signals:
+        assert signal.scale == "auto" or 0 < signal.scale < INF
+        assert signal.steady == "auto" or math.isfinite(signal.steady)
+
+
+@given(st.binary(max_size=60) | st.text("{}[]:,-&*!|>?'\"ab1 \n\t#%@", max_size=60).map(str.encode))
+def test_any_bytes_are_a_signal_error(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_bytes(data)
+    with pytest.raises(SignalError) as caught:
+        SignalMap.load(path)
+    assert str(caught.value).startswith(str(path))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_checking_a_map_names_the_topic_and_the_field() -> None:
+    fields: Callable[[str], dict[str, FieldType]] = bag_fields
+    signals = SignalMap((Signal("x", "/a", "data"), Signal("y", "/b", "data[0]")))
+    signals.check("/a", "std_msgs/msg/Float64", fields)
+    with pytest.raises(SignalError, match="field 'data\\[0\\]' of /b \\(std_msgs/msg/Float64\\)"):
+        signals.check("/b", "std_msgs/msg/Float64", fields)
+    signals.check("/c", "std_msgs/msg/String", fields)  # carries no signal
