@@ -144,7 +144,7 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     for name, module, text in (
         ("play", "player", "publish a recording through rclpy"),
         ("record", "recorder", "record topics through rclpy"),
-        ("demo", "demo", "fit the shipped recording and watch a second one live"),
+        ("demo", "demo", "fit shipped recordings of a turbofan and watch another, in which a fault sets in, live"),
     ):
         sub = command(name, _ros(module), text)
         if name == chosen:

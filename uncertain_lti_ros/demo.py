@@ -1,4 +1,4 @@
-"""`uncertain-lti demo`: fit the shipped recording, watch a second one live, and show where it leaves its envelope."""
+"""`uncertain-lti demo`: fit shipped recordings of a turbofan, watch another live, and show where a fault sets in."""
 
 from __future__ import annotations
 
@@ -20,14 +20,16 @@ from sensor_msgs.msg import JointState
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.errors import BagError, UncertainLTIError
 from uncertain_lti.model import Alarm
-from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.plots import envelope_figure
 from uncertain_lti.reading import read_for_model
 from uncertain_lti.report import check_data, check_text, fit_text
 from uncertain_lti_ros.process import Life, living
 from uncertain_lti_ros.terminal import say
 
-FIT, CHECK = "leibov_fit.mcap", "leibov_check.mcap"
+FIT = tuple(f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels"))
+CHECK = "turbofan_fan_damage.mcap"
+SHOWN = ["fan_speed", "compressor_exit_total_pressure", "turbine_exit_total_pressure"]
 _FLAGS = "/envelope_monitor/flags"
 _PATIENCE = 20.0  # s for another process to do its next step
 
@@ -49,11 +51,12 @@ def run(args: argparse.Namespace) -> int:
     bags = _bags()
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
-    model_file = output / "leibov.model.json"
+    model_file = output / "turbofan.model.json"
 
-    print(f"1. Fitting {FIT}: a turbofan drawn anew inside its published intervals at every step (Leibov 2006)")
-    transients = read_transients(bags / FIT, leibov2006().signals)
-    model = fit(transients, "qp", alarm=Alarm(violations=3, window=5))
+    print("1. Fitting a healthy turbofan (a nonlinear model with noisy sensors): pulses of every control both ways, and a")
+    print(f"   run under control: {', '.join(FIT)}")
+    transients = read_transients([bags / name for name in FIT], turbofan_signals())
+    model = fit(transients, "lp", additive="noise", alarm=Alarm(violations=2, window=5))
     model.save(model_file)
     print(fit_text(model, transients))
     print(f"   model: {model_file}")
@@ -71,11 +74,11 @@ def run(args: argparse.Namespace) -> int:
         for t_ns, flags in zip(offline.transient.t_ns[offline.judged].tolist(), expected, strict=True)
     )
     print(f"live and offline verdicts: {same} of {len(expected)} equal")
-    left = offline.transient.t_ns[0] + _departure(bags / CHECK) * 10**9
-    t = float(left - offline.transient.t_ns[0]) * 1e-9
+    t, what = _fault(bags / CHECK)
+    left = offline.transient.t_ns[0] + t * 1e9
     after = offline.judged & (offline.transient.t_ns > left)
     print(
-        f"the plant leaves its intervals at {t:.2f} s: violated in {int((offline.violated & ~after).sum())} of "
+        f"at {t:.2f} s {what}: violated in {int((offline.violated & ~after).sum())} of "
         f"{int((offline.judged & ~after).sum())} verdicts before and {int((offline.violated & after).sum())} of "
         f"{int(after.sum())} after"
     )
@@ -84,9 +87,9 @@ def run(args: argparse.Namespace) -> int:
         f"the alarm ({model.alarm.violations} of {model.alarm.window} verdicts violated) is raised "
         + (f"{raised[0] - t:.3f} s after that" if len(raised) and raised[0] >= t else "too early or not at all")
     )
-    event = (t, "leaves its intervals")
+    event = (t, what)
     for name, span in (("envelope.png", None), ("envelope_close.png", (t - 1.5, t + 1.5))):
-        envelope_figure(model, offline, output / name, states=["fan_speed"], event=event, span=span)
+        envelope_figure(model, offline, output / name, states=SHOWN, event=event, span=span)
         print(f"figure: {output / name}")
     return 0 if same == len(expected) and len(raised) and raised[0] >= t else 2
 
@@ -95,9 +98,9 @@ def _bags() -> Path:
     """Folder of the shipped recordings: in a checkout, or in the share folder of an installation."""
     roots = [Path(__file__).resolve().parents[1], *(Path(p) / "share/uncertain_lti_ros" for p in _prefixes())]
     for root in roots:
-        if (root / "bags" / FIT).is_file():
+        if (root / "bags" / CHECK).is_file():
             return root / "bags"
-    raise BagError(f"bags/{FIT} is not beside the package or in its share folder; run the demo from a checkout")
+    raise BagError(f"bags/{CHECK} is not beside the package or in its share folder; run the demo from a checkout")
 
 
 def _prefixes() -> Iterator[str]:
@@ -105,16 +108,15 @@ def _prefixes() -> Iterator[str]:
     yield sys.prefix
 
 
-def _departure(bag: Path) -> float:
-    """Instant of the departure in s after the first state, from the recording's own metadata."""
+def _fault(bag: Path) -> tuple[float, str]:
+    """Onset of the fault in s after the first state and what happens, from the recording's own metadata."""
     from mcap.reader import make_reader
 
     with open(bag, "rb") as stream:
         for record in make_reader(stream).iter_metadata():
-            for key, value in record.metadata.items():
-                if key == "leaves its intervals":
-                    return float(value.split()[0])
-    raise BagError(f"{bag}: its metadata does not say when the plant leaves its intervals; make it with bags/make.py")
+            if "fault_at" in record.metadata:
+                return float(record.metadata["fault_at"].split()[0]), record.metadata["what happens"]
+    raise BagError(f"{bag}: its metadata does not say when a fault sets in; make it with bags/make.py")
 
 
 def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> dict[int, Any]:
