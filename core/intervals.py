@@ -42,17 +42,17 @@ def rate_interval(
     lower, upper : float
         (0, inf) for fewer than two transients or no exposure.
     """
-    from scipy.stats import gamma, norm, t
+    from scipy.special import gammainccinv, gammaincinv, ndtr, stdtrit
 
     c = np.asarray(counts, dtype=np.float64)
     if len(c) < 2 or exposure <= 0:
         return 0.0, math.inf
     tail = 1.0 - confidence if one_sided else (1.0 - confidence) / 2.0
-    tail = float(norm.sf(t.isf(tail, len(c) - 1)))
+    tail = float(ndtr(stdtrit(len(c) - 1, tail)))
     size = max(cluster_size(c), size or 1.0)
     clusters = float(c.sum()) / size
-    lower = float(gamma.ppf(tail, clusters)) * size / exposure if clusters and not one_sided else 0.0
-    return lower, float(gamma.isf(tail, clusters + 1.0)) * size / exposure
+    lower = float(gammaincinv(clusters, tail)) * size / exposure if clusters and not one_sided else 0.0
+    return lower, float(gammainccinv(clusters + 1.0, tail)) * size / exposure
 
 
 def share_interval(hits: int, trials: int, confidence: float) -> tuple[float, float]:

@@ -111,6 +111,16 @@ def test_control_lost_in_the_noise_is_named():
     assert not any(WORDS["weak"] in m for m in messages(run(u=u, noise=0.0, count=1500, seed=4)) if "'valve'" in m)
 
 
+@pytest.mark.parametrize(("moves", "named"), [(1, True), (9, True), (200, False)])
+def test_control_that_hardly_ever_moves_is_named(moves, named):
+    u = steps(np.random.default_rng(4), 1501)
+    u[:, 1] = 0.0
+    u[100 : 100 + moves : 1, 1] = 0.4
+    found = messages(run(u=u))
+    assert any(f"'pump' leaves its usual value in {moves} of 1500 transitions only" in m for m in found) == named
+    assert not (named and any("'pump' never goes" in m for m in found))
+
+
 def test_control_set_by_a_feedback_is_named_and_open_loop_is_not():
     K = np.array([[2.0, 0.3], [0.1, 1.5]])
     found = messages(run(feedback=K, noise=0.0, u=np.zeros((1501, 2))))
@@ -195,7 +205,7 @@ def test_stale_controls_are_named():
     old = run(signals=signals, counters={"stale valve": 400})
     problem = assemble([old], OperatingPoint.identity(2, 2), None, "noise")
     (message,) = stale(signals.signals, 2, problem, [old])
-    assert "'valve' was older than its max_hold (0.1 s) in 400 of 1501 samples" in message
+    assert "'valve' was older than max_hold (0.1 s) in 400 of 1501 samples" in message
     assert stale(signals.signals, 2, problem, [run(signals=signals, counters={"stale valve": 3})]) == []
 
 
@@ -258,3 +268,16 @@ def test_the_suggested_delay_narrows_the_neato(recordings, signals_folder):
     later = replace(signals, controls=tuple(replace(c, delay=1) for c in signals.controls))
     plain, shifted = fit(read_transients(bag, signals)), fit(read_transients(bag, later))
     assert (shifted.fit["mean_width"] < 0.65 * plain.fit["mean_width"]).all()
+
+
+def test_hunter_steering_is_named_as_not_identifiable(recordings, signals_folder, tmp_path):
+    from uncertain_lti import read_transients
+
+    text = (signals_folder / "hunter_se.yaml").read_text()
+    text = text.replace(
+        "\ncontrols:", "\n  - {name: yaw_rate, topic: /hunter/twist, field: twist.angular.z}\ncontrols:"
+    )
+    (tmp_path / "s.yaml").write_text(text + "  - {name: steering, topic: /hunter/cmd, field: vector.y}\n")
+    bag = recordings / "hunter_se/straight_odd_t_0_5_run_01.mcap"
+    found = fit(read_transients(bag, tmp_path / "s.yaml")).fit["messages"]
+    assert any("'steering' leaves its usual value in 1 of 2512 transitions only" in m for m in found)

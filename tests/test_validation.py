@@ -231,8 +231,8 @@ def test_wrong_options_are_refused(runs):
     for options, words in cases:
         with pytest.raises(FitError, match=words):
             validate(runs, additive="noise", **options)
-    short = [cut(r, 0, 4) for r in runs[:2]]
-    with pytest.raises(FitError, match=r"without tanks 3\.0 no model can be fitted: 3 usable"):
+    short = [cut(r, 0, 7) for r in runs[:2]]
+    with pytest.raises(FitError, match=r"without tanks 3\.0 no model can be fitted: 6 usable"):
         validate(short, additive="noise")
 
 
@@ -319,16 +319,16 @@ def true_alarms(model, x, u, rule):
 
 @pytest.mark.slow
 def test_intervals_contain_the_truth_as_often_as_they_say():
-    """240 plants, each with its own recordings; the truth is that of the very model, on 250 fresh transients.
+    """200 plants, each with its own recordings; the truth is that of the very model, on 250 fresh transients.
 
-    Half with sensor noise and the additive term, half without either; both criteria; 8 to 30 recordings.
+    Half with sensor noise and the additive term, half without either; both criteria; 8 to 24 recordings.
     """
-    repetitions = 240
+    repetitions = 200
     held: dict[str, list[bool]] = {}
     for seed in range(repetitions):
         rng = np.random.default_rng([seed, 1])
         plant, noise = Tanks(seed, spread=0.2), 1e-3 * (seed % 2)
-        runs = plant.transients(int(rng.integers(8, 31)), seed, noise=noise)
+        runs = plant.transients(int(rng.integers(8, 25)), seed, noise=noise)
         validation = validate(
             runs, criterion=("qp", "lp")[seed // 2 % 2], additive="noise" if noise else "none", confidence=0.9
         )
@@ -355,7 +355,7 @@ def test_intervals_contain_the_truth_as_often_as_they_say():
             held.setdefault("calibrated", []).append(alarms.sum() / hours <= wish)
     shares = {what: (float(np.mean(hits)), len(hits)) for what, hits in held.items()}
     print(shares)
-    assert min(count for _, count in shares.values()) >= 150
+    assert min(count for _, count in shares.values()) >= 100
     for what, (share, _) in shares.items():
         assert share >= 0.87, f"{what}: the 90 % interval holds in {share:.1%} only; all: {shares}"
 

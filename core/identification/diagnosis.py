@@ -155,9 +155,11 @@ def _recordings(
     signals = model.signals.signals
     limit = 1e-12 * problem.p
     messages = excitation.collinear(problem, sums, names, limit)
-    messages += excitation.weak(problem, sums, names)
     part = _stretches(problem)
-    messages += excitation.one_sided(part, names)
+    rare = excitation.rare(part, names)
+    messages += rare.values()
+    messages += excitation.weak(problem, sums, names, rare)
+    messages += excitation.one_sided(part, names, rare)
     messages += excitation.fed_back(part, names)
     messages += sensors.delayed(part, signals)
     messages += sensors.quantised(part, signals)

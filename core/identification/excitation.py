@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ COLLINEAR = 1e-3
 """Smallest eigenvalue of the regressors' correlation below which signals move nearly together (and above rank)."""
 DETERMINED = 4.0
 """A control's effect on some state must be so many standard errors, or it cannot be told from the noise."""
+FEW = 10
+"""A control that leaves its usual value in fewer transitions is not identifiable."""
 ONE_SIDED = 0.05
 """A control that goes less than this share of its range to one side of its steady value is one-sided."""
 FED_BACK = 0.9
@@ -52,10 +54,26 @@ def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: f
     return messages
 
 
-def one_sided(problem: Problem, names: Sequence[str]) -> list[str]:
-    """Controls that stay on one side of their steady value."""
+def rare(problem: Problem, names: Sequence[str]) -> dict[int, str]:
+    """Controls, by column, that stand at one value in all but a few transitions."""
+    messages = {}
+    for j in range(problem.n, problem.p):
+        values, counts = np.unique(problem.z[:, j], return_counts=True)
+        moved = problem.N - int(counts.max())
+        if len(values) > 1 and moved < FEW:
+            messages[j] = (
+                f"control '{names[j]}' leaves its usual value in {moved} of {problem.N} transitions only, so its "
+                f"effect is not identifiable: record it moving, or leave it out"
+            )
+    return messages
+
+
+def one_sided(problem: Problem, names: Sequence[str], known: Collection[int] = ()) -> list[str]:
+    """Controls that stay on one side of their steady value, without those of which worse is known."""
     messages = []
     for j in range(problem.n, problem.p):
+        if j in known:
+            continue
         low, high = float(problem.z[:, j].min()), float(problem.z[:, j].max())
         if low == high:  # said to be constant elsewhere
             continue
@@ -70,8 +88,8 @@ def one_sided(problem: Problem, names: Sequence[str]) -> list[str]:
     return messages
 
 
-def weak(problem: Problem, moments: Moments, names: Sequence[str]) -> list[str]:
-    """Controls whose effect on every state is lost in what one step leaves unexplained."""
+def weak(problem: Problem, moments: Moments, names: Sequence[str], known: Collection[int] = ()) -> list[str]:
+    """Controls whose effect on every state is lost in what one step leaves unexplained; `known` as in `one_sided`."""
     free = np.flatnonzero(moments.phi_scale > 0)
     centre, target = moments.centre[np.ix_(free, free)], moments.target[free]
     if not len(free) or moments.count <= len(free):
@@ -83,7 +101,7 @@ def weak(problem: Problem, moments: Moments, names: Sequence[str]) -> list[str]:
     error = np.sqrt(np.outer(np.diagonal(inverse), residual / (moments.count - len(free))))
     messages = []
     for row, j in enumerate(free.tolist()):
-        if not problem.n <= j < problem.p or np.ptp(problem.z[:, j]) == 0:
+        if not problem.n <= j < problem.p or j in known or np.ptp(problem.z[:, j]) == 0:
             continue
         certainty = np.abs(theta[row]) / np.maximum(error[row], 1e-300)
         best = int(np.argmax(certainty))

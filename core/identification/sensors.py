@@ -107,14 +107,17 @@ def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Seque
     """Controls that were too old for many samples, or that ended long before the recording did."""
     messages = []
     samples = sum(len(t) for t in transients)
+    old: dict[tuple[int, float | None], list[str]] = {}
     for signal in signals[n:]:
         count = sum(t.counters[f"stale {signal.name}"] for t in transients)
         if samples and count > STALE * samples:
-            messages.append(
-                f"control '{signal.name}' was older than its max_hold ({signal.max_hold} s) in {count} of {samples} "
-                f"samples, which are not used: record it for as long as the states, or raise max_hold if the machine "
-                f"holds the last command"
-            )
+            old.setdefault((count, signal.max_hold), []).append(signal.name)
+    for (count, hold), names in old.items():
+        messages.append(
+            f"{quoted(names)} {'were' if len(names) > 1 else 'was'} older than max_hold ({hold} s) in {count} of "
+            f"{samples} samples, which are not used: record commands for as long as the states, or raise max_hold if "
+            f"the machine holds the last command"
+        )
     for topic in dict.fromkeys(s.topic for s in signals[n:] if s.max_hold is None):
         columns = [j for j, s in enumerate(signals) if j >= n and s.topic == topic]
         for source in range(int(problem.source[-1]) + 1):
