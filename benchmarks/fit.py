@@ -164,6 +164,7 @@ def joint(scale):
 def pyipm(scale):
     """Against PyIPM on the same rows; its linear programme minimises the mean width."""
     try:
+        import cvxopt
         from PyIPM import IPM
     except ImportError:
         print("PyIPM is not installed here (pip install PyIPM); this comparison is left out")
@@ -172,6 +173,8 @@ def pyipm(scale):
     x, u, x_next = excited(N, 10, 3)
     problem = problem_of(x, u, x_next)
     z, rate = np.hstack([x, u]), (x_next - x) / DT
+
+    cvxopt.solvers.options["show_progress"] = False
 
     def peer():
         for i in range(10):
@@ -272,7 +275,7 @@ def disk_fit(folder, N, parts):
         model = fit_fleet(Fleet([partition]), names(5, 4), criterion, dt_median=DT)
         took = time.perf_counter() - began
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        count = int(Fleet([partition]).count_outside(model).sum())
+        count = int(Fleet([partition]).judge(model).outside.sum())
         rows.append(
             [
                 criterion,

@@ -87,7 +87,7 @@ def test_many_blocks_and_passes_from_disk(tmp_path, criterion):
     assert np.asarray(fit_fleet(fleet, whole.signals, criterion).fit["objective"]) == pytest.approx(
         objective, rel=1e-12
     )
-    assert fleet.count_outside(model).sum() == 0
+    assert fleet.judge(model).outside.sum() == 0
 
 
 def test_cut_cache_and_wrong_folders_are_named(tmp_path):

@@ -218,8 +218,8 @@ def fit_fleet(
     def build(theta: Array, d: Array) -> UncertainLTI:
         return _model(fleet.columns, signals, sums, theta, d, dt_median, alarm)
 
-    model, d = repair(build, fleet, sums, solution.theta, solution.d, solution.violation)
-    max_width, weighted = fleet.widest(d)
+    model, d, judged = repair(build, fleet, sums, solution.theta, solution.d, solution.violation)
+    max_width = judged.largest
     mean_width = 2.0 * (sums.width_sum @ d) / sums.count
     if criterion == "qp":
         weights = engine.weights
@@ -227,7 +227,7 @@ def fit_fleet(
         reference = np.array([_objective(sums, solution.d, weights)])
     else:
         assert solution.delta is not None
-        objective, reference = weighted, solution.delta
+        objective, reference = judged.weighted, solution.delta
     gap = float(np.max((objective - reference) / np.maximum(np.abs(objective), 1e-300), initial=0.0))
     X = model.operating_point.X
     facts: dict[str, Any] = {

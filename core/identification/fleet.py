@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.identification import passes
-from uncertain_lti.identification.passes import Candidate, Moments, Samples
+from uncertain_lti.identification.passes import Candidate, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Columns, Partition
 from uncertain_lti.model import UncertainLTI
 
@@ -65,10 +65,10 @@ class Fleet:
             rows.append((Samples.join([r[i][0] for r in results], self.p), min(r[i][1] for r in results)))
         return rows
 
-    def count_outside(self, model: UncertainLTI) -> NDArray[np.intp]:
-        """Transitions outside each row's bounds, (n,), by the verdict's own arithmetic."""
-        counts = self.map(passes.count_outside, self._same(model))
-        return np.asarray(np.sum(counts, axis=0), dtype=np.intp)
+    def judge(self, model: UncertainLTI) -> Judged:
+        """What the bounds of a model are on all transitions, by the verdict's own arithmetic."""
+        first, *others = self.map(passes.judge, self._same(model))
+        return sum(others, first)
 
     def moving_from_rest(self) -> tuple[int, int, float]:
         """Samples with x = u = 0 and a successor that is not: how many, and the state that moves most and how far."""
@@ -79,8 +79,3 @@ class Fleet:
     def median_dt(self) -> float:
         """Median of Δt, s."""
         return float(np.median(np.concatenate(self.map(passes.steps, self._same()))))
-
-    def widest(self, d: Array) -> tuple[Array, Array]:
-        """Largest width, and largest √w_ii x width, each (n,), normalised."""
-        results = self.map(passes.widest, self._same(d))
-        return np.max([r[0] for r in results], axis=0), np.max([r[1] for r in results], axis=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,6 +74,18 @@ class Moments:
         return np.where(scale > 0, scale, 1.0)
 
 
+_SINGLE_THREADED = 2**18
+"""Multiplications up to which OpenBLAS keeps a product on one thread; beyond, waking the others costs more here."""
+
+
+def _pieces(part: Partition, rows: int) -> Iterator[Block]:
+    """All transitions, in pieces whose products of `rows` rows stay on one thread where that is still efficient."""
+    most = max(_SINGLE_THREADED // (rows * (part.p + 2)), 512)
+    for block in part.blocks():
+        for start in range(0, len(block), most):
+            yield block.piece(start, start + most)
+
+
 def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Samples]]:
     """One pass for everything in `Moments`, and every stride-th transition of the whole (none where stride is 0).
 
@@ -83,7 +95,7 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
     q = p + columns.disturbance + columns.noise
     sums: Moments | None = None
     sampled: list[list[Samples]] = [[] for _ in range(n)]
-    for block in part.blocks():
+    for block in _pieces(part, part.p + 2):
         if stride:
             chosen = np.arange(-(block.start + offset) % stride, len(block), stride)
             for i in range(n):
@@ -201,7 +213,7 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     kept = [0] * n
     reach = candidate.reach.copy()
     scale = candidate.scale[:, None]
-    for block in part.blocks():
+    for block in _pieces(part, part.n):
         psi = block.psi(columns)
         size = candidate.size_unit @ psi
         size[size == 0.0] = np.inf  # at rest without an additive term nothing but rest is contained
@@ -245,15 +257,39 @@ def _least(
     return [samples], [slack], reach
 
 
-def count_outside(part: Partition, model: UncertainLTI) -> NDArray[np.intp]:
-    """Transitions outside each row's bounds (6)(7), (n,), by the arithmetic of `UncertainLTI.bounds`."""
-    outside = np.zeros(part.n, dtype=np.intp)
+@dataclass(frozen=True)
+class Judged:
+    """What the bounds of a model are on transitions, each (n,): how many are outside by row, the largest width per
+    step, and the largest √w_ii x width, normalised."""
+
+    outside: NDArray[np.intp]
+    largest: Array
+    weighted: Array
+
+    def __add__(self, other: Judged) -> Judged:
+        return Judged(
+            self.outside + other.outside,
+            np.maximum(self.largest, other.largest),
+            np.maximum(self.weighted, other.weighted),
+        )
+
+
+def judge(part: Partition, model: UncertainLTI) -> Judged:
+    """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`."""
+    zeros = np.zeros(part.n)
+    total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
     for block in part.blocks():
         centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
         model.columns_centre_and_half(block.z, block.dt, centre, half)
         inside = (centre - half <= block.x_next) & (block.x_next <= centre + half)
-        outside += len(block) - np.count_nonzero(inside, axis=1)
-    return outside
+        outside = len(block) - np.count_nonzero(inside, axis=1)
+        largest = 2.0 * half.max(axis=1)
+        if block.weights.ndim == 1:
+            weighted = largest * np.sqrt(block.weights)
+        else:
+            weighted = 2.0 * (half * block.root_weights()).max(axis=1)
+        total = total + Judged(outside, largest, weighted)
+    return total
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:
@@ -272,15 +308,3 @@ def moving_from_rest(part: Partition) -> tuple[int, int, float]:
 def steps(part: Partition) -> Array:
     """Δt of every transition, (N,)."""
     return np.concatenate([block.dt for block in part.blocks()])
-
-
-def widest(part: Partition, d: Array) -> tuple[Array, Array]:
-    """Largest width per step, and largest √w_ii x width, each (n,), normalised."""
-    largest, weighted = np.zeros(part.n), np.zeros(part.n)
-    for block in part.blocks():
-        width = d.T @ block.psi(part.columns)
-        width *= 2.0 * block.dt
-        largest = np.maximum(largest, width.max(axis=1))
-        width *= block.root_weights()
-        weighted = np.maximum(weighted, width.max(axis=1))
-    return largest, weighted

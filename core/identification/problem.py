@@ -63,6 +63,12 @@ class Block:
         """Number of states."""
         return len(self.x_next)
 
+    def piece(self, start: int, stop: int) -> Block:
+        """Some consecutive transitions, without a copy."""
+        weights = self.weights if self.weights.ndim == 1 else self.weights[start:stop]
+        part = slice(start, stop)
+        return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights)
+
     def rate(self) -> Array:
         """(x_next - x) / Δt, 1/s, (n, K)."""
         rate = self.x_next - self.z[: self.n]

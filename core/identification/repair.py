@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.passes import Judged, Moments
 from uncertain_lti.model import UncertainLTI
 
 Array = NDArray[np.float64]
@@ -24,8 +24,8 @@ def repair(
     theta: Array,
     d: Array,
     violation: Array,
-) -> tuple[UncertainLTI, Array]:
-    """Lift d until `Fleet.count_outside` is zero in every row.
+) -> tuple[UncertainLTI, Array, Judged]:
+    """Lift d until `Fleet.judge` finds nothing outside in any row.
 
     A solver leaves a violation of at most `violation` x (scaled size of the sample), and the size is linear in |z|,
     so lifting each element by violation x its unit covers it in every sample. What is left is rounding: a few ulps
@@ -44,6 +44,8 @@ def repair(
     model : UncertainLTI
     d : array (q, n)
         Lifted.
+    judged : Judged
+        Widths, with none outside.
 
     Raises
     ------
@@ -67,9 +69,10 @@ def repair(
         ulps = 2.0 ** (attempt + 2) * _EPS * (nominal + base + own) * free[:, None]
         lifted = np.where(todo, base + ulps, lifted)
         model = build(theta, lifted)
-        todo = fleet.count_outside(model) > 0
+        judged = fleet.judge(model)
+        todo = judged.outside > 0
         if not todo.any():
-            return model, lifted
+            return model, lifted, judged
     raise FitError(
         f"containment could not be repaired in row {int(np.argmax(todo))}: the signals differ too much in scale; "
         f"give steady and scale that bring them to order one"

@@ -33,7 +33,7 @@ WIDTH_SLACK = 1e-9
 BOUNDED_TIE_BREAK = 1e-5
 """The same as TIE_BREAK among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
 MAX_ROUNDS = 200
-_JOIN = 48  # samples that join a working set per round
+_JOIN = 48  # samples that join a working set per round, at least; more where there are many unknowns
 
 
 @dataclass
@@ -148,11 +148,12 @@ class Row:
             slack = np.minimum(slack, self.limit / self.width - half)
         return np.asarray(slack)
 
-    def widen_pool(self, tolerance: float = TOLERANCE, most: int = _JOIN) -> bool:
+    def widen_pool(self, tolerance: float = TOLERANCE, most: int | None = None) -> bool:
         """Let the most violated held samples join the working set; False where there is none to join."""
         slack = self.slack()
         slack[self.pool] = np.inf
         outside = np.flatnonzero(slack < -tolerance)
+        most = most or max(_JOIN, 2 * (self.r + self.q))
         if len(outside) > most:
             outside = outside[np.argpartition(slack[outside], most)[:most]]
         self.pool = np.concatenate([self.pool, outside])
