@@ -331,6 +331,7 @@ def test_any_text_is_a_path_or_a_signal_error(text: str) -> None:
         ("sensor_msgs/msg/JointState", "roll(position[0])", "wants a quaternion with x, y, z, w"),
         ("sensor_msgs/msg/JointState", "norm(position[0])", "wants a vector with x, y, z or an array of numbers"),
         ("sensor_msgs/msg/JointState", "norm(name)", "wants a vector"),
+        ("geometry_msgs/msg/Polygon", "norm(points)", "wants a vector"),
         ("std_msgs/msg/Float64MultiArray", "data[fan]", "needs an array of strings called 'name' beside it"),
         ("std_msgs/msg/Float64MultiArray", "data[-1]", "needs an array of strings called 'name' beside it"),
         ("std_msgs/msg/Float64MultiArray", "data[1:3]", "give an index instead, for example \\[0\\]"),

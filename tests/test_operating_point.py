@@ -1,0 +1,204 @@
+"""Normalisation, and what `auto` resolves to."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from uncertain_lti.errors import TransientError
+from uncertain_lti.operating_point import STILL_BAND, STILL_SAMPLES, OperatingPoint, resolve_auto, still_stretches
+from uncertain_lti.signals import Signal
+
+NAN, INF = math.nan, math.inf
+number = st.floats(-1e6, 1e6)
+
+
+@given(st.data())
+def test_normalisation_is_as_method_section_1_states_it(data: st.DataObject) -> None:
+    n, m = data.draw(st.integers(1, 4)), data.draw(st.integers(0, 3))
+    vector = lambda size, elements: data.draw(hnp.arrays(float, size, elements=elements))  # noqa: E731
+    point = OperatingPoint(
+        vector(n, number), vector(m, number), vector(n, st.floats(1e-3, 1e3)), vector(m, st.floats(1e-3, 1e3))
+    )
+    lead = data.draw(hnp.array_shapes(max_dims=2, max_side=3) | st.just(()))
+    x, u = vector((*lead, n), number), vector((*lead, m), number)
+    deviation = point.normalise_x(x)
+    for index in np.ndindex(lead):
+        for i in range(n):
+            assert deviation[(*index, i)] == (x[(*index, i)] - point.x_s[i]) / point.X[i]
+        for j in range(m):
+            assert point.normalise_u(u)[(*index, j)] == (u[(*index, j)] - point.u_s[j]) / point.U[j]
+    np.testing.assert_allclose(point.recorded_x(deviation), x, rtol=1e-12, atol=1e-9)
+
+
+def test_identity_changes_nothing() -> None:
+    point = OperatingPoint.identity(2, 1)
+    x, u = np.array([1.5, -2.0]), np.array([0.1])
+    assert point.normalise_x(x).tolist() == point.recorded_x(x).tolist() == x.tolist()
+    assert point.normalise_u(u).tolist() == u.tolist()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (([0.0], [], [0.0], []), "every scale in X must be positive"),
+        (([0.0], [1.0], [1.0], [-1.0]), "every scale in U must be positive"),
+        (([0.0], [], [NAN], []), "X must be a vector of finite numbers"),
+        (([INF], [], [1.0], []), "x_s must be a vector of finite numbers"),
+        (([0.0, 1.0], [], [1.0], []), "x_s and X differ in length"),
+        (([0.0], [1.0], [1.0], []), "u_s and U differ in length"),
+        (([[0.0]], [], [[1.0]], []), "x_s must be a vector"),
+    ],
+)
+def test_a_wrong_operating_point_is_refused(arguments: tuple[list[float], ...], words: str) -> None:
+    with pytest.raises(TransientError, match=words):
+        OperatingPoint(*map(np.array, arguments))
+
+
+def test_auto_must_be_resolved_before_it_is_used() -> None:
+    states = [Signal("x", "/a", "data", steady=2.0, scale=4.0)]
+    assert OperatingPoint.of(states, []).normalise_x(np.array([6.0])).tolist() == [1.0]
+    with pytest.raises(TransientError, match="signal 'u': scale is auto and not resolved; give a number"):
+        OperatingPoint.of(states, [Signal("u", "/a", "data", scale="auto")])
+
+
+def test_it_cannot_be_changed_behind_the_models_back() -> None:
+    given_x_s = np.zeros(1)
+    point = OperatingPoint(given_x_s, np.zeros(0), np.ones(1), np.zeros(0))
+    given_x_s[0] = 7.0
+    assert point.x_s.tolist() == [0.0]
+    with pytest.raises(ValueError):
+        point.x_s[0] = 7.0
+
+
+# --- still stretches -----------------------------------------------------------------------------------------
+
+
+def naive_stretches(values: np.ndarray, span: np.ndarray, band: float) -> list[tuple[int, int]]:
+    """From the left: the longest stretch from each start whose every column stays within the band."""
+    found, start = [], 0
+    while start < len(values):
+        stop = start
+        for end in range(start + 1, len(values) + 1):
+            part = values[start:end]
+            if not np.isfinite(part).all() or (part.max(axis=0) - part.min(axis=0) > band * span).any():
+                break
+            stop = end
+        if stop - start >= STILL_SAMPLES:
+            found.append((start, stop))
+        start = max(stop, start + 1)
+    return found
+
+
+@st.composite
+def recorded(draw: st.DrawFn) -> np.ndarray:
+    """Stretches of rest, ramps, noise and gaps."""
+    columns = draw(st.integers(1, 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    parts = []
+    for _ in range(draw(st.integers(1, 6))):
+        length = draw(st.sampled_from([1, 5, STILL_SAMPLES - 1, STILL_SAMPLES, 30, 255, 256, 257, 600]))
+        level = rng.integers(-2, 3, columns)
+        kind = draw(st.sampled_from(["rest", "noise", "ramp", "gap"]))
+        rest = np.tile(level.astype(float), (length, 1))
+        rest += {"noise": 0.02, "ramp": 0.0, "rest": 0.0, "gap": 0.0}[kind] * rng.uniform(-1, 1, rest.shape)
+        if kind == "ramp":
+            rest += np.linspace(0, 1, length)[:, None]
+        if kind == "gap":
+            rest[draw(st.integers(0, length - 1)), draw(st.integers(0, columns - 1))] = NAN
+        parts.append(rest)
+    return np.vstack(parts)
+
+
+@given(recorded(), st.sampled_from([0.0, STILL_BAND, 0.3, 1.0]))
+def test_still_stretches_are_those_of_the_naive_search(values: np.ndarray, band: float) -> None:
+    seen = np.isfinite(values)
+    span = np.max(values, axis=0, where=seen, initial=-9.0) - np.min(values, axis=0, where=seen, initial=9.0)
+    span = np.where(seen.any(axis=0), span, 0.0)
+    assert still_stretches(values, span, band) == naive_stretches(values, span, band)
+
+
+# --- the rule ------------------------------------------------------------------------------------------------
+
+
+def signals(*said: tuple[object, object]) -> list[Signal]:
+    return [Signal(f"s{i}", "/a", "data", steady=s, scale=c) for i, (s, c) in enumerate(said)]
+
+
+def rest(level: float, length: int) -> np.ndarray:
+    return np.full((length, 1), level)
+
+
+AUTO = ("auto", "auto")
+
+
+def test_steady_is_the_median_over_the_longest_still_stretch_and_scale_the_largest_steady_magnitude() -> None:
+    ramp = np.linspace(2.0, -8.0, 9)[:, None]
+    recordings = [np.vstack([rest(2.0, 20), ramp, rest(-8.0, 12)]), np.vstack([rest(3.0, 25), ramp])]
+    steady, scale, words = resolve_auto(signals(AUTO), recordings)
+    assert (steady, scale) == ([3.0], [8.0])
+    assert words.startswith("25 still samples (every signal within 5% of its range)")
+
+
+def test_every_signal_has_to_be_still_at_once() -> None:
+    a = np.concatenate([np.zeros(40), np.ones(12)])
+    b = np.concatenate([np.tile([0.0, 1.0], 20), np.full(12, 0.5)])
+    steady, scale, _ = resolve_auto(signals(AUTO, AUTO), [np.column_stack([a, b])])
+    assert (steady, scale) == ([1.0, 0.5], [1.0, 0.5])
+
+
+def test_a_median_and_not_a_mean() -> None:
+    values = np.concatenate([np.full(30, 1.0), np.full(5, 1.04), [2.0]])
+    steady, _, _ = resolve_auto(signals(AUTO), [values[:, None]])
+    assert steady == [1.0]
+
+
+def test_where_the_steady_magnitude_is_zero_the_scale_is_the_range() -> None:
+    values = np.concatenate([np.zeros(30), [-3.0, 4.0]])
+    assert resolve_auto(signals(AUTO), [values[:, None]])[:2] == ([0.0], [7.0])
+
+
+def test_where_nothing_ever_moves_the_scale_is_one() -> None:
+    assert resolve_auto(signals(AUTO), [rest(0.0, 30)])[:2] == ([0.0], [1.0])
+    assert resolve_auto(signals(AUTO), [rest(5.0, 30)])[:2] == ([5.0], [5.0])
+
+
+def test_the_band_is_doubled_until_there_is_a_stretch() -> None:
+    saw = np.tile([0.0, 0.35], 20)
+    values = np.concatenate([saw, [1.0]])
+    steady, _, words = resolve_auto(signals(AUTO), [values[:, None]])
+    assert "within 40% of its range" in words and steady == [pytest.approx(0.175)]
+
+
+def test_without_a_stretch_all_samples_count() -> None:
+    values = np.array([1.0, 2.0, 6.0])[:, None]
+    steady, scale, words = resolve_auto(signals(AUTO), [values])
+    assert (steady, scale, words) == ([2.0], [2.0], "all samples (no still stretch)")
+
+
+def test_a_signal_that_never_comes_stays_at_zero_and_one() -> None:
+    values = np.column_stack([np.arange(30.0), np.full(30, NAN), np.full(30, INF)])
+    steady, scale, _ = resolve_auto(signals(AUTO, AUTO, AUTO), [values])
+    assert (steady[1:], scale[1:]) == ([0.0, 0.0], [1.0, 1.0])
+    assert steady[0] == 14.5
+
+
+@given(st.lists(recorded(), min_size=1, max_size=2).filter(lambda r: len({x.shape[1] for x in r}) == 1), st.data())
+def test_what_is_said_stays_and_what_is_resolved_can_be_used(recordings: list[np.ndarray], data: st.DataObject) -> None:
+    said = [
+        (data.draw(st.sampled_from(["auto", 3.5])), data.draw(st.sampled_from(["auto", 2.5])))
+        for _ in range(recordings[0].shape[1])
+    ]
+    steady, scale, words = resolve_auto(signals(*said), recordings)
+    assert words
+    for (said_steady, said_scale), s, c in zip(said, steady, scale, strict=True):
+        assert s == said_steady if said_steady != "auto" else math.isfinite(s)
+        assert c == said_scale if said_scale != "auto" else 0 < c < INF
+    alone, _, _ = resolve_auto(signals(*[AUTO] * len(said)), recordings)
+    for (said_steady, _), s, a in zip(said, steady, alone, strict=True):
+        assert said_steady != "auto" or s == a  # what one signal says does not move another
