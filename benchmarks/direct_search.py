@@ -1,6 +1,6 @@
 """The paper's solver (direct search, golden-section line searches) beside the exact one: objective of (10) and time.
 
-    ./run python benchmarks/direct_search.py
+./run python benchmarks/direct_search.py
 """
 
 import time

@@ -11,10 +11,13 @@ import time
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from uncertain_lti import __version__
 from uncertain_lti.errors import BagError, FitError, UncertainLTIError
+
+if TYPE_CHECKING:
+    from uncertain_lti import UncertainLTI
 
 DONE, ALARM, BAD_INPUT = 0, 1, 2
 
@@ -109,7 +112,7 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     fit.add_argument("--workers", type=int, metavar="N", help="fit on a Dask cluster of N workers on this machine")
 
     check = command("check", _check, "check a recording against a model")
-    check.add_argument("model", metavar="MODEL", help="model file")
+    check.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     check.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders")
     check.add_argument("--violations", type=int, help="alarm: so many violations (default: the model's)")
     check.add_argument("--window", type=int, help="alarm: among so many last verdicts (default: the model's)")
@@ -133,7 +136,7 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     validate.add_argument("--json", action="store_true", help="print JSON")
 
     info = command("info", _info, "show what is in a model file")
-    info.add_argument("model", metavar="MODEL", help="model file")
+    info.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     info.add_argument("--json", action="store_true", help="print the file as JSON")
 
     reproduce = command("reproduce", _reproduce, "run the paper's experiment on the nonlinear turbofan")
@@ -307,12 +310,12 @@ def _sha256(path: str) -> str:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from uncertain_lti import EnvelopeMonitor, UncertainLTI
+    from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.bag import group_recordings
     from uncertain_lti.reading import read_for_model
     from uncertain_lti.report import check_data, check_text
 
-    model = UncertainLTI.load(options.model)
+    model = _named(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
     results = []
     for bag in group_recordings(options.bags):
@@ -376,11 +379,18 @@ def _reproduce(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _info(options: argparse.Namespace) -> int:
+def _named(model: str) -> UncertainLTI:
+    """The model of a file, or the paper's by its name."""
     from uncertain_lti import UncertainLTI
+    from uncertain_lti.plants.leibov import leibov2006
+
+    return leibov2006() if model == "leibov2006" and not os.path.exists(model) else UncertainLTI.load(model)
+
+
+def _info(options: argparse.Namespace) -> int:
     from uncertain_lti.report import model_text
 
-    model = UncertainLTI.load(options.model)
+    model = _named(options.model)
     if options.json:
         _print_json(model.to_dict())
     else:

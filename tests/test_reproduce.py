@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from uncertain_lti.cli import main
 from uncertain_lti.errors import FitError
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.plants.leibov import leibov2006, transient
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def objective(model, transients):
@@ -78,6 +81,16 @@ def replace_name(run):
     return Transient(run.t_ns, run.x, run.u, signals=replace(run.signals, source="copy"))
 
 
+def test_the_published_model_is_known_to_the_commands_by_name(capsys):
+    """It contains its own shipped recording up to the sample after which that leaves the intervals, and not beyond."""
+    assert main(["check", "leibov2006", str(ROOT / "bags/leibov_check.mcap"), "--json"]) == 1
+    (result,) = json.loads(capsys.readouterr().out)["recordings"]
+    first = [k for k, v in enumerate(result["verdict_per_sample"]) if 1.0 in v["flags"]][0]
+    assert first == 1201
+    assert main(["info", "leibov2006"]) == 0
+    assert "-15.59-17j" in capsys.readouterr().out
+
+
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reproduce")
@@ -87,9 +100,7 @@ def experiment(tmp_path_factory):
 
 def case(data, name, criterion="qp", additive="none"):
     (found,) = [
-        c
-        for c in data["cases"]
-        if (c["identified_from"], c["criterion"], c["additive"]) == (name, criterion, additive)
+        c for c in data["cases"] if (c["identified_from"], c["criterion"], c["additive"]) == (name, criterion, additive)
     ]
     return found
 

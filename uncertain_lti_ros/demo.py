@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     output.mkdir(parents=True, exist_ok=True)
     model_file = output / "turbofan.model.json"
 
-    print("1. Fitting a healthy turbofan (a nonlinear model with noisy sensors): pulses of every control both ways, and a")
-    print(f"   run under control: {', '.join(FIT)}")
+    print("1. Fitting a healthy turbofan (a nonlinear model with noisy sensors): pulses of every control both ways,")
+    print(f"   and a run under control: {', '.join(FIT)}")
     transients = read_transients([bags / name for name in FIT], turbofan_signals())
     model = fit(transients, "lp", additive="noise", alarm=Alarm(violations=2, window=5))
     model.save(model_file)
