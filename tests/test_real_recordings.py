@@ -16,7 +16,7 @@ RECORDINGS = [  # recordings, signals file, additive term that its noise asks fo
     (("micro_gas_turbine/ex_1.mcap", "micro_gas_turbine/ex_20.mcap"), "micro_gas_turbine.yaml", "both", True),
     (("micro_gas_turbine/ex_24.mcap",), "micro_gas_turbine.yaml", "noise", None),
     (("hunter_se/straight_odd_t_0_5_run_01.mcap",), "hunter_se.yaml", "disturbance", True),
-    (("neato/person_follower.mcap",), "neato.yaml", "both", False),
+    (("neato/person_follower.mcap",), "neato.yaml", "both", True),
     (("neato/draw_square.mcap",), "neato.yaml", "noise", True),
     (("crazyflie/rollbag_0.mcap",), "crazyflie_vicon.yaml", "noise", False),
     (("crazyflie/rollbag_0.mcap",), "crazyflie_estimate.yaml", "noise", False),
