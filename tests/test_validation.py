@@ -355,7 +355,7 @@ def test_intervals_contain_the_truth_as_often_as_they_say():
             held.setdefault("calibrated", []).append(alarms.sum() / hours <= wish)
     shares = {what: (float(np.mean(hits)), len(hits)) for what, hits in held.items()}
     print(shares)
-    assert min(count for _, count in shares.values()) >= 100
+    assert min(count for _, count in shares.values()) >= 80
     for what, (share, _) in shares.items():
         assert share >= 0.87, f"{what}: the 90 % interval holds in {share:.1%} only; all: {shares}"
 
