@@ -6,7 +6,7 @@ import bisect
 import itertools
 import os
 from array import array
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -16,6 +16,7 @@ from mcap.records import Schema
 
 from uncertain_lti.bag_files import listed_parts, natural, os_error, parts_of, stem_and_index
 from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.mcap_index import outline
 from uncertain_lti.mcap_records import Block, Contents, count, messages, read_block, scan
 from uncertain_lti.message_types import Definition, define, header_stamp_ns, normal_name, undefined
 from uncertain_lti.signal_paths import signal_paths
@@ -98,6 +99,10 @@ class Bag:
     on opening; messages are read and decoded while they are iterated. Of messages that are out of order only
     what overlaps is held, as raw bytes.
 
+    indexed: where a file has an index, go by what that states until messages are read; `described` gives what is
+    needed to read them in blocks, and everything else walks the file first. Damage to what is never read is then
+    not told, and first and last log times of topics are those of the chunks they are in.
+
     Messages of one topic that has several types: the type with the most messages counts, the others are left
     out with a warning. Messages that do not fit their definition are left out with a warning as they are met.
 
@@ -107,12 +112,22 @@ class Bag:
         There is no recording, or no message of it can be read.
     """
 
-    def __init__(self, path: str | os.PathLike[str], parts: Sequence[str | os.PathLike[str] | Contents] = ()) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        parts: Sequence[str | os.PathLike[str] | Contents] = (),
+        indexed: bool = False,
+    ) -> None:
         self.path = Path(path)
         self._warnings: list[str] = []
         self._undecoded: dict[str, str] = {}
-        contents = [part if isinstance(part, Contents) else scan(Path(part)) for part in parts]
-        self._contents = contents or self._open()
+        survey = _outline_or_scan if indexed else scan
+        contents = [part if isinstance(part, Contents) else survey(Path(part)) for part in parts]
+        self._take(contents or self._open(survey))
+
+    def _take(self, contents: list[Contents]) -> None:
+        self._contents = contents
+        self._folder_warnings = list(self._warnings)
         damage = [warning for part in self._contents for warning in part.warnings]
         self._warnings += damage
         if (damage or not self._contents) and not any(part.count for part in self._contents):
@@ -120,6 +135,34 @@ class Bag:
             raise BagError(f"{self.path}: no message can be read ({why}); record or copy it anew")
         self._channels = [_channels(part) for part in self._contents]
         self.topics: Mapping[str, TopicInfo] = self._topics()
+
+    def walk(self) -> None:
+        """Walk every file of which only the index was read; raises BagError as opening the bag does."""
+        if any(part.indexed for part in self._contents):
+            self._warnings = self._folder_warnings
+            self._undecoded = {}
+            self._take([scan(part.path) if part.indexed else part for part in self._contents])
+
+    def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
+        """Each file, and its channels that count for these topics; raises BagError as `messages` does."""
+        wanted = self._required(topics)
+        return [
+            (contents, _of(channels, wanted, counted=True))
+            for contents, channels in zip(self._contents, self._channels, strict=True)
+        ]
+
+    def tell(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
+        """Take over what was said where the same recording was read; undecoded by topic."""
+        self._warnings, self._undecoded = list(warnings), dict(undecoded)
+
+    def left_out(self, topic: str, number: int, why: str) -> str:
+        """Sentence about messages that cannot be decoded."""
+        return f"{self.path}: {topic}: {count(number, 'message')} left out that cannot be decoded ({why})"
+
+    @property
+    def said(self) -> tuple[list[str], dict[str, str]]:
+        """What `tell` takes."""
+        return list(self._warnings), dict(self._undecoded)
 
     @property
     def parts(self) -> tuple[Path, ...]:
@@ -152,9 +195,8 @@ class Bag:
         BagError
             A topic is not there (the sentence names those that are) or cannot be decoded (it says why).
         """
-        wanted = set(topics)
-        for topic in sorted(wanted):
-            self._require(topic)
+        self.walk()
+        wanted = self._required(topics)
         return self._decoded([_of(channels, wanted, counted=True) for channels in self._channels])
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
@@ -165,29 +207,30 @@ class Bag:
         BagError
             A topic is not there; the sentence names those that are.
         """
+        self.walk()
         wanted = set(self.topics if topics is None else topics)
         for topic in sorted(wanted):
             self._require(topic, readable=False)
         return self._sorted([_of(channels, wanted) for channels in self._channels])
 
-    def _open(self) -> list[Contents]:
+    def _open(self, survey: Callable[[Path], Contents]) -> list[Contents]:
         try:
             if self.path.is_dir():
-                return self._folder()
+                return self._folder(survey)
             if self.path.exists() and not self.path.is_file():
                 raise BagError(f"{self.path}: neither a file nor a folder; check the path")
-            return [scan(self.path)]
+            return [survey(self.path)]
         except OSError as error:
             raise os_error(self.path, error) from None
 
-    def _folder(self) -> list[Contents]:
+    def _folder(self, survey: Callable[[Path], Contents]) -> list[Contents]:
         paths, listed, self._warnings = parts_of(self.path)
         contents = []
         for path in paths:
             if len(paths) > 1 and not path.stat().st_size:  # the part that was open when the power went
                 self._warnings.append(f"{path}: the file is empty; it is left out")
             else:
-                contents.append(scan(path))
+                contents.append(survey(path))
         if not listed and (why := _not_one_recording(contents)):
             raise BagError(
                 f"{self.path}: without a metadata.yaml its files do not look like one recording ({why}); name them "
@@ -235,6 +278,12 @@ class Bag:
     def _every_channel(self) -> Iterator[RecordedChannel]:
         return itertools.chain.from_iterable(channels.values() for channels in self._channels)
 
+    def _required(self, topics: Iterable[str]) -> set[str]:
+        wanted = set(topics)
+        for topic in sorted(wanted):
+            self._require(topic)
+        return wanted
+
     def _require(self, topic: str, readable: bool = True) -> None:
         info = self.topics.get(topic)
         if info is None:
@@ -252,9 +301,7 @@ class Bag:
             except BagError as error:
                 topic = channel.topic
                 failed[topic] = failed.get(topic, 0) + 1
-                self._undecoded[topic] = (
-                    f"{self.path}: {topic}: {count(failed[topic], 'message')} left out that cannot be decoded ({error})"
-                )
+                self._undecoded[topic] = self.left_out(topic, failed[topic], str(error))
                 continue
             yield channel.topic, raw.log_time_ns, message
 
@@ -284,6 +331,10 @@ class Bag:
             for entry in pending[:final]:
                 yield entry[4]
             del pending[:final]
+
+
+def _outline_or_scan(path: Path) -> Contents:
+    return outline(path) or scan(path)
 
 
 def _of(channels: Mapping[int, RecordedChannel], topics: set[str], counted: bool = False) -> dict[int, RecordedChannel]:
@@ -316,8 +367,8 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
 # --- which files are one recording --------------------------------------------------------------------------
 
 
-def group_recordings(paths: Iterable[str | os.PathLike[str]]) -> list[Bag]:
-    """Recordings that these paths name, in the order of their first mention.
+def group_recordings(paths: Iterable[str | os.PathLike[str]], indexed: bool = False) -> list[Bag]:
+    """Recordings that these paths name, in the order of their first mention; indexed as in `Bag`.
 
     A folder is one recording. Files are one recording each, except the parts of a split bag: files
     `<stem>_<i>.mcap` of one stem in one folder that either
@@ -344,7 +395,7 @@ def group_recordings(paths: Iterable[str | os.PathLike[str]]) -> list[Bag]:
         files.setdefault(group, []).append(path)
     bags = []
     for group in order:
-        bags += _group(files[group])
+        bags += _group(files[group], indexed)
     seen: set[Path] = set()
     for part in itertools.chain.from_iterable(bag.parts for bag in bags):
         if part.resolve() in seen:
@@ -353,17 +404,18 @@ def group_recordings(paths: Iterable[str | os.PathLike[str]]) -> list[Bag]:
     return bags
 
 
-def _group(paths: list[Path]) -> list[Bag]:
+def _group(paths: list[Path], indexed: bool) -> list[Bag]:
     if len(paths) == 1 or len(set(paths)) < len(paths):
-        return [Bag(path) for path in paths]
+        return [Bag(path, indexed=indexed) for path in paths]
     try:
         listed = {part.resolve(): i for i, part in enumerate(listed_parts(paths[0].parent) or [])}
     except BagError:  # about other files in the folder
         listed = {}
     if all(path.resolve() in listed for path in paths):
         paths = sorted(paths, key=lambda path: listed[path.resolve()])
-        return [Bag(paths[0], paths)]
-    contents = {path: scan(path) for path in paths}
+        return [Bag(paths[0], paths, indexed)]
+    survey = _outline_or_scan if indexed else scan
+    contents = {path: survey(path) for path in paths}
     ordered = [contents[path] for path in sorted(paths, key=natural)]
     numbers = [pair[1] for part in ordered if (pair := stem_and_index(part.path))]
     if numbers[0] == 0 and not _not_one_recording(ordered):
@@ -373,7 +425,7 @@ def _group(paths: list[Path]) -> list[Bag]:
 
 def _not_one_recording(parts: Sequence[Contents]) -> str:
     """Why files are not the consecutive parts of one recording; "" where they may be."""
-    pause = max((_longest_pause(part) for part in parts), default=0)
+    pause: int | None = None
     for before, after in itertools.pairwise(parts):
         names = f"{before.path.name} and {after.path.name}"
         pair = stem_and_index(before.path), stem_and_index(after.path)
@@ -385,7 +437,9 @@ def _not_one_recording(parts: Sequence[Contents]) -> str:
         if not (kinds[0] <= kinds[1] or kinds[1] <= kinds[0]):
             return f"{names} do not carry the same topics"
         (begin, end), (next_begin, next_end) = _span(before), _span(after)
-        if next_begin - end > max(10**9, pause):
+        if next_begin - end > 10**9 and pause is None:
+            pause = max(_longest_pause(part) for part in parts)
+        if next_begin - end > max(10**9, pause or 0):
             return f"{(next_begin - end) / 1e9:.1f} s lie between {names}"
         if next_begin < begin or (end - next_begin) * 10 > min(end - begin, next_end - next_begin):
             return f"{names} overlap in time"
@@ -398,6 +452,8 @@ def _span(contents: Contents) -> tuple[int, int]:
 
 def _longest_pause(contents: Contents) -> int:
     """Longest time without any message, ns."""
+    if contents.indexed:
+        contents = scan(contents.path)
     times: list[int] = []
     for block in contents.blocks:
         times += (message[1] for message in messages(read_block(contents.path, block)))

@@ -40,10 +40,10 @@ from uncertain_lti.errors import BagError
 LARGEST_CHUNK = 1 << 28  # bytes, decompressed; recorders write chunks of 1 to 10 MB
 _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
 _PIECE = 1 << 24
-_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
-_FOOTER_SIZE = _RECORD.size + 20
+RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
+FOOTER_SIZE = RECORD.size + 20
 _FIRST_CHUNK_WARNINGS = 3
 
 
@@ -52,7 +52,10 @@ class Block:
     """A stretch of a file that is read at once: bytes `offset` to `offset + size`.
 
     compression is "" where the bytes are records as they stand; length is the size of the records; start and
-    end are the smallest and largest log time (ns); channels those that have a message here.
+    end are the smallest and largest log time (ns); channels those that have a message here. Of a chunk that was
+    found in an index (`mcap_index.outline`), unchecked is the size of what stands before its records: that has yet
+    to be held against the block, and the records against their checksum. indexed is the size of what follows it:
+    where its messages are.
     """
 
     offset: int
@@ -62,6 +65,8 @@ class Block:
     start: int
     end: int
     channels: frozenset[int]
+    unchecked: int = 0
+    indexed: int = 0
 
 
 @dataclass(slots=True)
@@ -75,7 +80,12 @@ class Tally:
 
 @dataclass(slots=True)
 class Contents:
-    """What `scan` found in a file. Blocks are in file order; warnings are sentences that begin with the path."""
+    """What `scan` found in a file. Blocks are in file order; warnings are sentences that begin with the path.
+
+    indexed says that it was not walked, and is only what its index states (`mcap_index.outline`): first and last
+    of a tally are then those of the chunks that hold the channel, and summed says whether the file has a checksum
+    over everything, which was not checked.
+    """
 
     path: Path
     size: int
@@ -84,6 +94,8 @@ class Contents:
     schemas: dict[int, Schema] = field(default_factory=dict)
     tally: dict[int, Tally] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    indexed: bool = False
+    summed: bool = False
 
     @property
     def count(self) -> int:
@@ -113,13 +125,14 @@ def scan(path: Path) -> Contents:
 
 def read_block(path: Path, block: Block) -> bytes:
     """Records of a block that `scan` found; raises BagError where the file is not what it was."""
+    assert not block.unchecked
     try:
         with open(path, "rb", buffering=0) as stream:
             stream.seek(block.offset)
             data = stream.read(block.size)
     except OSError as error:
         raise os_error(path, error) from None
-    records, _ = _inflate(block.compression, memoryview(data), block.length)
+    records, _ = inflate(block.compression, memoryview(data), block.length)
     if len(records) < block.length:
         raise BagError(f"{path}: the file changed while it was read; read it again when it is written")
     return bytes(records[: block.length])
@@ -127,15 +140,15 @@ def read_block(path: Path, block: Block) -> bytes:
 
 def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:
     """(channel, log time, publish time, begin, end) of each message; its data is `records[begin:end]`."""
-    for opcode, begin, end in _walk(records):
-        if opcode == Opcode.MESSAGE and end - begin >= _MESSAGE.size:
-            channel, _, log_time, publish_time = _MESSAGE.unpack_from(records, begin)
-            yield channel, log_time, publish_time, begin + _MESSAGE.size, end
+    for opcode, begin, end in walk(records):
+        if opcode == Opcode.MESSAGE and end - begin >= MESSAGE.size:
+            channel, _, log_time, publish_time = MESSAGE.unpack_from(records, begin)
+            yield channel, log_time, publish_time, begin + MESSAGE.size, end
 
 
-def _walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
+def walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
     """(opcode, begin, end) of each whole record."""
-    position, size, header, unpack = 0, len(records), _RECORD.size, _RECORD.unpack_from
+    position, size, header, unpack = 0, len(records), RECORD.size, RECORD.unpack_from
     while position + header <= size:
         opcode, length = unpack(records, position)
         begin = position + header
@@ -145,7 +158,7 @@ def _walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
         yield opcode, begin, position
 
 
-def _inflate(compression: str, data: memoryview, limit: int) -> tuple[bytes | memoryview, str]:
+def inflate(compression: str, data: memoryview, limit: int) -> tuple[bytes | memoryview, str]:
     """Decompress at most `limit` + 1 bytes; returns them, and what went wrong on the way (or "")."""
     if not compression:
         return data[: limit + 1], ""
@@ -182,8 +195,8 @@ class _Exact(ReadDataStream):
         return data
 
 
-def _parse(kind: type[Any], content: bytes) -> Any:
-    """One record, or None where it contradicts itself."""
+def parse(kind: type[Any], content: bytes | memoryview) -> Any:
+    """The content of one record, or None where it contradicts itself."""
     try:
         return kind.read(_Exact(BytesIO(content)))
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
@@ -248,11 +261,11 @@ class _Scanner:
         self.sums = zlib.crc32(MAGIC)
         self.stream.seek(position)
         while True:
-            header = self.stream.read(_RECORD.size)
-            if len(header) < _RECORD.size:
+            header = self.stream.read(RECORD.size)
+            if len(header) < RECORD.size:
                 return False
-            opcode, length = _RECORD.unpack(header)
-            begin, end = position + _RECORD.size, position + _RECORD.size + length
+            opcode, length = RECORD.unpack(header)
+            begin, end = position + RECORD.size, position + RECORD.size + length
             later = bisect.bisect_right(offsets, position)
             following = offsets[later] if later < len(offsets) else size
             if opcode == 0 or end > following:
@@ -266,7 +279,7 @@ class _Scanner:
                 self.stream.seek(position)
                 continue
             if opcode == Opcode.DATA_END or opcode == Opcode.FOOTER:
-                self._data_end(_parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None)
+                self._data_end(parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None)
                 return True
             self.sums = zlib.crc32(header, self.sums)
             if opcode == Opcode.MESSAGE or opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
@@ -298,7 +311,7 @@ class _Scanner:
 
     def _bare(self, position: int, opcode: int, content: bytes) -> None:
         """A record outside chunks: continues the current block or begins one."""
-        end = position + _RECORD.size + len(content)
+        end = position + RECORD.size + len(content)
         if self.bare_end != position or end - self.bare_begin > _BARE_BLOCK:
             self._end_bare()
             self.bare_begin = position
@@ -319,16 +332,16 @@ class _Scanner:
         self.bare = {}
 
     def _chunk(self, position: int, begin: int, content: bytes, cut: bool = False) -> None:
-        if len(content) < _CHUNK.size:
+        if len(content) < CHUNK.size:
             self._leave_out(position, "its record is too short", cut)
             return
-        first, last, stated, checksum, name_length = _CHUNK.unpack_from(content)
+        first, last, stated, checksum, name_length = CHUNK.unpack_from(content)
         where = f"{position} (log time {seconds(first)} to {seconds(last)} s)"
-        data_begin = _CHUNK.size + name_length + 8
+        data_begin = CHUNK.size + name_length + 8
         if len(content) < data_begin:
             self._leave_out(where, "its sizes contradict each other", cut)
             return
-        compression = content[_CHUNK.size : _CHUNK.size + name_length].decode(errors="replace")
+        compression = content[CHUNK.size : CHUNK.size + name_length].decode(errors="replace")
         (length,) = struct.unpack_from("<Q", content, data_begin - 8)
         data = memoryview(content)[data_begin : data_begin + length]
         if not cut and (data_begin + length != len(content) or (not compression and length != stated)):
@@ -341,7 +354,7 @@ class _Scanner:
             )
             return
         stated = min(stated, max(LARGEST_CHUNK, len(data)))
-        records, trouble = _inflate(compression, data, stated)
+        records, trouble = inflate(compression, data, stated)
         if cut:
             records = records[:stated]
         else:
@@ -354,7 +367,7 @@ class _Scanner:
                 return
         tally: dict[int, Tally] = {}
         end = 0
-        for opcode, start, end in _walk(records):
+        for opcode, start, end in walk(records):
             if opcode == Opcode.MESSAGE:
                 self._message(records, start, end, tally)
             elif opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
@@ -370,10 +383,10 @@ class _Scanner:
             self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
 
     def _message(self, records: bytes | memoryview, begin: int, end: int, tally: dict[int, Tally]) -> None:
-        if end - begin < _MESSAGE.size:
+        if end - begin < MESSAGE.size:
             self.odd_records += 1
             return
-        channel, _, time, _ = _MESSAGE.unpack_from(records, begin)
+        channel, _, time, _ = MESSAGE.unpack_from(records, begin)
         if entry := tally.get(channel):
             entry.count += 1
             if time > entry.last:
@@ -403,7 +416,7 @@ class _Scanner:
                 self.found.tally[channel] = entry
 
     def _definition(self, opcode: int, content: bytes) -> None:
-        record = _parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
+        record = parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
         if record is None:
             self.odd_records += 1
             return
@@ -423,26 +436,26 @@ class _Scanner:
 
     def _summary(self) -> None:
         """Definitions, statistics and places of chunks, where the file states them and their checksum holds."""
-        footer_at = self.found.size - len(MAGIC) - _FOOTER_SIZE
-        tail = self._at(footer_at, _FOOTER_SIZE)
-        if len(tail) < _FOOTER_SIZE or tail[:9] != _RECORD.pack(Opcode.FOOTER, 20):
+        footer_at = self.found.size - len(MAGIC) - FOOTER_SIZE
+        tail = self._at(footer_at, FOOTER_SIZE)
+        if len(tail) < FOOTER_SIZE or tail[:9] != RECORD.pack(Opcode.FOOTER, 20):
             return
-        footer = _parse(Footer, tail[_RECORD.size :])
+        footer = parse(Footer, tail[RECORD.size :])
         if not footer or not len(MAGIC) <= footer.summary_start < footer_at:
             return
         records = self._at(footer.summary_start, footer_at - footer.summary_start)
         if footer.summary_crc not in (0, zlib.crc32(tail[:-4], zlib.crc32(records))):
             self.found.warnings.append(f"{self.found.path}: the checksum of its summary is wrong; read without it")
             return
-        for opcode, begin, end in _walk(records):
-            if opcode == Opcode.SCHEMA and (schema := _parse(Schema, records[begin:end])):
+        for opcode, begin, end in walk(records):
+            if opcode == Opcode.SCHEMA and (schema := parse(Schema, records[begin:end])):
                 self.summary_schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL and (channel := _parse(Channel, records[begin:end])):
+            elif opcode == Opcode.CHANNEL and (channel := parse(Channel, records[begin:end])):
                 self.summary_channels[channel.id] = channel
             elif opcode == Opcode.STATISTICS:
-                self.statistics = _parse(Statistics, records[begin:end])
+                self.statistics = parse(Statistics, records[begin:end])
             elif opcode == Opcode.CHUNK_INDEX:
-                index = _parse(ChunkIndex, records[begin:end])
+                index = parse(ChunkIndex, records[begin:end])
                 offset = index.chunk_start_offset if index else 0
                 if offset > 0 and self._at(offset, 1) == bytes([Opcode.CHUNK]):
                     self.known.append(index)

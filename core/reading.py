@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import os
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.bag import Bag, group_recordings
+from uncertain_lti.bag_arrays import Progress, in_reach, read_columns
+from uncertain_lti.cdr_arrays import RepeatedNamesError
 from uncertain_lti.errors import BagError, SignalError
 from uncertain_lti.message_types import header_stamp_ns
 from uncertain_lti.model import UncertainLTI
@@ -21,7 +23,6 @@ from uncertain_lti.signals import FieldPath, SignalMap
 from uncertain_lti.transient import Transient
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
-Progress = Callable[[Iterable[object], int], Iterable[object]]
 
 
 @dataclass
@@ -42,6 +43,8 @@ class Stream:
 def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
     """Read the fields of a signals file from one recording.
 
+    Messages are read in blocks (`bag_arrays`), with what `read_stream_by_message` gives to the last bit.
+
     Raises
     ------
     BagError
@@ -49,39 +52,63 @@ def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) 
     SignalError
         A field is not in the message type, is not one number, or names what no message has.
     """
+    paths = _paths(bag, signals)
+    try:
+        columns = read_columns(bag, signals.topics, paths, progress)
+    except RepeatedNamesError:
+        return read_stream_by_message(bag, signals, progress)
+    _refuse_absent_names(bag, signals, paths, columns.values)
+    return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
+
+
+def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
+    """The same, message by message; raises as `read_stream` does."""
+    paths = _paths(bag, signals)
     topics = signals.topics
-    for name in topics:  # every problem of the map is found before the long read
-        if name in bag.topics and bag.topics[name].readable:
-            signals.check(name, bag.topics[name].type, bag.type_fields(name))
     messages: Iterable[tuple[str, int, object]] = bag.messages(topics)
     if progress is not None:
-        total = sum(bag.topics[t].count for t in topics if t in bag.topics)
+        total = sum(bag.topics[t].count for t in topics)
         messages = progress(messages, total)  # type: ignore[assignment]
-    paths = [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in topics]
     position = {name: i for i, name in enumerate(topics)}
     order, arrival, stamp = array("q"), array("q"), array("q")
     values = [array("d") for _ in topics]
-    absent: dict[str, tuple[str, list[str]]] = {}
     for name, log_time, message in messages:
         where = position[name]
-        if not values[where]:
-            for path in paths[where]:
-                if missing := path.missing_name(message):
-                    absent[path.text] = missing
         order.append(where)
-        arrival.append(log_time)
+        arrival.append(in_reach(bag, log_time))
         stamp.append(header_stamp_ns(message) or -1)
         values[where].extend([path.read(message) for path in paths[where]])
     arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
-    for name, columns, read in zip(topics, paths, arrays, strict=True):
+    _refuse_absent_names(bag, signals, paths, arrays)
+    return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
+
+
+def _paths(bag: Bag, signals: SignalMap) -> list[list[FieldPath]]:
+    """Field paths per topic; every problem of the map is found before the long read."""
+    for name in signals.topics:
+        if name in bag.topics and bag.topics[name].readable:
+            signals.check(name, bag.topics[name].type, bag.type_fields(name))
+    return [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics]
+
+
+def _refuse_absent_names(
+    bag: Bag, signals: SignalMap, paths: Sequence[Sequence[FieldPath]], values: Sequence[NDArray[np.float64]]
+) -> None:
+    """A name that the first message lacks, and that gave no number in any other, is a mistake in the map."""
+    for name, columns, read in zip(signals.topics, paths, values, strict=True):
         for path, column in zip(columns, read.T, strict=True):
-            if path.text in absent and np.isnan(column).all():
-                wanted, there = absent[path.text]
+            by_name = any(kind == "name" for kind, _ in path.steps)
+            if not by_name or not len(column) or not math.isnan(column[0]) or not np.isnan(column).all():
+                continue
+            said = bag.said
+            _, _, first = next(iter(bag.messages([name])))
+            bag.tell(*said)
+            if missing := path.missing_name(first):
+                wanted, there = missing
                 raise SignalError(
                     f"field '{path.text}' of {name} in {bag.path}: there is no '{wanted}' in the message's names; "
                     f"names there: {', '.join(there) or 'none'}"
                 )
-    return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
 
 
 def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, str]:
@@ -169,7 +196,7 @@ def read_transients(
     """
     if not isinstance(signals, SignalMap):
         signals = SignalMap.load(signals)
-    bags = group_recordings([paths] if isinstance(paths, (str, os.PathLike)) else list(paths))
+    bags = group_recordings([paths] if isinstance(paths, (str, os.PathLike)) else list(paths), indexed=True)
     if not bags:
         raise BagError("no recording is named; give at least one MCAP file or folder")
     signals = signals.with_types(_types(bags, signals))
@@ -216,7 +243,7 @@ def read_for_model(
         raise SignalError(
             "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
         )
-    bag = recording if isinstance(recording, Bag) else Bag(recording)
+    bag = recording if isinstance(recording, Bag) else Bag(recording, indexed=True)
     for topic, found in _types([bag], signals).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:

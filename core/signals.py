@@ -8,7 +8,7 @@ import re
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from uncertain_lti.errors import SignalError
 
@@ -59,31 +59,66 @@ _STEP = re.compile(
 _NAN = math.nan
 
 
-def _roll(q: Any) -> float:
-    x, y, z, w = q.x, q.y, q.z, q.w
+class Derived(NamedTuple):
+    """A number worked out from the parts of a value, in two steps so that many messages share the first.
+
+    terms takes the parts (x, y, z, w of a quaternion; floats, or arrays of them: the arithmetic is the same to the
+    last bit) to the arguments of number, and to what has to be positive for there to be one. number is for floats
+    alone: numpy's functions round otherwise than those of math.
+    """
+
+    terms: Callable[..., tuple[tuple[Any, ...], Any]]
+    number: Callable[..., float]
+
+    def of(self, value: Any) -> float:
+        """The number for one value of a message; NaN where there is none."""
+        if self is not NORM:
+            return self.of_parts(value.x, value.y, value.z, value.w)
+        if hasattr(value, "x"):
+            return math.hypot(*(float(getattr(value, c)) for c in "xyzw" if hasattr(value, c)))
+        return math.hypot(*(float(v) for v in value))
+
+    def of_parts(self, *parts: Any) -> float:
+        """The same from the parts of the value."""
+        arguments, size = self.terms(*parts)
+        return self.number(*arguments) if size > 0.0 else _NAN
+
+
+def _roll(x: Any, y: Any, z: Any, w: Any) -> tuple[tuple[Any, ...], Any]:
     norm2 = x * x + y * y + z * z + w * w
-    return math.atan2(2.0 * (w * x + y * z), norm2 - 2.0 * (x * x + y * y)) if 0.0 < norm2 < math.inf else _NAN
+    return (2.0 * (w * x + y * z), norm2 - 2.0 * (x * x + y * y)), _finite(norm2)
 
 
-def _pitch(q: Any) -> float:
-    x, y, z, w = q.x, q.y, q.z, q.w
+def _pitch(x: Any, y: Any, z: Any, w: Any) -> tuple[tuple[Any, ...], Any]:
     norm2 = x * x + y * y + z * z + w * w
-    return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x) / norm2))) if 0.0 < norm2 < math.inf else _NAN
+    return (2.0 * (w * y - z * x), norm2), _finite(norm2)
 
 
-def _yaw(q: Any) -> float:
-    x, y, z, w = q.x, q.y, q.z, q.w
+def _yaw(x: Any, y: Any, z: Any, w: Any) -> tuple[tuple[Any, ...], Any]:
     norm2 = x * x + y * y + z * z + w * w
-    return math.atan2(2.0 * (w * z + x * y), norm2 - 2.0 * (y * y + z * z)) if 0.0 < norm2 < math.inf else _NAN
+    return (2.0 * (w * z + x * y), norm2 - 2.0 * (y * y + z * z)), _finite(norm2)
 
 
-def _norm(value: Any) -> float:
-    if hasattr(value, "x"):
-        return math.hypot(*(float(getattr(value, c)) for c in "xyzw" if hasattr(value, c)))
-    return math.hypot(*(float(v) for v in value))
+def _finite(norm2: Any) -> Any:
+    """What it is, or NaN where it is infinite: atan2 and asin would make an angle of that."""
+    return norm2 * (norm2 < math.inf)
 
 
-_ANGLES: Mapping[str, Callable[[Any], float]] = {"roll": _roll, "pitch": _pitch, "yaw": _yaw, "norm": _norm}
+def _arc_sine(sine: float, norm2: float) -> float:
+    return math.asin(max(-1.0, min(1.0, sine / norm2)))
+
+
+def _themselves(*parts: Any) -> tuple[tuple[Any, ...], Any]:
+    return parts, 1.0
+
+
+NORM = Derived(_themselves, math.hypot)
+_DERIVED: Mapping[str, Derived] = {
+    "roll": Derived(_roll, math.atan2),
+    "pitch": Derived(_pitch, _arc_sine),
+    "yaw": Derived(_yaw, math.atan2),
+    "norm": NORM,
+}
 
 
 class FieldPath:
@@ -100,12 +135,12 @@ class FieldPath:
         The text is not a field path.
     """
 
-    __slots__ = ("text", "unwrap", "_function", "_steps", "_name_index")
+    __slots__ = ("text", "unwrap", "derived", "steps", "_name_index")
 
     def __init__(self, text: str) -> None:
         self.text = text
         self.unwrap = False
-        self._function: Callable[[Any], float] | None = None
+        self.derived: Derived | None = None
         self._name_index = 0
         inner = text.strip()
         functions: list[str] = []
@@ -122,8 +157,8 @@ class FieldPath:
         if len(functions) > 1 or "unwrap" in functions:
             raise SignalError(f"field '{text}': functions nest only as unwrap(roll|pitch|yaw(...))")
         if functions:
-            self._function = _ANGLES[functions[0]]
-        self._steps = self._parse(inner)
+            self.derived = _DERIVED[functions[0]]
+        self.steps = self._parse(inner)
 
     def _parse(self, inner: str) -> tuple[tuple[str, str | int], ...]:
         steps: list[tuple[str, str | int]] = []
@@ -159,7 +194,7 @@ class FieldPath:
     def read(self, message: Any) -> float:
         """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero."""
         value, parent = message, message
-        for kind, key in self._steps:
+        for kind, key in self.steps:
             if kind == "attribute":
                 parent, value = value, getattr(value, key)  # type: ignore[arg-type]
             elif kind == "index":
@@ -171,7 +206,7 @@ class FieldPath:
                 if index < 0 or index >= len(value):
                     return _NAN
                 value = value[index]
-        return self._function(value) if self._function else float(value)
+        return self.derived.of(value) if self.derived else float(value)
 
     def _find_name(self, names: Sequence[str], wanted: str) -> int:
         index = self._name_index  # names seldom move between messages
@@ -186,7 +221,7 @@ class FieldPath:
     def missing_name(self, message: Any) -> tuple[str, list[str]] | None:
         """(name, names there) where this path looks up a name that the message's `name` array lacks."""
         value, parent = message, message
-        for kind, key in self._steps:
+        for kind, key in self.steps:
             if kind == "attribute":
                 parent, value = value, getattr(value, key)  # type: ignore[arg-type]
             elif kind == "name":
@@ -211,7 +246,7 @@ class FieldPath:
         here = f"field '{self.text}' of {topic} ({type_name})"
         current: FieldType = FieldType("message", type_name)
         parent: Mapping[str, FieldType] = {}
-        for kind, key in self._steps:
+        for kind, key in self.steps:
             if kind == "attribute":
                 if current.array is not None:
                     raise SignalError(f"{here}: give an index before '.{key}', for example [0]")
@@ -241,10 +276,10 @@ class FieldPath:
         self._check_leaf(here, current, type_name, topic, type_fields)
 
     def _check_leaf(self, here: str, leaf: FieldType, type_name: str, topic: str, type_fields: TypeFields) -> None:
-        if self._function is not None:
+        if self.derived is not None:
             number = leaf.kind == "number"
             inner = type_fields(leaf.type_name) if leaf.kind == "message" and leaf.array is None else {}
-            if self._function is _norm:
+            if self.derived is NORM:
                 fits = (number and leaf.array is not None) or ("x" in inner and inner["x"].kind == "number")
                 wants = "a vector with x, y, z or an array of numbers"
             else:

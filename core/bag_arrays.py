@@ -1,0 +1,211 @@
+"""Fields of a recording as arrays, in order of arrival: what `FieldPath.read` gives for every message, at once."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.bag import Bag
+from uncertain_lti.cdr_arrays import FieldReader, Messages
+from uncertain_lti.errors import BagError
+from uncertain_lti.mcap_batches import Batch, IndexMismatchError, batches
+from uncertain_lti.message_types import Definition
+from uncertain_lti.signals import FieldPath
+
+Integers = NDArray[np.int64]
+Progress = Callable[[Iterable[object], int], Iterable[object]]
+LATEST = 2**63 - 1  # ns; log times are kept with a sign
+
+
+@dataclass
+class Columns:
+    """Messages of some topics in order of arrival.
+
+    topic (messages,) positions in the topics asked for; arrival, stamp (messages,) ns, with -1 for no stamp; values,
+    one array (messages of the topic, paths) per topic; alone is how many messages had to be decoded one by one.
+    """
+
+    topic: NDArray[np.int64]
+    arrival: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    values: list[NDArray[np.float64]]
+    alone: int = 0
+
+
+@dataclass
+class _Undecoded:
+    """Messages of a topic that cannot be decoded: where the first and last are, and why the last one cannot."""
+
+    number: int = 0
+    first: tuple[int, int] = (2**64, 0)
+    last: tuple[int, int] = (-1, 0)
+    why: str = ""
+
+    def add(self, place: tuple[int, int], why: str) -> None:
+        self.number += 1
+        self.first = min(self.first, place)
+        if place >= self.last:
+            self.last, self.why = place, why
+
+
+def read_columns(
+    bag: Bag, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
+) -> Columns:
+    """Read the paths of each topic; messages that cannot be decoded are left out and told by the bag.
+
+    Raises
+    ------
+    BagError
+        A topic is not there or cannot be read.
+    RepeatedNamesError
+        What a path gives depends on the order of the messages.
+    """
+    try:
+        return _Reading(bag, topics, paths).run(progress)
+    except IndexMismatchError:
+        bag.walk()
+    try:
+        return _Reading(bag, topics, paths).run(progress)
+    except IndexMismatchError:
+        raise BagError(f"{bag.path}: the file changed while it was read; read it again when it is written") from None
+
+
+def in_reach(bag: Bag, log_time: int) -> int:
+    """The same log time; raises BagError where it cannot be kept."""
+    if log_time > LATEST:
+        raise BagError(
+            f"{bag.path}: a message has a log time of {log_time} ns, which is past the year 2262; "
+            f"the recorder's clock was wrong, so record anew"
+        )
+    return log_time
+
+
+class _Reading:
+    def __init__(self, bag: Bag, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]]) -> None:
+        self.bag, self.topics, self.paths = bag, topics, paths
+        self.parts = bag.described(topics)
+        counts = [bag.topics[name].count for name in topics]
+        self.total = sum(counts)
+        self.readers: list[FieldReader] = []
+        self.undecoded = [_Undecoded() for _ in topics]
+        self.met = 0  # messages so far, with those left out
+        self.filled = 0
+        self.filled_of = [0] * len(topics)
+        self.topic = np.empty(self.total, dtype=np.int64)
+        self.arrival = np.empty(self.total, dtype=np.int64)
+        self.stamp = np.empty(self.total, dtype=np.int64)
+        self.values = [np.empty((n, len(p)), dtype=np.float64) for n, p in zip(counts, paths, strict=True)]
+
+    def run(self, progress: Progress | None) -> Columns:
+        steps: Iterable[object] = self._steps()
+        if progress is not None:  # which counts messages
+            steps = progress(
+                itertools.chain.from_iterable(itertools.repeat(None, n) for n in self._steps()), self.total
+            )
+        for _ in steps:
+            pass
+        self._tell()
+        return self._in_order()
+
+    def _steps(self) -> Iterator[int]:
+        """Read batch after batch; yields how many messages each has."""
+        for contents, channels in self.parts:
+            topic_of = np.zeros(1 << 16, dtype=np.int64)
+            reader_of = np.zeros(1 << 16, dtype=np.int64)
+            for key, channel in channels.items():
+                topic_of[key] = where = self.topics.index(channel.topic)
+                reader_of[key] = self._reader(where, channel.definition)
+            for batch in batches(contents, channels):
+                self._take(batch, topic_of[batch.channel], reader_of[batch.channel])
+                yield len(batch.channel)
+
+    def _reader(self, where: int, definition: Definition) -> int:
+        """Number of the reader for messages of this definition on a topic."""
+        for number, reader in enumerate(self.readers):
+            if reader.definition is definition and reader.paths is self.paths[where]:
+                return number
+        self.readers.append(FieldReader(definition, self.paths[where]))
+        return len(self.readers) - 1
+
+    def _take(self, batch: Batch, topic: Integers, reader: Integers) -> None:
+        number = len(topic)
+        if self.filled + number > self.total:
+            raise IndexMismatchError  # more than it states
+        if number:
+            in_reach(self.bag, int(batch.log_time.max()))
+        stamp = np.empty(number, dtype=np.int64)
+        keep: NDArray[np.bool_] | None = None
+        for where in range(len(self.topics)):
+            rows = np.flatnonzero(topic == where)
+            if not len(rows):
+                continue
+            failed = self._read_topic(where, batch, rows, reader[rows], stamp)
+            if failed:
+                keep = np.ones(number, dtype=bool) if keep is None else keep
+                keep[rows[failed]] = False
+        self.met += number
+        kept: NDArray[np.bool_] | slice = slice(None) if keep is None else keep
+        number = number if keep is None else int(np.count_nonzero(keep))
+        where_to = slice(self.filled, self.filled + number)
+        self.topic[where_to] = topic[kept]
+        self.arrival[where_to] = batch.log_time[kept]
+        self.stamp[where_to] = stamp[kept]
+        self.filled += number
+
+    def _read_topic(self, where: int, batch: Batch, rows: Integers, reader: Integers, stamp: Integers) -> list[int]:
+        """Read the messages of one topic; returns which of them cannot be decoded."""
+        begin = self.filled_of[where]
+        values = self.values[where][begin : begin + len(rows)]
+        if len(values) < len(rows):
+            raise IndexMismatchError
+        failures: list[tuple[int, str]] = []
+        for number in np.unique(reader).tolist():
+            mine = np.flatnonzero(reader == number)
+            messages = Messages(batch.data, batch.begin[rows[mine]], batch.end[rows[mine]])
+            read, stamps = np.empty((len(mine), values.shape[1])), np.empty(len(mine), dtype=np.int64)
+            whole = len(mine) == len(rows)
+            failed = self.readers[number].read(messages, values if whole else read, stamps)
+            failures += [(int(mine[failure.row]), failure.why) for failure in failed]
+            stamp[rows[mine]] = stamps
+            if not whole:
+                values[mine] = read
+        for row, why in failures:
+            self.undecoded[where].add((int(batch.log_time[rows[row]]), self.met + int(rows[row])), why)
+        if failures:
+            kept = np.ones(len(rows), dtype=bool)
+            kept[[row for row, _ in failures]] = False
+            good = values[kept]
+            values[: len(good)] = good
+        self.filled_of[where] += len(rows) - len(failures)
+        return [row for row, _ in failures]
+
+    def _tell(self) -> None:
+        warnings, undecoded = self.bag.said
+        met = [(entry.first, name, entry) for name, entry in zip(self.topics, self.undecoded, strict=True)]
+        for _, name, entry in sorted((m for m in met if m[2].number), key=lambda m: m[0]):
+            undecoded[name] = self.bag.left_out(name, entry.number, entry.why)
+        self.bag.tell(warnings, undecoded)
+
+    def _in_order(self) -> Columns:
+        """Stable sort by log time: messages are in file order so far."""
+        topic, arrival, stamp = self.topic[: self.filled], self.arrival[: self.filled], self.stamp[: self.filled]
+        values = [v[:n] for v, n in zip(self.values, self.filled_of, strict=True)]
+        alone = sum(reader.alone for reader in self.readers)
+        if (arrival[1:] >= arrival[:-1]).all():
+            return Columns(topic, arrival, stamp, values, alone)
+        order = np.argsort(arrival, kind="stable")
+        row = np.empty(len(order), dtype=np.int64)
+        for where in range(len(values)):
+            mine = topic == where
+            row[mine] = np.arange(len(values[where]))
+        topic = topic[order]
+        row = row[order]
+        for where, read in enumerate(values):
+            mine = row[topic == where]
+            if (mine[1:] < mine[:-1]).any():
+                values[where] = read[mine]
+        return Columns(topic, arrival[order], stamp[order], values, alone)

@@ -1,0 +1,364 @@
+"""Messages of MCAP blocks as columns: some MiB of blocks in one buffer, the records in it found all at once.
+
+Records stand one behind the other, each with its length, so one follows them from the first to the last. Here
+many walkers take a step together: one begins at each block, and within a large block also wherever something looks
+like a message. Each has to arrive exactly where the next one began, which proves that the next one began well, so
+what is found is what walking alone finds (`mcap_records.walk`); where one does not, the blocks are walked alone.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import BinaryIO, NoReturn
+
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+from numpy.typing import NDArray
+
+from uncertain_lti.bag_files import os_error
+from uncertain_lti.cdr_arrays import SLACK, numbers_at
+from uncertain_lti.errors import BagError
+from uncertain_lti.mcap_records import CHUNK, MESSAGE, RECORD, Block, Contents, parse, walk
+
+Integers = NDArray[np.int64]
+
+_BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
+_STRIDE = 1 << 15  # bytes between two walkers in a large block
+_LOOK = 1 << 14  # bytes in which a walker looks for its first message
+_LIKE_A_MESSAGE = re.compile(rb"\x05.{4}\0{4}", re.DOTALL)
+_NEAR = 1 << 16  # bytes between blocks that are read along
+_LONG_INDEX = 1 << 10  # bytes per channel from which on an index is faster than looking
+_CHANNEL_AT = RECORD.size
+_LOG_TIME_AT = RECORD.size + 6
+_DATA_AT = RECORD.size + MESSAGE.size
+_LENGTH = struct.Struct("<Q")
+
+
+class IndexMismatchError(Exception):
+    """The file is not what its index states: it has to be walked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Messages of wanted channels in file order.
+
+    data[begin:end] is the encoded message of `channel`, log_time in ns; (messages,) each. SLACK bytes before and
+    after every message can be read as well. data is used again for the next batch.
+    """
+
+    data: bytearray
+    channel: NDArray[np.uint16]
+    log_time: NDArray[np.uint64]
+    begin: Integers
+    end: Integers
+
+
+def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
+    """Messages of these channels, some MiB at a time, in file order; only blocks that hold one are read.
+
+    Raises
+    ------
+    IndexMismatchError
+        The contents come from an index, and the file is not what that states.
+    BagError
+        The file changed, or cannot be read any more.
+    """
+    wanted = np.zeros(1 << 16, dtype=bool)
+    wanted[list(channels)] = True
+    missing = {channel: contents.tally[channel].count for channel in channels if channel in contents.tally}
+    try:
+        with open(contents.path, "rb", buffering=0) as stream:
+            loader = _Loader(contents, stream)
+            for blocks in _groups([block for block in contents.blocks if not block.channels.isdisjoint(missing)]):
+                places = loader.load(blocks)
+                batch = _messages(loader.data, _starts(loader.data, places, contents), wanted, contents)
+                counts = np.bincount(batch.channel, minlength=1 << 16)
+                for channel in missing:
+                    missing[channel] -= int(counts[channel])
+                if contents.indexed and min(missing.values()) < 0:
+                    raise IndexMismatchError
+                yield batch
+    except OSError as error:
+        raise os_error(contents.path, error) from None
+    if contents.indexed and any(missing.values()):
+        raise IndexMismatchError
+
+
+def _groups(blocks: Sequence[Block]) -> Iterator[list[Block]]:
+    group: list[Block] = []
+    size = 0
+    for block in blocks:
+        if group and size + block.length > _BATCH:
+            yield group
+            group, size = [], 0
+        group.append(block)
+        size += block.length
+    if group:
+        yield group
+
+
+def _begin(block: Block) -> int:
+    """Where the block begins in the file, with what stands before its records."""
+    return block.offset - block.unchecked
+
+
+def _end(block: Block) -> int:
+    return block.offset + block.size + block.indexed
+
+
+def _runs(blocks: Sequence[Block]) -> Iterator[list[Block]]:
+    """Blocks that are near enough to each other to be read at once."""
+    run: list[Block] = []
+    for block in blocks:
+        if run and not 0 <= _begin(block) - _end(run[-1]) <= _NEAR:
+            yield run
+            run = []
+        run.append(block)
+    if run:
+        yield run
+
+
+# --- from the file into the buffer --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the records of a block are in the buffer; offsets of its messages from begin, as its index has them."""
+
+    block: Block
+    begin: int
+    end: int
+    offsets: Integers | None
+
+
+class _Loader:
+    """Reads and decompresses blocks, and checks those that nobody has read before."""
+
+    def __init__(self, contents: Contents, stream: BinaryIO) -> None:
+        self.contents, self.stream = contents, stream
+        self.zstd = zstandard.ZstdDecompressor()
+        self.data = bytearray()
+        self.packed = bytearray()
+
+    def load(self, blocks: Sequence[Block]) -> list[_Place]:
+        """Put blocks into the buffer, with SLACK bytes around; raises as `batches` does."""
+        runs = list(_runs(blocks))
+        direct = [all(not block.compression for block in run) for run in runs]
+        sizes = [
+            _end(run[-1]) - _begin(run[0]) if as_is else sum(block.length for block in run)
+            for run, as_is in zip(runs, direct, strict=True)
+        ]
+        if len(self.data) < sum(sizes) + 2 * SLACK:
+            self.data = bytearray(sum(sizes) + 2 * SLACK)
+        view = memoryview(self.data)
+        places = []
+        at = SLACK
+        for run, as_is, size in zip(runs, direct, sizes, strict=True):
+            if as_is:
+                packed = view[at : at + size]
+            else:
+                length = _end(run[-1]) - _begin(run[0])
+                if len(self.packed) < length:
+                    self.packed = bytearray(length)
+                packed = memoryview(self.packed)[:length]
+            self.stream.seek(_begin(run[0]))
+            if self.stream.readinto(packed) != len(packed):  # type: ignore[attr-defined]
+                self._refuse()
+            for block in run:
+                offset = block.offset - _begin(run[0])
+                content = packed[offset : offset + block.size]
+                begin = at + offset if as_is else at
+                end = begin + block.length
+                if not as_is:
+                    at = end
+                    if not self._inflate(block, content, view[begin:end]):
+                        self._refuse()
+                if block.unchecked and not self._as_stated(block, packed[:offset], view[begin:end]):
+                    self._refuse()
+                offsets = _offsets(block, packed[offset + block.size :])
+                places.append(_Place(block, begin, end, offsets))
+            if as_is:
+                at += size
+        return places
+
+    def _refuse(self) -> NoReturn:
+        if self.contents.indexed:
+            raise IndexMismatchError
+        raise BagError(f"{self.contents.path}: the file changed while it was read; read it again when it is written")
+
+    def _inflate(self, block: Block, data: memoryview, target: memoryview) -> bool:
+        """Decompress; False where that does not give as many bytes as the block has."""
+        try:
+            if not block.compression:
+                target[:] = data
+                return True
+            if block.compression == "zstd":
+                reader = self.zstd.stream_reader(data)
+                filled = 0
+                while filled < block.length and (more := reader.readinto(target[filled:])):
+                    filled += more
+                return filled == block.length and (not block.unchecked or not reader.read(1))
+            frame = lz4.frame.LZ4FrameDecompressor()
+            records = frame.decompress(data, max_length=block.length + 1)
+            target[: len(records)] = records  # ValueError where there is more than room
+            return len(records) == block.length
+        except (zstandard.ZstdError, RuntimeError, EOFError, ValueError, MemoryError):
+            return False
+
+    def _as_stated(self, block: Block, before: memoryview, records: memoryview) -> bool:
+        head = before[-block.unchecked :]
+        checksum = int.from_bytes(head[33:37], "little")
+        name = block.compression.encode()
+        stated = (
+            RECORD.pack(Opcode.CHUNK, block.unchecked - RECORD.size + block.size)
+            + CHUNK.pack(block.start, block.end, block.length, checksum, len(name))
+            + name
+            + _LENGTH.pack(block.size)
+        )
+        return head == stated and (zlib.crc32(records) == checksum if checksum else not self.contents.summed)
+
+
+# --- records in the buffer ----------------------------------------------------------------------------------
+
+
+def _starts(data: bytearray, places: Sequence[_Place], contents: Contents) -> Integers:
+    """Where the records in the buffer begin."""
+    for by_index in (True, False):
+        begins, limits = _walkers(data, places, by_index)
+        starts = _together(data, begins, limits)
+        if starts is not None:
+            return starts
+    alone: list[int] = []
+    for place in places:
+        reached = place.begin
+        for _, content, stop in walk(memoryview(data)[place.begin : place.end]):
+            alone.append(place.begin + content - RECORD.size)
+            reached = place.begin + stop
+        if contents.indexed and reached != place.end:
+            raise IndexMismatchError
+    return np.array(alone, dtype=np.int64)
+
+
+def _walkers(data: bytearray, places: Sequence[_Place], by_index: bool) -> tuple[Integers, Integers]:
+    """Where walkers begin, and where each has to arrive."""
+    begins: list[Integers] = []
+    limits: list[Integers] = []
+    for place in places:
+        if place.begin == place.end:
+            continue
+        if by_index and place.offsets is not None:
+            here = place.begin + place.offsets
+        else:
+            here = np.array(_likely_messages(data, place), dtype=np.int64)
+        begins += [np.array([place.begin]), here]
+        limits += [here, np.array([place.end])]
+    return np.concatenate(begins), np.concatenate(limits)
+
+
+def _offsets(block: Block, after: memoryview) -> Integers | None:
+    """Offsets of messages as stated behind a large block, in order, but for one at its begin; None where odd."""
+    if block.indexed < _LONG_INDEX * len(block.channels):
+        return None
+    offsets = []
+    at = 0
+    while at < block.indexed:
+        opcode, length = RECORD.unpack_from(after, at)
+        content = at + RECORD.size + 6
+        at += RECORD.size + length
+        if opcode != Opcode.MESSAGE_INDEX or at > block.indexed or length < 6 or (length - 6) % 16:
+            return None
+        offsets.append(np.frombuffer(after[content:at], "<i8")[1::2])
+    every = np.sort(np.concatenate(offsets))
+    if not len(every) or every[0] < 0 or every[-1] >= block.length:
+        return None
+    return every[1:] if every[0] == 0 else every
+
+
+def _together(data: bytearray, begins: Integers, limits: Integers) -> Integers | None:
+    """Where records begin, found by walkers that go side by side; None where one does not arrive."""
+    length = numbers_at(data, "<u4")
+    position, limit = begins, limits
+    found = []
+    while position.size:
+        found.append(position)
+        position = position + length[position + 1]
+        position += RECORD.size
+        going = position < limit
+        if np.count_nonzero(going) < len(going):
+            if not np.array_equal(position[~going], limit[~going]):
+                return None
+            position, limit = position[going], limit[going]
+    starts = np.concatenate(found)
+    starts.sort()
+    if length[starts + 5].any() or not np.frombuffer(data, np.uint8)[starts].all():
+        return None  # a record of 4 GiB and more, or a zero, where `walk` ends
+    return starts
+
+
+def _likely_messages(data: bytearray, place: _Place) -> list[int]:
+    """Where messages seem to begin, far from each other in a large block."""
+    found = []
+    goal = place.begin + _STRIDE
+    while goal + _STRIDE // 2 < place.end:
+        at = _likely_message(data, goal, place.end, place.block)
+        if at is not None:
+            found.append(at)
+        goal = (goal if at is None else at) + _STRIDE
+    return found
+
+
+def _likely_message(data: bytearray, begin: int, end: int, block: Block) -> int | None:
+    """Where a message of the block seems to begin, soon after `begin`."""
+    stop = min(begin + _LOOK, end - _DATA_AT)
+    while match := _LIKE_A_MESSAGE.search(data, begin, stop):
+        at = match.start()
+        _, length = RECORD.unpack_from(data, at)
+        channel, _, log_time, _ = MESSAGE.unpack_from(data, at + RECORD.size)
+        fits = MESSAGE.size <= length <= end - at - RECORD.size
+        if fits and channel in block.channels and block.start <= log_time <= block.end:
+            return at
+        begin = at + 1
+    return None
+
+
+def _messages(data: bytearray, starts: Integers, wanted: NDArray[np.bool_], contents: Contents) -> Batch:
+    """Messages of wanted channels among the records."""
+    is_message = np.frombuffer(data, np.uint8)[starts] == Opcode.MESSAGE
+    if not is_message.all():
+        if contents.indexed:
+            for start in starts[~is_message].tolist():
+                _hold_against(contents, data, start)
+        starts = starts[is_message]
+    length = numbers_at(data, "<u4")[starts + 1].astype(np.int64)
+    whole = length >= MESSAGE.size
+    if not whole.all():
+        if contents.indexed:
+            raise IndexMismatchError
+        starts, length = starts[whole], length[whole]
+    channel = numbers_at(data, "<u2")[starts + _CHANNEL_AT]
+    keep = wanted[channel]
+    if not keep.all():
+        starts, length, channel = starts[keep], length[keep], channel[keep]
+    log_time = numbers_at(data, "<u8")[starts + _LOG_TIME_AT]
+    return Batch(data, channel, log_time, starts + _DATA_AT, starts + length + RECORD.size)
+
+
+def _hold_against(contents: Contents, data: bytearray, start: int) -> None:
+    """A definition in a chunk has to be the one that the summary gives."""
+    opcode, length = RECORD.unpack_from(data, start)
+    if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
+        return
+    content = bytes(memoryview(data)[start + RECORD.size : start + RECORD.size + length])
+    record = parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
+    known: object = None
+    if record is not None:
+        known = (contents.schemas if opcode == Opcode.SCHEMA else contents.channels).get(record.id)
+    if record is None or record != known:
+        raise IndexMismatchError
