@@ -189,7 +189,7 @@ def validate(
                     kept.append(None if weight is None else weight[a : b - 1])
         chosen = kept if own[0] is not None else weights
         try:
-            model = fit(pieces, weights=chosen, operating_point=full.operating_point, **options)  # type: ignore[arg-type]
+            model = fit(pieces, weights=chosen, operating_point=full.operating_point, describe_data=False, **options)  # type: ignore[arg-type]
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
         tested = left if (start, stop) == (0, len(left)) else cut(left, start, stop)

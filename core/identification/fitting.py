@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -40,6 +41,7 @@ def fit(
     structure: Structure | None = None,
     discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
+    describe_data: bool = True,
     alarm: Alarm | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> UncertainLTI:
@@ -74,6 +76,8 @@ def fit(
         their effect on the objective and listed in `fit["discarded"]`, beside the widths with them.
     method : {"working-set", "cvxpy"}
         cvxpy states the whole problem as written (OSQP, HiGHS); slow, without tie-breaks, for comparison.
+    describe_data : bool
+        Say in `fit["messages"]` what the user should know; a fit of many need not.
     alarm : Alarm, optional
         Goes to the model file.
     progress : callable, optional
@@ -153,7 +157,7 @@ def fit(
             alarm=alarm,
             progress=progress,
             dt_median=float(np.median(problem.dt)),
-            describe_on=problem,
+            describe_on=problem if describe_data else None,
             transients=transients,
         )
     except InfeasibleError as error:
@@ -248,7 +252,7 @@ def fit_fleet(
             "passes": solution.passes,
             "working_set": solution.working,
         },
-        "versions": _versions(),
+        "versions": dict(_versions()),
     }
     if describe_on is not None:
         facts["rank"], facts["messages"] = describe(model, describe_on, sums, mean_width, max_width, transients)
@@ -378,6 +382,7 @@ def _objective(sums: Moments, d: Array, weights: Array | None) -> float:
     return float(sum(4.0 * d[:, i] @ grams[i] @ d[:, i] for i in range(n)))
 
 
+@cache
 def _versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version
 
