@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import os
 from collections import Counter
@@ -39,7 +40,8 @@ class Transient:
     Parameters
     ----------
     t : array (N+1,)
-        Instants: s where the numbers are floating point, ns where they are integers. Kept as integer ns.
+        Instants: s where the numbers are floating point, ns where they are integers; or datetime64. Kept as
+        integer ns.
     x : array (N+1, n)
         States in recorded units; NaN where a sample has none.
     u : array (N+1, m)
@@ -67,7 +69,7 @@ class Transient:
     Raises
     ------
     TransientError
-        Shapes do not fit, times are not finite, steps are below a nanosecond, or nothing is left.
+        Shapes do not fit, times are not finite, steps are about a nanosecond, or max_gap or min_step is out of range.
     """
 
     t_ns: NDArray[np.int64]
@@ -94,7 +96,7 @@ class Transient:
     ) -> None:
         self.name = name
         self.signals = signals
-        t_ns = _nanoseconds(t, name)
+        t_ns = _nanoseconds(t, name, recorded=signals is not None)
         self.x = _matrix(x, len(t_ns), "x", name)
         self.u = _matrix(u, len(t_ns), "u", name)
         if self.x.shape[1] == 0:
@@ -104,6 +106,10 @@ class Transient:
         self.counters = Counter(counters or {})
         self.sources = tuple(os.fspath(s) for s in sources)
         self.notes = tuple(notes)
+        if max_gap is not None and not max_gap > 0:
+            raise TransientError(f"{name}: max_gap is {max_gap}; it must be a positive number of seconds")
+        if not 0 <= min_step < math.inf:
+            raise TransientError(f"{name}: min_step is {min_step}; it must be 0 s or more")
         min_step_ns = to_ns(min_step)
         median = median_step_ns([t_ns], min_step_ns)
         if max_gap is None:
@@ -193,15 +199,18 @@ class Transient:
             A column is missing or not numeric.
         """
         name = options.setdefault("name", "data frame")
+        states, controls = _listed(states, "states", name), _listed(controls, "controls", name)
         columns = [str(c) for c in frame.columns]
-        chosen = [frame.iloc[:, _column(columns, c, name, lambda i: frame.iloc[:, i])] for c in (*states, *controls)]
-        t = frame.index if time is None else frame.iloc[:, _column(columns, time, name, lambda i: frame.iloc[:, i])]
-        t = np.asarray(t)
-        if t.dtype.kind in "mM":
-            t = t.astype(f"{t.dtype.kind}8[ns]").astype(np.int64)
+
+        def column(wanted: str) -> Any:
+            return frame.iloc[:, _column(columns, wanted, name, lambda i: frame.iloc[:, i])]
+
+        t = frame.index if time is None else column(str(time))
+        if getattr(t.dtype, "kind", "O") in "mM":
+            t = np.asarray(t, dtype=f"{t.dtype.kind}8[ns]")  # of instants with a time zone: UTC
         else:
-            t = _numeric(t, time or "index", name)
-        values = [_numeric(np.asarray(c), n, name) for c, n in zip(chosen, (*states, *controls), strict=True)]
+            t = _numeric(t, str(time or "index"), name)
+        values = [_numeric(column(c), c, name) for c in (*states, *controls)]
         z = np.column_stack(values) if values else np.empty((len(t), 0))
         return cls(t, z[:, : len(states)], z[:, len(states) :], state_names=states, control_names=controls, **options)
 
@@ -218,35 +227,67 @@ class Transient:
     ) -> Transient:
         """From a CSV file with one header line; columns by name, empty cells are NaN, time in s.
 
+        A name that stands twice is taken once if both columns are equal.
+
         Raises
         ------
         TransientError
-            The file is missing or a column is missing or not numeric.
+            The file is missing, a column is missing, or a cell is not a number; names the line.
         """
         name = options.setdefault("name", os.fspath(path))
+        states, controls = _listed(states, "states", name), _listed(controls, "controls", name)
+        wanted = (time, *states, *controls)
         try:
-            with open(path, encoding="utf-8-sig") as stream:
-                columns = [c.strip().strip('"') for c in stream.readline().split(delimiter)]
-                wanted = (time, *states, *controls)
-                raw = np.genfromtxt(stream, delimiter=delimiter, dtype=np.float64, ndmin=2, invalid_raise=True)
+            with open(path, encoding="utf-8-sig", newline="") as stream:
+                rows = csv.reader(stream, delimiter=delimiter)
+                columns = [c.strip() for c in next(rows, [])]
+                if not columns:
+                    raise TransientError(f"{path}: the file is empty; its first line must name the columns")
+                columns[0] = columns[0].removeprefix("#").strip()  # as numpy.savetxt writes a header
+                cells: dict[int, list[float]] = {i: [] for i, c in enumerate(columns) if c in wanted}
+                for row in rows:
+                    if row and not row[0].startswith("#"):
+                        _take(row, cells, columns, f"{path}: line {rows.line_num}", delimiter)
         except FileNotFoundError:
             raise TransientError(f"{path}: there is no such file; check the path") from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise TransientError(f"{path}: cannot be read as text: {error}; check the file") from None
-        except ValueError as error:
-            first = str(error).strip().splitlines()[-1].strip()
-            raise TransientError(f"{path}: rows differ in length ({first}); mend the file") from None
-        if raw.shape[1] != len(columns):
-            raise TransientError(
-                f"{path}: the header names {len(columns)} columns, the rows have {raw.shape[1]}; "
-                f"is the delimiter {delimiter!r}?"
-            )
-        z = raw[:, [_column(columns, c, name, lambda i: raw[:, i]) for c in wanted]]
-        for column, values in zip(wanted, z.T, strict=True):
-            if len(values) and np.isnan(values).all():
+        except OSError as error:
+            raise TransientError(f"{path}: cannot be read: {error.strerror}; check the path") from None
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise TransientError(f"{path}: cannot be read as CSV: {error}; check the file") from None
+        arrays = {i: np.array(values, dtype=np.float64) for i, values in cells.items()}
+        chosen = [arrays[_column(columns, c, name, arrays.__getitem__)] for c in wanted]
+        if not len(chosen[0]):
+            raise TransientError(f"{path}: there is no row under the header; check the file")
+        for column, values in zip(wanted, chosen, strict=True):
+            if np.isnan(values).all():
                 raise TransientError(f"{path}: column '{column}' holds no number; choose another")
+        z = np.column_stack(chosen)
         split = 1 + len(states)
         return cls(z[:, 0], z[:, 1:split], z[:, split:], state_names=states, control_names=controls, **options)
+
+
+def _listed(names: Sequence[str], what: str, name: str) -> list[str]:
+    if isinstance(names, str):
+        raise TransientError(f"{name}: {what} is the text '{names}'; give a list of column names")
+    return [str(n) for n in names]
+
+
+def _take(
+    row: Sequence[str], cells: Mapping[int, list[float]], columns: Sequence[str], at: str, delimiter: str
+) -> None:
+    """Append the cells of one row to those of their columns."""
+    if len(row) != len(columns):
+        raise TransientError(
+            f"{at} has {len(row)} cells, and the header names {len(columns)}; mend the file, or is the delimiter "
+            f"not {delimiter!r}?"
+        )
+    for i, values in cells.items():
+        try:
+            values.append(float(row[i]) if row[i].strip() else math.nan)
+        except ValueError:
+            raise TransientError(
+                f"{at}: '{row[i][:40]}' in column '{columns[i]}' is not a number; mend it, or leave the cell empty"
+            ) from None
 
 
 def _column(columns: Sequence[str], wanted: str, name: str, values: Any) -> int:
@@ -254,25 +295,46 @@ def _column(columns: Sequence[str], wanted: str, name: str, values: Any) -> int:
     if not found:
         raise TransientError(f"{name}: there is no column '{wanted}'; columns are {', '.join(columns)}")
     for other in found[1:]:
-        if not np.array_equal(np.asarray(values(found[0])), np.asarray(values(other))):
+        first, second = (np.asarray(values(i)) for i in (found[0], other))
+        if not ((first == second) | ((first != first) & (second != second))).all():  # NaN in both is the same
             raise TransientError(f"{name}: column '{wanted}' stands twice with different values; rename one")
     return found[0]
 
 
-def _numeric(values: NDArray[Any], column: str, name: str) -> Array:
-    try:
-        return values.astype(np.float64)
-    except (TypeError, ValueError):
-        raise TransientError(f"{name}: column '{column}' is not numeric; choose another or convert it") from None
+def _numeric(column: Any, wanted: str, name: str) -> Array:
+    """Column of a data frame as numbers, NaN where it has none."""
+    values = column.to_numpy()
+    if values.dtype.kind not in "mMc":
+        try:
+            return np.array(column.to_numpy(dtype=np.float64, na_value=math.nan))
+        except (TypeError, ValueError, NotImplementedError):  # the last from an index of several columns
+            pass
+    raise TransientError(f"{name}: column '{wanted}' is not numeric; choose another or convert it")
 
 
-def _nanoseconds(t: ArrayLike, name: str) -> NDArray[np.int64]:
+def _nanoseconds(t: ArrayLike, name: str, recorded: bool) -> NDArray[np.int64]:
+    """Instants in ns; recorded: they are those of messages, which may follow each other within a few."""
     raw = np.array(t)
     if raw.ndim != 1:
         raise TransientError(f"{name}: t has shape {raw.shape}; it must be a vector (N+1,)")
+    if raw.dtype.kind in "mM":
+        if np.isnat(raw).any():
+            raise TransientError(f"{name}: t[{int(np.argmax(np.isnat(raw)))}] is not a time; leave that sample out")
+        return raw.astype(f"{raw.dtype.kind}8[ns]").astype(np.int64)
     if raw.dtype.kind in "iu":
-        return raw.astype(np.int64)
+        if raw.size and raw.max() > np.iinfo(np.int64).max:
+            raise TransientError(
+                f"{name}: t reaches {raw.max()} ns, past what 64 bits hold; count from a later instant"
+            )
+        t_ns = raw.astype(np.int64)
+        if not recorded and (step := _median_forward(t_ns)) < 5:
+            raise TransientError(
+                f"{name}: integers are nanoseconds, and the steps are {step:g}; give seconds as floats"
+            )
+        return t_ns
     try:
+        if raw.size and raw.dtype.kind not in "fO":
+            raise TypeError
         seconds = raw.astype(np.float64)
     except (TypeError, ValueError):
         raise TransientError(f"{name}: t is not numeric; give seconds, or integer nanoseconds") from None
@@ -280,16 +342,21 @@ def _nanoseconds(t: ArrayLike, name: str) -> NDArray[np.int64]:
         where = int(np.argmin(np.isfinite(seconds)))
         raise TransientError(f"{name}: t[{where}] is {seconds[where]}; leave out samples without a time")
     if seconds.size and np.abs(seconds).max() > 9.2e9:
-        raise TransientError(f"{name}: t reaches {np.abs(seconds).max():g} s; are these nanoseconds? Give integers")
-    t_ns = np.rint(seconds * 1e9).astype(np.int64)
-    steps = np.diff(seconds)
-    forward = steps[steps > 0]
-    if forward.size and np.median(forward) < 5e-9:
         raise TransientError(
-            f"{name}: steps of {np.median(forward):g} s are too short for a nanosecond clock; "
-            f"give time in a larger unit"
+            f"{name}: t reaches {np.abs(seconds).max():g} s; give seconds, or nanoseconds as an array of integers"
         )
-    return t_ns
+    if (step := _median_forward(seconds)) < 5e-9:
+        raise TransientError(
+            f"{name}: steps of {step:g} s are too short for a nanosecond clock; give time in a larger unit"
+        )
+    return np.rint(seconds * 1e9).astype(np.int64)
+
+
+def _median_forward(t: NDArray[Any]) -> float:
+    """Median of the steps forward; infinite without any."""
+    steps = np.diff(t)
+    forward = steps[steps > 0]
+    return float(np.median(forward)) if forward.size else math.inf
 
 
 def _matrix(values: ArrayLike, rows: int, what: str, name: str) -> Array:
@@ -315,8 +382,10 @@ def _names(
     names = tuple(given) if given is not None else tuple(s.name for s in signals) if signals is not None else None
     if names is None:
         return tuple(f"{letter}{i + 1}" for i in range(count))
-    if len(names) != count:
-        raise TransientError(f"{name}: {len(names)} names for {count} columns of {letter}")
+    if isinstance(given, str) or len(names) != count:
+        raise TransientError(f"{name}: {len(names)} names for {count} columns of {letter}; give a list, one for each")
+    if len(set(names)) < count:
+        raise TransientError(f"{name}: two columns of {letter} have the same name; give each its own")
     return names
 
 
