@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.errors import FitError
 from uncertain_lti.identification import fit
+from uncertain_lti.identification.structure import Structure
 from uncertain_lti.intervals import (
     cluster_size,
     discarding_bound,
@@ -527,9 +528,10 @@ def _options(model: UncertainLTI) -> Mapping[str, Any]:
             raise FitError(f"the model does not say by which {key} it was fitted; fit it again")
     if facts.get("weights", "ones") != "ones":
         raise FitError("the model was fitted with weights, which its file does not hold; use validate() from Python")
-    options = {"criterion": facts["criterion"], "additive": facts["additive"]}
-    if facts.get("discarded"):
-        options["discard"] = len(facts["discarded"])
+    options: dict[str, Any] = {"criterion": facts["criterion"], "additive": facts["additive"]}
+    options |= {key: facts[key] for key in ("discard", "count") if key in facts}
+    if "structure" in facts:
+        options["structure"] = Structure.from_dict(facts["structure"], model.n, model.m)
     return options
 
 

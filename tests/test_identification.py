@@ -531,6 +531,19 @@ def test_structure_rules_of_a_signals_file():
             Structure.from_rules(rules, *names)
 
 
+def test_structure_goes_to_the_model_file_and_back(tmp_path):
+    transient = drawn(small_plant(72), 150, 72, noise=1e-3)
+    given = Structure(2, 1, fixed={"A": [[np.nan, 0.3], [0.0, np.nan]]}, upper={"B": [[1.0], [np.nan]]})
+    fit(transient, additive="noise", structure=given).save(tmp_path / "m.json")
+    stored = UncertainLTI.load(tmp_path / "m.json").fit["structure"]
+    again = Structure.from_dict(stored, 2, 1)
+    for side in ("lower", "upper"):
+        for name, values in getattr(given, side).items():
+            assert np.array_equal(getattr(again, side)[name], values), name
+    with pytest.raises(FitError, match="fit again"):
+        Structure.from_dict({"lower": 3}, 2, 1)
+
+
 # --- discards ---
 
 

@@ -165,12 +165,18 @@ def fit(
     facts = {
         **model.fit,
         "additive": additive,
-        "weights": "ones" if weights is None else {1: "per state", 2: "per sample", 3: "full"}[problem.weights.ndim],
+        "weights": "ones"
+        if weights is None and transient_weights is None
+        else {1: "per state", 2: "per sample", 3: "full"}[problem.weights.ndim],
+        "count": count,
         "transients": len(transients),
         "segments": sum(t.segments for t in transients),
         "sources": [{"file": t.name} for t in transients],
     }
+    if structure is not None:
+        facts["structure"] = structure.to_dict()
     if budget:
+        facts["discard"] = discard
         facts["discarded"] = discarded
         facts["with_discarded"] = {
             key: before.fit[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")

@@ -135,6 +135,30 @@ class Structure:
                             structure.upper[name][at] = high
         return cls(n, m, lower=structure.lower, upper=structure.upper)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for the model file; null for no bound."""
+
+        def plain(values: Any) -> Any:
+            return [plain(v) for v in values] if isinstance(values, list) else values if math.isfinite(values) else None
+
+        return {
+            side: {name: plain(array.tolist()) for name, array in getattr(self, side).items()}
+            for side in ("lower", "upper")
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], n: int, m: int) -> Structure:
+        """From `to_dict`; raises FitError."""
+
+        def arrays(side: str) -> dict[str, Array]:
+            try:
+                return {name: np.array(values, dtype=np.float64) for name, values in data[side].items() if values}
+            except (AttributeError, KeyError, TypeError, ValueError):
+                raise FitError("structure: the model file does not hold it as it was written; fit again") from None
+
+        shaped = {side: {k: v for k, v in arrays(side).items() if v.size} for side in ("lower", "upper")}
+        return cls(n, m, lower=shaped["lower"], upper=shaped["upper"])
+
     def stacked(self, drift: bool, disturbance: bool, noise: bool) -> tuple[Array, Array, Array, Array]:
         """Bounds in the order of the unknowns: theta lower, upper (r, n); d lower, upper (q, n).
 
