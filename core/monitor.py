@@ -11,36 +11,71 @@ from numpy.typing import NDArray
 
 from uncertain_lti.errors import ModelError
 from uncertain_lti.model import Alarm, UncertainLTI
+from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.sampler import Status, Step
 from uncertain_lti.transient import Transient
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
 class Verdict:
     """What the monitor says of one clock message.
 
     flags (n,): 0 contained, 1 violated, NaN no verdict. lower, upper, state (n,): the bounds that were judged and
     the sample, in recorded units; NaN where there is none. utilisation (n,): (x_next - centre) / half with half
     before the margin. outside_domain: z(t_k) lies outside the ranges seen in the fit. alarm: after this verdict.
+
+    A live monitor makes one per message, and often nobody asks for more than the flags: the rest is worked out where
+    it is asked for.
     """
 
-    t_ns: int
-    arrival_ns: int
-    status: Status
-    flags: Array
-    lower: Array
-    upper: Array
-    state: Array
-    utilisation: Array
-    outside_domain: bool
-    alarm: bool
+    __slots__ = ("t_ns", "arrival_ns", "status", "flags", "state", "outside_domain", "alarm", "_judgement")
+
+    def __init__(
+        self, step: Step, flags: Array, outside_domain: bool, alarm: bool, judgement: _Judgement | None
+    ) -> None:
+        self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, step.status
+        self.flags, self.state = flags, step.x_next
+        self.outside_domain, self.alarm = outside_domain, alarm
+        self._judgement = judgement
 
     @property
     def judged(self) -> bool:
         """There is a verdict: the message is neither dropped nor without a complete transition."""
-        return self.status is Status.OK
+        return self._judgement is not None
+
+    @property
+    def lower(self) -> Array:
+        """Lower bound that was judged, in recorded units (n,)."""
+        return self.flags if self._judgement is None else self._judgement.recorded(self._judgement.lower)
+
+    @property
+    def upper(self) -> Array:
+        """Upper bound that was judged, in recorded units (n,)."""
+        return self.flags if self._judgement is None else self._judgement.recorded(self._judgement.upper)
+
+    @property
+    def utilisation(self) -> Array:
+        """Where between its bounds the sample lies (n,)."""
+        return self.flags if self._judgement is None else self._judgement.utilisation()
+
+
+class _Judgement:
+    """Centre, half-width, bounds and sample of one verdict, normalised, (n,) each."""
+
+    __slots__ = ("point", "centre", "half", "lower", "upper", "x_next")
+
+    def __init__(
+        self, point: OperatingPoint, centre: Array, half: Array, lower: Array, upper: Array, x_next: Array
+    ) -> None:
+        self.point, self.centre, self.half = point, centre, half
+        self.lower, self.upper, self.x_next = lower, upper, x_next
+
+    def recorded(self, x: Array) -> Array:
+        return self.point.recorded_x(x)
+
+    def utilisation(self) -> Array:
+        return _utilisation(self.x_next - self.centre, self.half)
 
 
 @dataclass(frozen=True)
@@ -110,6 +145,13 @@ class EnvelopeMonitor:
         if len(self.masked) == len(names):
             raise ModelError("every state of the model is masked; leave at least one that can raise the alarm")
         self._counted = np.array([name not in masked for name in names])
+        self._uncounted, self._all_count = ~self._counted, not self.masked
+        point, domain = model.operating_point, model.domain
+        self._steady, self._scale = np.concatenate((point.x_s, point.u_s)), np.concatenate((point.X, point.U))
+        self._least = np.concatenate((domain.x_min, domain.u_min))
+        self._greatest = np.concatenate((domain.x_max, domain.u_max))
+        self._limited = bool(np.isfinite(self._least).any() or np.isfinite(self._greatest).any())
+        self._no_flags = np.full(model.n, np.nan)
         self.alarm = False
         self._recent: deque[bool] = deque()
         self._violations = 0  # among the recent verdicts
@@ -133,30 +175,21 @@ class EnvelopeMonitor:
         """
         if step.status is Status.RESET or not armed:
             self.reset()
-        n = self.model.n
-        flags = np.full(n, np.nan)
-        lower, upper, utilisation = flags, flags, flags
-        outside = False
-        if step.status is Status.OK:
-            point = self.model.operating_point
-            x, u = point.normalise_x(step.x), point.normalise_u(step.u)
-            flags, lower, upper, utilisation = self._judge(x, u, np.float64(step.dt), point.normalise_x(step.x_next))
-            outside = bool(self.model.domain.outside(x, u))
-            if armed:
-                self._count(bool(((flags == 1.0) & self._counted).any()))
-            lower, upper = point.recorded_x(lower), point.recorded_x(upper)
-        return Verdict(
-            step.t_ns,
-            step.arrival_ns,
-            step.status,
-            flags,
-            lower,
-            upper,
-            step.x_next,
-            utilisation,
-            outside,
-            self.alarm,
-        )
+        if step.status is not Status.OK:
+            return Verdict(step, self._no_flags.copy(), False, self.alarm, None)
+        point = self.model.operating_point
+        z = (np.concatenate((step.x, step.u)) - self._steady) / self._scale
+        x_next = (step.x_next - point.x_s) / point.X
+        centre, half = self.model.one_centre_and_half(z, step.dt)
+        judged_half = half if self.rule.margin == 1.0 else half * self.rule.margin
+        lower, upper = centre - judged_half, centre + judged_half
+        inside = (lower <= x_next) & (x_next <= upper)
+        outside = self._limited and bool(((z < self._least) | (z > self._greatest)).any())
+        if armed:
+            counted = inside if self._all_count else inside | self._uncounted
+            self._count(not counted.all())
+        flags: Array = 1.0 - inside
+        return Verdict(step, flags, outside, self.alarm, _Judgement(point, centre, half, lower, upper, x_next))
 
     def _count(self, violated: bool) -> None:
         recent = self._recent
@@ -206,10 +239,7 @@ class EnvelopeMonitor:
         lower, upper = centre - judged_half, centre + judged_half
         inside = (lower <= x_next) & (x_next <= upper)
         flags = np.where(inside, 0.0, 1.0)
-        difference = x_next - centre
-        with np.errstate(divide="ignore", invalid="ignore"):
-            utilisation = np.where(difference == 0.0, 0.0, difference / half)
-        return flags, lower, upper, utilisation
+        return flags, lower, upper, _utilisation(x_next - centre, half)
 
     def _m_of_n(self, judged: NDArray[np.bool_], violated: NDArray[np.bool_]) -> NDArray[np.bool_]:
         total = np.concatenate([[0], np.cumsum(violated[judged])])
@@ -218,3 +248,8 @@ class EnvelopeMonitor:
         raised = np.concatenate([[False], recent >= self.rule.violations])
         held: NDArray[np.bool_] = raised[np.cumsum(judged)]  # without a verdict the last one stands
         return held
+
+
+def _utilisation(difference: Array, half: Array) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return np.where(difference == 0.0, 0.0, difference / half)

@@ -126,7 +126,11 @@ class _Topic:
         """
         jumps = reset or (self.ahead and len(self.kept) < KEPT_OVER_A_JUMP)
         if chosen is not None and not jumps:
-            self.kept = deque((m for m in self.kept if m is chosen or _behind(sample, m) < 0), BUFFERED_MESSAGES)
+            kept = self.kept
+            while kept[0] is not chosen and _behind(sample, kept[0]) >= 0:  # most often this is all
+                kept.popleft()
+            if len(kept) > 1:
+                self.kept = deque((m for m in kept if m is chosen or _behind(sample, m) < 0), BUFFERED_MESSAGES)
         if reset:
             self.ahead = False
             self.closed.clear()  # nothing of this pass can be late for a sample of the one before
@@ -188,8 +192,16 @@ class Sampler:
         n = len(signals.states)
         self._n, self._nm = n, len(signals.signals)
         self._where = {topic: signals.on(topic) for topic in signals.topics}
+        # Most often a topic carries signals that stand side by side; then they are copied as one.
+        self._span = {
+            topic: slice(where[0], where[-1] + 1) if where == list(range(where[0], where[-1] + 1)) else None
+            for topic, where in self._where.items()
+        }
         self._max_age = [skew_ns] * n + [2**62 if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls]
+        self._least_max_age = {t: min(self._max_age[i] for i in where) for t, where in self._where.items()}
         self._one_topic = all(s.topic == self.clock for s in signals.states)
+        self._clock_is_x = self._where[self.clock] == list(range(n))
+        self._unknown = [math.nan] * self._nm
         self._delays = [(n + j, c.delay) for j, c in enumerate(signals.controls) if c.delay]
         self._topics: dict[str, _Topic] = {}
         for topic, where in self._where.items():
@@ -262,10 +274,13 @@ class Sampler:
         if status.opens_segment:
             self._history = {}
         if self._one_topic:
-            x_next = np.full(self._n, math.nan)
-            for i, value in zip(self._where[self.clock], message.values, strict=True):
-                if i < self._n:
-                    x_next[i] = value
+            if self._clock_is_x:
+                x_next = np.array(message.values, dtype=np.float64)
+            else:
+                x_next = np.full(self._n, math.nan)
+                for i, value in zip(self._where[self.clock], message.values, strict=True):
+                    if i < self._n:
+                        x_next[i] = value
             steps.append(self._step(status, message, dt, self._before, x_next))
         self._open, self._open_status, self._open_dt = message, status, dt
         self.counters["samples"] += 1
@@ -293,27 +308,31 @@ class Sampler:
     ) -> Step:
         if before is None or status in (Status.FIRST, Status.RESET):
             before = np.full(self._nm, math.nan)
-        if status is Status.OK and not (np.isfinite(before).all() and np.isfinite(x_next).all()):
+        if status is Status.OK and not (_all_finite(before) and _all_finite(x_next)):
             status = Status.MISSING
             self.counters["missing"] += 1
         return Step(status, self._instant(message), message.arrival, dt, before[: self._n], before[self._n :], x_next)
 
     def _fix(self, sample: _Message, final: bool, reset: bool = False) -> NDArray[np.float64]:
         """z = [x; u] of the open sample from what has arrived; final: the sample closes now; reset: by a step back."""
-        z = np.full(self._nm, math.nan)
+        z = self._unknown.copy()
         for topic, where in self._where.items():
+            span = self._span[topic]
             if topic == self.clock:
-                z[where] = sample.values
+                chosen, age = sample, 0
+            else:
+                state = self._topics[topic]
+                found = state.choose(sample)
+                if final:
+                    state.close(sample, found, reset)
+                if found is None:
+                    continue
+                chosen, age = found, _behind(sample, found)
+            if span is not None and (topic == self.clock or age <= self._least_max_age[topic]):
+                z[span] = chosen.values
                 continue
-            state = self._topics[topic]
-            chosen = state.choose(sample)
-            if final:
-                state.close(sample, chosen, reset)
-            if chosen is None:
-                continue
-            age = _behind(sample, chosen)
             for i, value in zip(where, chosen.values, strict=True):
-                if age <= self._max_age[i]:
+                if topic == self.clock or age <= self._max_age[i]:
                     z[i] = value
                 elif final:
                     self.counters[f"stale {self.signals.signals[i].name}"] += 1
@@ -322,11 +341,11 @@ class Sampler:
             line = line if final else line.copy()
             line.append(z[i])
             z[i] = line[0] if len(line) > delay else math.nan
-        if final:
-            for signal, finite in zip(self.signals.signals, np.isfinite(z), strict=True):
-                if not finite:
+        if final and not _all_finite(z):
+            for signal, value in zip(self.signals.signals, z, strict=True):
+                if not math.isfinite(value):
                     self.counters[f"missing {signal.name}"] += 1
-        return z
+        return np.array(z, dtype=np.float64)
 
     def latest(self) -> tuple[int, NDArray[np.float64], NDArray[np.float64]] | None:
         """(t_ns, x (n,), u (m,)) of the open sample with what is known so far; None before the first sample."""
@@ -334,6 +353,12 @@ class Sampler:
             return None
         z = self._fix(self._open, final=False)
         return self._instant(self._open), z[: self._n], z[self._n :]
+
+
+def _all_finite(values: Sequence[float] | NDArray[np.float64]) -> bool:
+    if isinstance(values, np.ndarray):
+        return bool(np.isfinite(values).all())
+    return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum of finite numbers may overflow
 
 
 def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> int | None:

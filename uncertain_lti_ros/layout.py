@@ -156,6 +156,7 @@ class _Layout:
         where = {place: i for i, place in enumerate(order)}
         self._picks = [where[place] for place in places]
         self._plain = self._picks == list(range(len(every))) and all(w.path.derived is None for w in every)
+        self._plain = self._plain and all(code in "fd" for want in wants for _, code in want.places)
         self._first = 2 if self._stamped else 0
         self._derived: list[tuple[Derived | None, list[str] | None, int]] = [
             (want.path.derived, want.names, len(want.places)) for want in wants
@@ -181,7 +182,7 @@ class _Layout:
         values = []
         for derived, names, count in self._derived:
             if derived is None:
-                values.append(picked[first] if count else math.nan)
+                values.append(float(picked[first]) if count else math.nan)
             else:
                 parts = picked[first : first + count]
                 values.append(float(derived.of(parts if names is None else _Parts(names, parts))))

@@ -1,0 +1,397 @@
+"""The live monitor beside a bare rclpy node on the same topics: CPU per sample, time to the flag, losses, memory.
+
+    ./run python benchmarks/live_monitor.py                        # the table: rates 500 Hz and 1 kHz, n = 5 and 50
+    ./run python benchmarks/live_monitor.py --soak 600             # ten minutes at 1 kHz: memory and counters
+
+One process publishes a state and a control message per sample (sensor_msgs/JointState, reliable, stamped with the
+time of publishing). Another one takes them: a bare node that subscribes and does nothing, on either executor, or the
+monitor. A third subscribes to what the monitor publishes. CPU is user and system time of the whole process from
+/proc, the middleware's threads included, over the samples published meanwhile; the least of several runs counts. The
+delay is from the stamp to the callback of the bare node, and to the flag's arrival in the third process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+STATE, CONTROL = "/bench/state", "/bench/control"
+TYPE = "sensor_msgs/msg/JointState"
+CONTROLS = {5: 2, 50: 10}
+WARM_UP = 2.0  # s
+QUEUE = 1000
+
+
+def save_model(path: Path, n: int, rate: float) -> None:
+    from uncertain_lti import SignalMap, UncertainLTI
+    from uncertain_lti.model import Sampling
+    from uncertain_lti.signals import Signal
+
+    m, dt = CONTROLS[n], 1.0 / rate
+    signals = SignalMap(
+        tuple(Signal(f"x{i}", STATE, f"position[x{i}]", type=TYPE) for i in range(n)),
+        tuple(Signal(f"u{j}", CONTROL, f"position[u{j}]", type=TYPE, max_hold=0.5) for j in range(m)),
+        clock=STATE,
+        max_gap=100 * dt,
+        time={STATE: "header", CONTROL: "header"},
+    )
+    sampling = Sampling(STATE, TYPE, dict(signals.time), dt_median=dt, max_gap=100 * dt)
+    rng = np.random.default_rng(1)
+    matrices = rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.full((n, n), 0.1), np.full((n, m), 0.1)
+    UncertainLTI(*matrices, v=np.full(n, 0.1), signals=replace(signals), sampling=sampling).save(path)
+
+
+# --- the processes ------------------------------------------------------------------------------------------
+
+
+def publish(n: int, rate: float, seconds: float) -> None:
+    """Prints how many samples it sent, once both topics have a subscriber."""
+    import rclpy
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import JointState
+
+    from uncertain_lti_ros.outputs import NamedVector
+
+    rclpy.init()
+    node = rclpy.create_node("publisher")
+    state = node.create_publisher(JointState, STATE, QoSProfile(depth=QUEUE))
+    control = node.create_publisher(JointState, CONTROL, QoSProfile(depth=QUEUE))
+    while not (state.get_subscription_count() and control.get_subscription_count()):
+        time.sleep(0.05)
+    time.sleep(0.5)
+    x, u = NamedVector([f"x{i}" for i in range(n)]), NamedVector([f"u{j}" for j in range(CONTROLS[n])])
+    rng = np.random.default_rng(2)
+    values = rng.uniform(-0.05, 0.05, (1000, n + CONTROLS[n]))
+    rows = [(row[:n].tobytes(), row[n:].tobytes()) for row in values]
+    began, sent = time.perf_counter(), 0
+    print("begins", flush=True)
+    while (wait := began + sent / rate - time.perf_counter()) < seconds and sent < rate * seconds:
+        if wait > 0:
+            time.sleep(wait)
+        elif wait < -0.05:
+            began -= wait  # never a burst
+        now = time.time_ns()
+        position, command = rows[sent % 1000]
+        control.publish(u(now, command))
+        state.publish(x(now, position))
+        sent += 1
+    print(sent, flush=True)
+    time.sleep(1.0)
+    rclpy.shutdown()
+
+
+def take(executor: str) -> None:
+    """The bare node: prints its delays when a line comes in."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.experimental import EventsExecutor
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import JointState
+
+    rclpy.init()
+    node = rclpy.create_node("bare")
+    count = [0]
+
+    def nothing(_: JointState) -> None:
+        count[0] += 1
+
+    for topic in (STATE, CONTROL):
+        node.create_subscription(JointState, topic, nothing, QoSProfile(depth=QUEUE))
+    spinner = EventsExecutor() if executor == "events" else SingleThreadedExecutor()
+    spinner.add_node(node)
+    listen_for_end(spinner, lambda: {"received": count[0]})
+
+
+def bare_delay(executor: str) -> None:
+    """As `take`, with a look at the clock in each callback, which is not part of what costs are held against."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.experimental import EventsExecutor
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import JointState
+
+    rclpy.init()
+    node = rclpy.create_node("bare")
+    delays: list[int] = []
+
+    def note(message: JointState) -> None:
+        stamp = message.header.stamp
+        delays.append(time.time_ns() - stamp.sec * 10**9 - stamp.nanosec)
+
+    node.create_subscription(JointState, STATE, note, QoSProfile(depth=QUEUE))
+    node.create_subscription(JointState, CONTROL, lambda _: None, QoSProfile(depth=QUEUE))
+    spinner = EventsExecutor() if executor == "events" else SingleThreadedExecutor()
+    spinner.add_node(node)
+    listen_for_end(spinner, lambda: {"delays": delays})
+
+
+def hear(names: list[str]) -> None:
+    """Subscribes to outputs of the monitor; those but the flags are received and dropped by the middleware."""
+    import rclpy
+    from rclpy.experimental import EventsExecutor
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Bool
+
+    rclpy.init()
+    node, idle = rclpy.create_node("hearer"), rclpy.create_node("idle_hearer")
+    delays: list[int] = []
+
+    def note(data: bytes) -> None:
+        stamp = int.from_bytes(data[4:8], "little") * 10**9 + int.from_bytes(data[8:12], "little")
+        delays.append(time.time_ns() - stamp)
+
+    for name in names:
+        topic = f"/envelope_monitor/{name}"
+        if name == "flags":
+            node.create_subscription(JointState, topic, note, QoSProfile(depth=5000), raw=True)
+        else:
+            kind = Bool if name == "violation" else JointState
+            idle.create_subscription(kind, topic, lambda _: None, QoSProfile(depth=1))
+    spinner = EventsExecutor()
+    spinner.add_node(node)
+    listen_for_end(spinner, lambda: {"delays": delays})
+
+
+def listen_for_end(spinner: Any, say: Any) -> None:
+    import select
+
+    print("ready", flush=True)
+    while not select.select([sys.stdin], [], [], 0)[0]:
+        for _ in range(200):
+            spinner.spin_once(timeout_sec=0.1)
+    print(json.dumps(say()), flush=True)
+
+
+# --- the measurement ----------------------------------------------------------------------------------------
+
+
+class Child:
+    def __init__(self, env: dict[str, str], *command: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, *command], env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, text=True, start_new_session=True,
+        )  # fmt: skip
+
+    @property
+    def cpu(self) -> float:
+        """User and system time, s, of all its threads."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    @property
+    def memory(self) -> float:
+        """Resident memory of its own, MiB."""
+        for line in Path(f"/proc/{self.process.pid}/smaps_rollup").read_text().splitlines():
+            if line.startswith("Private_Dirty:"):
+                return int(line.split()[1]) / 1024
+        raise RuntimeError("no Private_Dirty")
+
+    def line(self) -> str:
+        assert self.process.stdout is not None
+        return self.process.stdout.readline().strip()
+
+    def ask(self) -> dict[str, Any]:
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        said: dict[str, Any] = json.loads(self.line())
+        return said
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+OUTPUTS = "flags violation lower upper state utilisation predicted_lower predicted_upper".split()
+SUBJECTS = {
+    "bare, default executor": ("take", "default", []),
+    "bare, events executor": ("take", "events", []),
+    "monitor, all outputs heard": ("monitor", "", OUTPUTS),
+    "monitor, ~/violation heard": ("monitor", "", ["violation"]),
+}
+
+
+def status(domain: int) -> dict[str, Any]:
+    """What the monitor's ~/status says."""
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.executors import SingleThreadedExecutor
+    from std_srvs.srv import Trigger
+
+    context = Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node("asker", context=context)
+    client = node.create_client(Trigger, "/envelope_monitor/status")
+    spinner = SingleThreadedExecutor(context=context)
+    assert client.wait_for_service(20.0), "the monitor does not answer"
+    future = client.call_async(Trigger.Request())
+    spinner.add_node(node)
+    spinner.spin_until_future_complete(future, 20.0)
+    said: dict[str, Any] = json.loads(future.result().message)
+    node.destroy_node()
+    context.try_shutdown()
+    return said
+
+
+class Run:
+    """One subject, one rate, one size: the processes, and what was measured of them."""
+
+    def __init__(self, n: int, rate: float, seconds: float) -> None:
+        self.n, self.rate, self.seconds = n, rate, seconds
+        self.domain = random.randint(1, 100)
+        self.env = os.environ | {
+            "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }  # fmt: skip
+        self.children: list[Child] = []
+
+    def child(self, *command: str) -> Child:
+        self.children.append(Child(self.env, *command))
+        return self.children[-1]
+
+    def part(self, *arguments: str) -> Child:
+        return self.child(__file__, "--part", *arguments)
+
+    def monitor(self, folder: str) -> Child:
+        path = Path(folder) / "bench.model.json"
+        save_model(path, self.n, self.rate)
+        code = "import sys; from uncertain_lti_ros.envelope_monitor import main; sys.exit(main())"
+        return self.child("-c", code, "--ros-args", "-p", f"model:={path}", "-p", "violations:=1")
+
+    def measure(self, kind: str, executor: str, outputs: list[str], delays: bool = False) -> dict[str, Any]:
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                hearer = None
+                if kind == "monitor":
+                    subject = self.monitor(folder)
+                    if outputs:
+                        hearer = self.part("hear", *outputs)
+                        hearer.line()
+                    status(self.domain)
+                else:
+                    subject = self.part("delay" if delays else "take", executor)
+                    subject.line()
+                publisher = self.part("publish", str(self.n), str(self.rate), str(self.seconds + WARM_UP))
+                publisher.line()
+                time.sleep(WARM_UP)
+                cpu, began = subject.cpu, time.perf_counter()
+                time.sleep(self.seconds - 0.5)
+                used, elapsed = subject.cpu - cpu, time.perf_counter() - began
+                sent = int(publisher.line())
+                time.sleep(0.5)
+                per_sample = used / (sent / (self.seconds + WARM_UP) * elapsed) * 1e6
+                found: dict[str, Any] = {"cpu": per_sample, "sent": sent}
+                if kind == "monitor":
+                    said = status(self.domain)
+                    found |= {"verdicts": said["verdicts"], "lost": sum(said["lost"].values())}
+                    found["missed"] = sent - 1 - said["verdicts"]
+                    if hearer is not None and "flags" in outputs:
+                        found["delays"] = hearer.ask()["delays"]
+                elif delays:
+                    found["delays"] = subject.ask()["delays"]
+                else:
+                    found["missed"] = 2 * sent - subject.ask()["received"]
+                return found
+        finally:
+            for child in self.children:
+                child.end()
+
+
+def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int) -> None:
+    from uncertain_lti.report import table
+
+    rows = []
+    for n in sizes:
+        for rate in rates:
+            best: dict[str, dict[str, Any]] = {}
+            for _ in range(repeats):
+                for name, subject in SUBJECTS.items():
+                    found = Run(n, rate, seconds).measure(*subject)
+                    if name not in best or found["cpu"] < best[name]["cpu"]:
+                        best[name] = found | {"missed": max(found["missed"], best.get(name, found)["missed"])}
+                delay = Run(n, rate, seconds).measure("take", "events", [], delays=True)["delays"]
+                p99 = float(np.percentile(delay[100:], 99)) / 1e6
+                events = best["bare, events executor"]
+                events["p99"] = min(p99, events.get("p99", np.inf))
+            default = best["bare, default executor"]["cpu"]
+            for name, found in best.items():
+                if "delays" in found:
+                    found["p99"] = float(np.percentile(found["delays"][100:], 99)) / 1e6
+                rows.append(
+                    [
+                        f"{n}", f"{rate:g}", name, f"{found['cpu']:.0f}", f"{found['cpu'] / default:.2f}",
+                        f"{found['cpu'] / events['cpu']:.2f}", f"{found['p99']:.2f}" if "p99" in found else "",
+                        str(found["missed"]),
+                    ]
+                )  # fmt: skip
+                print("  ".join(rows[-1]), file=sys.stderr, flush=True)
+    head = ["n", "Hz", "", "CPU, µs/sample", "/ default", "/ events", "p99 delay, ms", "not received"]
+    print(table(head, rows))
+
+
+def soak(seconds: float, rate: float, n: int) -> dict[str, float]:
+    """Memory after warm-up and at the end, MiB, and how many samples got no verdict; printed as they come."""
+    run = Run(n, rate, seconds)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            subject = run.monitor(folder)
+            hearer = run.part("hear", *OUTPUTS)
+            hearer.line()
+            status(run.domain)
+            publisher = run.part("publish", str(n), str(rate), str(seconds))
+            publisher.line()
+            began, memory = time.perf_counter(), []
+            warm = min(60.0, seconds / 3)
+            while (now := time.perf_counter() - began) < seconds - 1.0:
+                time.sleep(min(10.0, seconds / 12))
+                if now > warm:
+                    memory.append(subject.memory)
+                    print(f"{now:6.0f} s  {memory[-1]:.2f} MiB", file=sys.stderr, flush=True)
+            sent = int(publisher.line())
+            time.sleep(0.7)
+            said = status(run.domain)
+            growth = memory[-1] - memory[0]
+            print(f"{sent} samples sent, {said['verdicts']} verdicts, {growth:+.2f} MiB from {memory[0]:.1f} MiB")
+            flags = len(hearer.ask()["delays"])
+            return {"sent": sent, "verdicts": said["verdicts"], "flags": flags, "growth": growth}
+    finally:
+        for child in run.children:
+            child.end()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=6.0, help="length of one run")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--rates", type=float, nargs="+", default=[500.0, 1000.0])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[5, 50], choices=list(CONTROLS))
+    parser.add_argument("--soak", type=float, metavar="S", help="instead, run the monitor for S seconds at 1 kHz")
+    parser.add_argument("--part", nargs="+", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.part:
+        kind, *rest = args.part
+        if kind == "publish":
+            publish(int(rest[0]), float(rest[1]), float(rest[2]))
+        elif kind == "hear":
+            hear(rest)
+        else:
+            {"take": take, "delay": bare_delay}[kind](rest[0])
+    elif args.soak:
+        soak(args.soak, 1000.0, args.sizes[0])
+    else:
+        compare(args.rates, args.sizes, args.seconds, args.repeats)
+
+
+if __name__ == "__main__":
+    main()
