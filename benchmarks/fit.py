@@ -101,7 +101,7 @@ def outside(problem, model):
 def solve(problem, criterion):
     """Fit, repair and tie-breaks included; the messages in words are not."""
     signals = names(problem.n, problem.p - problem.n)
-    return fit_fleet(Fleet([problem]), signals, criterion, dt_median=DT)
+    return fit_fleet(Fleet.of(problem), signals, criterion, dt_median=DT)
 
 
 def million(scale):

@@ -149,7 +149,7 @@ def fit(
         problem = problem.without(np.array([index for index, _ in chosen], dtype=np.intp))
     try:
         model = fit_fleet(
-            Fleet([problem]),
+            Fleet.of(problem) if method == "working-set" else Fleet([problem]),
             signals,
             criterion,
             structure=structure,

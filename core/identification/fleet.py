@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import numpy as np
@@ -10,25 +13,41 @@ from numpy.typing import NDArray
 
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.passes import Candidate, Judged, Moments, Samples
-from uncertain_lti.identification.problem import Columns, Partition
+from uncertain_lti.identification.problem import Columns, Partition, Problem
 from uncertain_lti.model import UncertainLTI
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
+_WORTH_A_THREAD = 100_000
+"""Transitions per part from which on a thread of its own pays."""
+
 
 class Fleet:
-    """Partitions visited one after the other in this process; the passes over all data as map and reduce.
+    """Partitions visited in this process, in turn or by threads; passes over all data as map and reduce.
 
     Parameters
     ----------
     partitions : sequence of Partition
         With the same columns, states and controls.
+    threads : int
+        How many partitions a pass visits at a time: numpy works outside the interpreter's lock.
     """
 
-    def __init__(self, partitions: Sequence[Partition]) -> None:
+    def __init__(self, partitions: Sequence[Partition], threads: int = 1) -> None:
         self.partitions = list(partitions)
+        self._threads = threads
         self._describe([(part.N, part.n, part.p, part.columns) for part in self.partitions])
+
+    @classmethod
+    def of(cls, problem: Problem) -> Fleet:
+        """A problem in memory, in as many parts as there are cores where it is large."""
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        count = min(cores, problem.N // _WORTH_A_THREAD)
+        if count < 2:
+            return cls([problem])
+        edges = np.linspace(0, problem.N, count + 1).astype(int).tolist()
+        return cls([problem.subset(slice(a, b)) for a, b in itertools.pairwise(edges)], count)
 
     def _describe(self, facts: Sequence[tuple[int, int, int, Columns]]) -> None:
         self.counts = [count for count, *_ in facts]
@@ -44,7 +63,11 @@ class Fleet:
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
         """function(partition, *arguments of that partition) for every partition, in order."""
-        return [function(part, *args) for part, args in zip(self.partitions, arguments, strict=True)]
+        if self._threads == 1:
+            return [function(part, *args) for part, args in zip(self.partitions, arguments, strict=True)]
+        with ThreadPoolExecutor(self._threads) as pool:
+            futures = [pool.submit(function, p, *args) for p, args in zip(self.partitions, arguments, strict=True)]
+            return [future.result() for future in futures]
 
     def _same(self, *arguments: Any) -> list[tuple[Any, ...]]:
         return [arguments] * len(self.counts)

@@ -210,8 +210,8 @@ class Problem:
         weights = self.weights if self.weights.ndim == 1 else self.weights[part]
         return Block(0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights)
 
-    def subset(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Problem:
-        """The same problem on some transitions."""
+    def subset(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Problem:
+        """The same problem on some transitions; a slice is no copy."""
         weights = self.weights if self.weights.ndim == 1 else self.weights[index]
         return Problem(
             self.z_columns[:, index],
