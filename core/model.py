@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
+import reprlib
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import Any
 
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 
 FORMAT = "uncertain-lti/1"
 MAX_FILE_BYTES = 64 * 2**20
+LONGEST_WINDOW = 1_000_000
+"""Verdicts that the alarm looks at, at most."""
 _BLOCK = 4096  # samples per block of the vectorised path: stays in the cache
 
 
@@ -70,9 +73,11 @@ class Alarm:
     margin: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (1 <= self.violations <= self.window):
+        whole = isinstance(self.violations, int) and isinstance(self.window, int)
+        if not (whole and 1 <= self.violations <= self.window <= LONGEST_WINDOW):
             raise ModelError(
-                f"alarm: violations is {self.violations} of window {self.window}; it takes 1 <= violations <= window"
+                f"alarm: violations is {reprlib.repr(self.violations)} of window {reprlib.repr(self.window)}; it takes "
+                f"whole numbers, 1 <= violations <= window <= {LONGEST_WINDOW}"
             )
         if not (math.isfinite(self.margin) and self.margin > 0):
             raise ModelError(f"alarm: margin is {self.margin}; it must be a positive number")
@@ -129,8 +134,8 @@ class UncertainLTI:
         validation: Mapping[str, Any] | None = None,
     ) -> None:
         self.A = _array(A, "A", None)
-        n = self.A.shape[0]
-        if self.A.ndim != 2 or self.A.shape != (n, n) or n == 0:
+        n = len(self.A) if self.A.ndim else 0
+        if self.A.shape != (n, n) or n == 0:
             raise ModelError(f"A has shape {self.A.shape}; it must be square, one row per state")
         self.B = _array(B, "B", None)
         if self.B.size == 0:
@@ -140,7 +145,7 @@ class UncertainLTI:
         m = self.B.shape[1]
         zeros = np.zeros(n)
         self.dA = _array(dA, "dA", (n, n), half_width=True)
-        self.dB = _array(dB if m else np.zeros((n, 0)), "dB", (n, m), half_width=True)
+        self.dB = _array(dB, "dB", (n, m), half_width=True)
         self.c = _array(zeros if c is None else c, "c", (n,))
         self.dc = _array(zeros if dc is None else dc, "dc", (n,), half_width=True)
         self.v = _array(zeros if v is None else v, "v", (n,), half_width=True)
@@ -428,12 +433,17 @@ class UncertainLTI:
         ModelError
             The file cannot be written.
         """
-        text = _layout(self.to_dict())
+        try:
+            text = _layout(self.to_dict()).encode()
+        except (TypeError, ValueError, RecursionError) as error:
+            raise ModelError(
+                f"{path}: the model holds what JSON cannot ({error}); mend its fit or validation"
+            ) from None
         folder = os.path.dirname(os.path.abspath(path))
         temporary = None
         try:
             descriptor, temporary = tempfile.mkstemp(dir=folder, prefix=".model-", suffix=".tmp")
-            with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+            with os.fdopen(descriptor, "wb") as stream:
                 stream.write(text)
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -460,13 +470,13 @@ class UncertainLTI:
             if os.path.getsize(path) > MAX_FILE_BYTES:
                 raise ModelError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, so not a model file; check the path")
             with open(path, encoding="utf-8") as stream:
-                data = json.load(stream)
+                data = json.load(stream, object_pairs_hook=_distinct)
         except FileNotFoundError:
             raise ModelError(f"{path}: there is no such model file; write one with `uncertain-lti fit`") from None
         except OSError as error:
             raise ModelError(f"{path}: cannot be read: {error.strerror}; check the path") from None
         except (ValueError, RecursionError) as error:
-            detail = str(error).split("\n")[0][:120]
+            detail = (str(error).splitlines() or [type(error).__name__])[0][:120]
             raise ModelError(f"{path}: is not JSON ({detail}); write one with `uncertain-lti fit`") from None
         return cls.from_dict(data, source=os.fspath(path))
 
@@ -475,11 +485,11 @@ class UncertainLTI:
         """From the structure of a model file; raises ModelError naming source and field."""
         try:
             return cls._from_dict(data, source)
-        except ModelError as error:
-            text = str(error)
-            raise ModelError(text if text.startswith(source) else f"{source}: {text}") from None
-        except SignalError as error:
-            raise ModelError(str(error)) from None
+        except RecursionError:
+            raise ModelError(f"{source}: is nested too deeply; is this a model file?") from None
+        except (ModelError, SignalError) as error:
+            text = str(error).removeprefix(source).removeprefix(": ")
+            raise ModelError(f"{source}: {' '.join(text.split())}") from None  # names may hold line breaks
 
     @classmethod
     def _from_dict(cls, data: Any, source: str) -> UncertainLTI:
@@ -487,7 +497,7 @@ class UncertainLTI:
             raise ModelError(f"no field 'format'; is this a model file written by `uncertain-lti fit` ({FORMAT})?")
         if data["format"] != FORMAT:
             raise ModelError(
-                f"format is {data['format']!r}, and this version reads {FORMAT!r}; fit the model again, "
+                f"format is {reprlib.repr(data['format'])}, and this version reads {FORMAT!r}; fit the model again, "
                 f"or use the version that wrote it"
             )
         known = {
@@ -499,8 +509,8 @@ class UncertainLTI:
                 raise ModelError(f"field '{name}' is missing; fit the model again")
         for name in data:
             if name not in known:
-                raise ModelError(f"unknown field '{name}'; known are {', '.join(sorted(known))}")
-        said = _object(data["sampling"], "sampling")
+                raise ModelError(f"unknown field {reprlib.repr(name)}; known are {', '.join(sorted(known))}")
+        said = _object(data["sampling"], "sampling", {f.name for f in fields(Sampling)})
         sampling = Sampling(
             clock=_text(said.get("clock", ""), "sampling.clock"),
             clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
@@ -516,7 +526,7 @@ class UncertainLTI:
         )
         for topic, kind in sampling.time.items():
             if kind not in ("header", "log"):
-                raise ModelError(f"sampling.time[{topic}] is {kind!r}; it must be header or log")
+                raise ModelError(f"sampling.time[{topic}] is {reprlib.repr(kind)}; it must be header or log")
         signals = replace(
             SignalMap.from_dict(
                 {"states": data["states"], "controls": data["controls"]}, source=source, need_topics=False
@@ -536,21 +546,18 @@ class UncertainLTI:
         _array(data["B"], "B", (n, m))
         domain = None
         if "domain" in data:
-            box = _object(data["domain"], "domain")
             sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
+            box = _object(data["domain"], "domain", set(sizes))
             for name in sizes:
                 if name not in box:
                     raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
             domain = Domain(**{name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()})
-        alarm = _object(data.get("alarm", {}), "alarm")
-        for key in alarm:
-            if key not in ("violations", "window", "margin"):
-                raise ModelError(f"unknown field 'alarm.{key}'; known are violations, window, margin")
+        alarm = _object(data.get("alarm", {}), "alarm", {f.name for f in fields(Alarm)})
         for key in ("violations", "window"):
             if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
-                raise ModelError(f"alarm.{key} is {alarm[key]!r}; it must be a whole number")
+                raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
         if "margin" in alarm:
-            alarm["margin"] = _positive(alarm["margin"], "alarm.margin")
+            alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False)
         return cls(
             *(data[name] for name in ("A", "B", "dA", "dB")),
             *(data.get(name) for name in ("c", "dc", "v")),
@@ -595,7 +602,7 @@ def _array(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_widt
         if isinstance(value, Sequence) and not _numbers_only(value):
             raise TypeError
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ModelError(f"field '{name}' is not an array of numbers") from None
     if shape is not None and array.shape != shape:
         if array.size == 0 and 0 in shape:
@@ -615,25 +622,41 @@ def _numbers_only(value: Any) -> bool:
     return not isinstance(value, (str, bool)) and value is not None
 
 
-def _object(value: Any, name: str) -> dict[str, Any]:
+def _object(value: Any, name: str, known: set[str] | None = None) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ModelError(f"field '{name}' is not an object")
+    for key in value:
+        if known is not None and key not in known:
+            raise ModelError(f"unknown field '{name}.{key}'; known are {', '.join(sorted(known))}")
     return dict(value)
 
 
 def _text(value: Any, name: str) -> str:
     if not isinstance(value, str):
-        raise ModelError(f"field '{name}' is {value!r}; it must be a text")
+        raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a text")
     return value
 
 
-def _positive(value: Any, name: str, zero: bool = False) -> float | None:
-    if value is None:
+def _positive(value: Any, name: str, zero: bool = False, null: bool = True) -> float | None:
+    """A number that is positive, or not negative where zero is allowed; None for null where that is."""
+    if value is None and null:
         return None
-    fits = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-    if not fits or value < 0 or (value == 0 and not zero):
-        raise ModelError(f"field '{name}' is {value!r}; it must be a positive number")
-    return float(value)
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
+    except OverflowError:
+        number = math.nan
+    if not (0.0 < number < math.inf or (zero and number == 0.0)):
+        raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number")
+    return number
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of a JSON file; readers would keep the last of two equal keys."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(k for k in keys if keys.count(k) > 1)!r} stands twice in one object")
+    return found
 
 
 def _limits(value: Any, name: str, size: int) -> Array:

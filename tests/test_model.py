@@ -1,0 +1,712 @@
+"""The model: bounds (6)(7) to the bit, discrepancies (4)(5), and a file that is either whole or refused."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+import threading
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from uncertain_lti.errors import ModelError, UncertainLTIError
+from uncertain_lti.model import FORMAT, Alarm, Domain, Sampling, UncertainLTI
+from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.transient import Transient
+
+NAN, INF = math.nan, math.inf
+
+# --- random models -------------------------------------------------------------------------------------------
+
+
+def random_model(rng: np.random.Generator, n: int, m: int, additive: bool = True, size: float = 1.0) -> UncertainLTI:
+    """Any signs and magnitudes, some elements and half-widths zero, an operating point of its own."""
+
+    def elements(*shape: int) -> np.ndarray:
+        values = rng.normal(size=shape) * 10.0 ** rng.uniform(-3, 1, shape) * size
+        return np.where(rng.uniform(size=shape) < 0.15, 0.0, values)
+
+    vectors = [elements(n), np.abs(elements(n)), np.abs(elements(n))] if additive else []
+    signals = SignalMap(
+        tuple(Signal(f"x{i}", "/x", f"d[{i}]", float(rng.normal()), float(rng.uniform(0.1, 9))) for i in range(n)),
+        tuple(Signal(f"u{j}", "/u", f"d[{j}]", float(rng.normal()), float(rng.uniform(0.1, 9))) for j in range(m)),
+        clock="/x",
+        max_gap=0.1,
+        time={"/x": "header"} | ({"/u": "log"} if m else {}),
+    )
+    return UncertainLTI(
+        elements(n, n), elements(n, m), np.abs(elements(n, n)), np.abs(elements(n, m)), *vectors, signals=signals
+    )
+
+
+seeds = st.integers(0, 2**32 - 1)
+sizes = st.tuples(st.integers(1, 6), st.integers(0, 4)) | st.sampled_from([(1, 7), (1, 20), (9, 0), (12, 12), (2, 130)])
+leads = st.sampled_from([(), (1,), (7,), (2, 3), (0,), (4, 0), (4095,), (4096,), (4097,), (1, 1, 5)])
+
+
+def bits(array: np.ndarray) -> bytes:
+    return np.ascontiguousarray(array).tobytes()
+
+
+# --- bounds (6)(7) -------------------------------------------------------------------------------------------
+
+
+@given(seeds, sizes, leads, st.sampled_from(["C", "F", "strided", "reversed"]), st.booleans())
+def test_one_sample_and_many_give_the_same_bits(
+    seed: int, size: tuple[int, int], lead: tuple[int, ...], layout: str, one_dt: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    n, m = size
+    model = random_model(rng, n, m)
+
+    def laid_out(array: np.ndarray) -> np.ndarray:
+        if layout == "F":
+            return np.asfortranarray(array)
+        if layout == "strided":
+            wide = np.zeros((*array.shape[:-1], 2 * array.shape[-1]))
+            wide[..., ::2] = array
+            return wide[..., ::2]
+        return array[..., ::-1].copy()[..., ::-1] if layout == "reversed" else array
+
+    x, u = laid_out(rng.normal(size=(*lead, n))), laid_out(rng.normal(size=(*lead, m)))
+    dt = np.float64(0.013) if one_dt else rng.uniform(1e-3, 1.0, lead)
+    lower, upper = model.bounds(x, u, dt)
+    assert lower.shape == upper.shape == (*lead, n)
+    picked = list(np.ndindex(lead))
+    for index in picked[:2] + picked[-2:] + [picked[i] for i in rng.integers(0, max(len(picked), 1), 5) if picked]:
+        low, high = model.bounds(x[index], u[index], dt if one_dt else dt[index])
+        assert bits(low) == bits(lower[index]) and bits(high) == bits(upper[index])
+
+
+def exact(
+    model: UncertainLTI, x: np.ndarray, u: np.ndarray, dt: float
+) -> Iterator[tuple[Fraction, Fraction, Fraction]]:
+    """Lower and upper bound of each state in rational numbers, and the sum of the magnitudes that were added."""
+    q = lambda value: Fraction(float(value))  # noqa: E731
+    for i in range(model.n):
+        terms = [q(a) * q(v) for a, v in zip([*model.A[i], *model.B[i]], [*x, *u], strict=True)]
+        widths = [q(d) * abs(q(v)) for d, v in zip([*model.dA[i], *model.dB[i]], [*x, *u], strict=True)]
+        centre = q(x[i]) + q(dt) * (sum(terms) + q(model.c[i]))
+        half = q(dt) * (sum(widths) + q(model.dc[i])) + q(model.v[i])
+        size = abs(q(x[i])) + q(dt) * (sum(map(abs, terms)) + abs(q(model.c[i])))
+        yield centre - half, centre + half, size + half
+
+
+@given(seeds, sizes, st.booleans(), st.floats(1e-6, 10.0))
+def test_bounds_are_the_formula_to_rounding(seed: int, size: tuple[int, int], additive: bool, dt: float) -> None:
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, *size, additive=additive)
+    x, u = rng.normal(size=model.n), rng.normal(size=model.m)
+    lower, upper = model.bounds(x, u, dt)
+    for i, (low, high, magnitude) in enumerate(exact(model, x, u, dt)):
+        allowed = 2.0**-52 * (model.n + model.m + 4) * float(magnitude)
+        assert abs(float(Fraction(float(lower[i])) - low)) <= allowed
+        assert abs(float(Fraction(float(upper[i])) - high)) <= allowed
+
+
+@given(seeds, sizes)
+def test_every_matrix_in_the_intervals_stays_inside(seed: int, size: tuple[int, int]) -> None:
+    """Equation (3) with elements anywhere in their intervals, ends and all; up to the rounding of both sides."""
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, *size)
+    x, u, dt = rng.normal(size=model.n), rng.normal(size=model.m), 0.1
+    lower, upper = model.bounds(x, u, dt)
+    for _ in range(20):
+        draw = lambda shape: rng.choice([-1.0, 0.0, 1.0, rng.uniform(-1, 1)], shape)  # noqa: E731
+        A, B = model.A + draw(model.A.shape) * model.dA, model.B + draw(model.B.shape) * model.dB
+        rate = A @ x + B @ u + model.c + draw(model.n) * model.dc
+        after = x + dt * rate + draw(model.n) * model.v
+        slack = 1e-12 * (1.0 + np.abs(after) + upper - lower)
+        assert (lower - slack <= after).all() and (after <= upper + slack).all()
+    sign = np.concatenate([np.sign(x), np.sign(u)])
+    widest = x + dt * ((model.A + model.dA * sign[: model.n]) @ x + (model.B + model.dB * sign[model.n :]) @ u)
+    np.testing.assert_allclose(upper, widest + dt * (model.c + model.dc) + model.v, rtol=1e-9, atol=1e-12)
+
+
+@given(seeds, sizes, st.floats(0.0, 5.0))
+def test_the_margin_multiplies_the_half_widths(seed: int, size: tuple[int, int], margin: float) -> None:
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, *size)
+    x, u = rng.normal(size=(3, model.n)), rng.normal(size=(3, model.m))
+    centre, half = model.centre_and_half(x, u, 0.1)
+    assert (half >= 0).all()
+    lower, upper = model.bounds(x, u, 0.1, margin=margin)
+    assert bits(lower) == bits(centre - half * margin) and bits(upper) == bits(centre + half * margin)
+
+
+def test_samples_controls_and_steps_are_broadcast() -> None:
+    model = random_model(np.random.default_rng(0), 3, 2)
+    x, u, dt = np.ones((4, 1, 3)), np.ones(2), np.array([0.1, 0.2])
+    lower, _ = model.bounds(x, u, dt)
+    assert lower.shape == (4, 2, 3)
+    assert bits(lower[2, 1]) == bits(model.bounds(np.ones(3), np.ones(2), 0.2)[0])
+
+
+@pytest.mark.parametrize(("x", "u"), [((2,), (1,)), ((3,), (2,)), ((5, 3), (5,)), ((), (1,))])
+def test_wrong_shapes_are_said(x: tuple[int, ...], u: tuple[int, ...]) -> None:
+    model = random_model(np.random.default_rng(0), 3, 1)
+    with pytest.raises(ModelError, match="they must end in 3 and 1"):
+        model.bounds(np.ones(x), np.ones(u), 0.1)
+
+
+# --- discrepancies (4)(5) and the nominal model ---------------------------------------------------------------
+
+
+def naive_discrepancy(model: UncertainLTI, transient: Transient, W: np.ndarray) -> tuple[float, list[float]]:
+    """(4)(5) as METHOD section 3 writes them, sample after sample."""
+    point, n = model.operating_point, model.n
+    total, largest = 0.0, [0.0] * n
+    free: np.ndarray | None = None
+    for k, dt in enumerate(transient.dt):
+        recorded = (transient.x[k] - point.x_s) / point.X
+        after = (transient.x[k + 1] - point.x_s) / point.X
+        u = (transient.u[k] - point.u_s) / point.U
+        if not transient.usable[k]:
+            free = None
+            continue
+        start = recorded if free is None else free
+        free = start + dt * (model.A @ start + model.B @ u + model.c)
+        weights = np.diag(W) if W.ndim == 1 else np.diag(W[k]) if W.ndim == 2 else W[k]
+        error = free - after
+        total += float(error @ weights @ error)
+        for i in range(n):
+            largest[i] = max(largest[i], math.sqrt(weights[i, i]) * abs(error[i]))
+    return total, largest
+
+
+@given(seeds, st.tuples(st.integers(1, 4), st.integers(0, 3)), st.integers(0, 3), st.sampled_from([0.0, 0.1]))
+def test_discrepancies_are_those_of_a_plain_loop(seed: int, size: tuple[int, int], kind: int, broken: float) -> None:
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, *size, size=0.3)
+    n, m = size
+    steps = rng.choice([1, 1, 1, 1, 2, 9], 30)
+    x, u = rng.normal(size=(31, n)), rng.normal(size=(31, m))
+    x[rng.uniform(size=x.shape) < broken] = NAN
+    transient = Transient(np.concatenate([[0], np.cumsum(steps)]) * 10_000_000, x, u, max_gap=0.05)
+    root = rng.normal(size=(30, n, n))
+    W = [np.ones(n), rng.uniform(0.1, 2, n), rng.uniform(0.1, 2, (30, n)), root @ np.swapaxes(root, 1, 2)][kind]
+    wanted, largest = naive_discrepancy(model, transient, W)
+    got = model.discrepancy(transient, None if kind == 0 else W)
+    assert got[0] == pytest.approx(wanted, rel=1e-9)
+    np.testing.assert_allclose(got[1], largest, rtol=1e-9)
+
+
+def test_a_transient_of_the_nominal_model_has_no_discrepancy() -> None:
+    model = leibov2006()
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(101, 4))
+    x = model.simulate(np.zeros(5), u[:-1], 0.025)
+    transient = Transient(25_000_000 * np.arange(101), x, u)
+    total, largest = model.discrepancy(transient)
+    assert total < 1e-20 and (largest < 1e-12).all()
+
+
+def test_weights_of_another_shape_are_refused() -> None:
+    transient = Transient([0.0, 1.0, 2.0], np.zeros((3, 2)), np.zeros((3, 1)))
+    with pytest.raises(ModelError, match=r"W has shape \(3,\); it must be \(2,\), \(2, 2\) or \(2, 2, 2\)"):
+        random_model(np.random.default_rng(0), 2, 1).discrepancy(transient, np.ones(3))
+
+
+def test_the_published_eigenvalues_are_the_models() -> None:
+    model = leibov2006()
+    wanted = [-1.60, -2.00, -14.34, -15.59 - 17.00j, -15.59 + 17.00j]
+    np.testing.assert_allclose(model.eigenvalues(), wanted, atol=0.005)
+    assert model.spectral_radius(0.025) == pytest.approx(np.abs(1 + 0.025 * model.eigenvalues()).max(), rel=1e-12)
+    assert model.spectral_radius(0.025) < 1 < model.spectral_radius(0.2)
+    with pytest.raises(ModelError, match="the model has no dt_median; give dt"):
+        model.spectral_radius()
+
+
+# --- what a model may be -------------------------------------------------------------------------------------
+
+ONE = np.ones((1, 1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (((1.0), ONE, ONE, ONE), r"A has shape \(\); it must be square"),
+        ((np.ones((1, 2)), ONE, ONE, ONE), "A has shape"),
+        ((np.ones((0, 0)), ONE, ONE, ONE), "A has shape"),
+        ((np.ones((1, 1, 1)), ONE, ONE, ONE), "A has shape"),
+        ((ONE, np.ones((2, 1)), ONE, ONE), r"B has shape \(2, 1\); it must have 1 rows"),
+        ((ONE, ONE, np.ones((2, 2)), ONE), "field 'dA' has shape"),
+        ((ONE, ONE, ONE, np.ones((1, 2))), "field 'dB' has shape"),
+        ((ONE, np.ones((1, 0)), ONE, ONE), "field 'dB' has shape"),
+        ((ONE, ONE, -ONE, ONE), "field 'dA' holds a negative half-width"),
+        ((ONE, ONE, ONE, -ONE), "field 'dB' holds a negative half-width"),
+        ((ONE, ONE, ONE, ONE, [0.0], [-1.0]), "field 'dc' holds a negative half-width"),
+        ((ONE, ONE, ONE, ONE, [0.0], [0.0], [-1e-300]), "field 'v' holds a negative half-width"),
+        ((ONE, ONE, ONE, ONE, [0.0, 1.0]), "field 'c' has shape"),
+        ((ONE * NAN, ONE, ONE, ONE), "field 'A' holds a number that is not finite"),
+        ((ONE, ONE * INF, ONE, ONE), "field 'B' holds a number that is not finite"),
+        (([["1"]], ONE, ONE, ONE), "field 'A' is not an array of numbers"),
+        (([[True]], ONE, ONE, ONE), "field 'A' is not an array of numbers"),
+        (([[1.0], [1.0, 2.0]], ONE, ONE, ONE), "field 'A' is not an array of numbers"),
+        (([[10**400]], ONE, ONE, ONE), "field 'A' is not an array of numbers"),
+    ],
+)
+def test_matrices_that_are_no_model_are_refused(arguments: Any, words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        UncertainLTI(*arguments)
+
+
+def test_names_must_be_as_many_as_rows_and_columns() -> None:
+    signals = SignalMap((Signal("a", "", "a"), Signal("b", "", "b")))
+    with pytest.raises(ModelError, match="2 states and 0 controls are named for A"):
+        UncertainLTI(ONE, ONE, ONE, ONE, signals=signals)
+
+
+def test_a_model_is_not_changed_behind_its_back() -> None:
+    A = np.zeros((1, 1))
+    model = UncertainLTI(A, ONE, ONE, ONE)
+    A[0, 0] = 7.0
+    assert model.A[0, 0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        model.A[0, 0] = 7.0
+    assert model.with_(v=[2.0]).v.tolist() == [2.0] and model.v.tolist() == [0.0]
+
+
+@pytest.mark.parametrize("rule", [(0, 1, 1.0), (2, 1, 1.0), (1, 0, 1.0), (1, 10**400, 1.0), (1.5, 2, 1.0), (1, 1, 0.0)])
+def test_an_alarm_rule_out_of_range_is_refused(rule: tuple[Any, ...]) -> None:
+    with pytest.raises(ModelError, match="^alarm: "):
+        Alarm(*rule)
+
+
+# --- the file ------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def models(draw: st.DrawFn) -> UncertainLTI:
+    """Any model that can be saved, with everything a file holds."""
+    rng = np.random.default_rng(draw(seeds))
+    n, m = draw(st.tuples(st.integers(1, 3), st.integers(0, 2)))
+    model = random_model(rng, n, m, additive=draw(st.booleans()))
+    name = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
+    names = draw(st.lists(name, min_size=n + m, max_size=n + m, unique=True))
+    number = st.floats(allow_nan=False, allow_infinity=False)
+    positive = st.floats(1e-300, 1e300)
+    given = [
+        Signal(
+            names[i],
+            "/x" if i < n else "/u",
+            f"d[{i}]",
+            draw(number),
+            draw(positive),
+            draw(name),
+            "pkg/msg/Type",
+            None if i < n else draw(st.none() | st.floats(0, 1e9)),
+            0 if i < n else draw(st.integers(0, 5)),
+        )
+        for i in range(n + m)
+    ]
+    signals = SignalMap(
+        tuple(given[:n]),
+        tuple(given[n:]),
+        clock="/x",
+        max_gap=draw(positive),
+        min_step=draw(st.floats(0, 1)),
+        max_skew=draw(st.none() | positive),
+        time={"/x": "header"} | ({"/u": "log"} if m else {}),
+    )
+    sampling = Sampling(
+        "/x", "pkg/msg/Type", signals.time, 0.1, 0.05, 0.2, signals.max_gap, signals.min_step, signals.max_skew
+    )
+    box = [draw(hnp.arrays(float, k, elements=number)) for k in (n, n, m, m)]
+    if draw(st.booleans()):
+        box[0][0] = -INF
+    return model.with_(
+        A=draw(hnp.arrays(float, (n, n), elements=number)),
+        signals=signals,
+        sampling=sampling,
+        domain=draw(st.sampled_from([Domain(*box), None])),
+        alarm=Alarm(2, draw(st.integers(2, 9)), draw(positive)),
+        fit={"criterion": "qp", "numbers": [1, 2.5, None], "inner": {"a": "ä"}},
+        validation={"inside": draw(number)},
+    )
+
+
+@given(models())
+def test_a_saved_model_is_the_same_to_the_last_bit(
+    tmp_path_factory: pytest.TempPathFactory, model: UncertainLTI
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.model.json"
+    model.save(path)
+    loaded = UncertainLTI.load(path)
+    for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+        assert bits(getattr(loaded, name)) == bits(getattr(model, name))
+    for name in ("x_min", "x_max", "u_min", "u_max"):
+        assert bits(getattr(loaded.domain, name)) == bits(getattr(model.domain, name))
+    for name in ("sampling", "alarm", "fit", "validation"):
+        assert getattr(loaded, name) == getattr(model, name)
+    assert loaded.signals.signals == model.signals.signals
+    assert (loaded.signals.clock, loaded.signals.max_gap, loaded.signals.max_skew, dict(loaded.signals.time)) == (
+        model.signals.clock,
+        model.signals.max_gap,
+        model.signals.max_skew,
+        dict(model.signals.time),
+    )
+    assert loaded.to_dict() == model.to_dict()
+
+
+def test_a_model_fitted_to_arrays_has_a_file_too(tmp_path: Path) -> None:
+    model = UncertainLTI(np.eye(2), np.ones((2, 0)), np.eye(2), np.ones((2, 0)))
+    model.save(tmp_path / "m.json")
+    loaded = UncertainLTI.load(tmp_path / "m.json")
+    assert (loaded.n, loaded.m, loaded.state_names) == (2, 0, ("x1", "x2"))
+    assert loaded.bounds(np.ones(2), np.ones(0), 0.1)[0].shape == (2,)
+    assert not loaded.domain.outside(np.full(2, 1e300), np.ones(0))
+
+
+def test_numbers_that_json_lacks_become_null_and_the_rest_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "m.json"
+    model = UncertainLTI(ONE, ONE, ONE, ONE, fit={"a": NAN, "b": np.arange(2), "c": np.float64(INF), "d": np.bool_(1)})
+    model.save(path)
+    assert UncertainLTI.load(path).fit == {"a": None, "b": [0, 1], "c": None, "d": True}
+    whole = path.read_bytes()
+    for bad in ({"a": object()}, {"a": "\ud800"}, {"a": {1, 2}}):
+        with pytest.raises(ModelError, match="what JSON cannot"):
+            model.with_(fit=bad).save(path)
+        assert path.read_bytes() == whole and os.listdir(tmp_path) == ["m.json"]
+
+
+def base() -> dict[str, Any]:
+    """A whole, well-formed file of two states and one control."""
+    signals = [
+        {
+            "name": n,
+            "topic": t,
+            "type": "std_msgs/msg/Float64",
+            "field": "data",
+            "unit": "",
+            "steady": 0.5,
+            "scale": 2.0,
+        }
+        for n, t in (("a", "/a"), ("b", "/b"), ("u", "/u"))
+    ]
+    return {
+        "format": FORMAT,
+        "states": signals[:2],
+        "controls": [signals[2] | {"max_hold": 0.5, "delay": 1}],
+        "sampling": {
+            "clock": "/a",
+            "clock_type": "std_msgs/msg/Float64",
+            "time": {"/a": "header", "/b": "log", "/u": "log"},
+            "dt_median": 0.1,
+            "dt_min": 0.05,
+            "dt_max": 0.2,
+            "max_gap": 0.25,
+            "min_step": 0.0,
+            "max_skew": 0.1,
+        },
+        "A": [[-1.0, 0.5], [0.0, -2.0]],
+        "B": [[1.0], [2.0]],
+        "dA": [[0.1, 0.2], [0.0, 0.3]],
+        "dB": [[0.1], [0.0]],
+        "c": [0.0, 0.1],
+        "dc": [0.0, 0.1],
+        "v": [0.0, 0.1],
+        "domain": {"x_min": [-1.0, -1.0], "x_max": [1.0, None], "u_min": [-1.0], "u_max": [1.0]},
+        "alarm": {"violations": 2, "window": 3, "margin": 1.5},
+        "fit": {"criterion": "qp"},
+        "validation": {},
+    }
+
+
+def write(folder: Path, data: Any) -> Path:
+    path = folder / "damaged.model.json"
+    path.write_text(json.dumps(data))
+    return path
+
+
+def test_the_base_of_the_damaged_files_is_whole(tmp_path: Path) -> None:
+    model = UncertainLTI.load(write(tmp_path, base()))
+    assert (model.n, model.m, model.alarm.window, model.sampling.max_skew) == (2, 1, 3, 0.1)
+    assert model.to_dict() == base()
+
+
+def put(place: str, value: Any) -> Any:
+    """The base with one thing at `a.b.0` replaced; `...` takes it away."""
+    data = base()
+    inner: Any = data
+    *way, last = [int(p) if p.isdigit() else p for p in place.split(".")]
+    for step in way:
+        inner = inner[step]
+    if value is ...:
+        del inner[last]
+    else:
+        inner[last] = value
+    return data
+
+
+MATRICES = {"A": (2, 2), "B": (2, 1), "dA": (2, 2), "dB": (2, 1), "c": (2,), "dc": (2,), "v": (2,)}
+BAD_MATRICES = [
+    (name, value)
+    for name, shape in MATRICES.items()
+    for value in (
+        np.zeros((3, *shape[1:])).tolist(), np.zeros((*shape, 1)).tolist(), [], 1.0, "text", None, True, {}, [[]],
+        np.full(shape, NAN).tolist(), np.full(shape, INF).tolist(), np.full(shape, "1").tolist(),
+        np.full(shape, True).tolist(), np.full(shape, None).tolist(), np.full(shape, 10**400).tolist(),
+        [[1.0, 2.0], [3.0]],
+    )
+    if value is not None or name not in ("c", "dc", "v")  # null there reads as zero
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), BAD_MATRICES)
+def test_a_matrix_that_is_none_is_refused_by_name(name: str, value: Any, tmp_path: Path) -> None:
+    path = write(tmp_path, put(name, value))
+    with pytest.raises(ModelError, match=rf"field '{name}' |^\S+: {name} has shape") as caught:
+        UncertainLTI.load(path)
+    assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ("format", ..., "no field 'format'"),
+        ("format", "uncertain-lti/2", "format is 'uncertain-lti/2', and this version reads 'uncertain-lti/1'"),
+        ("format", 1, "format is 1"),
+        ("format", [[]], "format is"),
+        *[
+            (name, ..., f"field '{name}' is missing")
+            for name in ("states", "controls", "sampling", "A", "B", "dA", "dB")
+        ],
+        ("A_", [[1.0]], "unknown field 'A_'"),
+        ("dA.0.0", -1e-9, "field 'dA' holds a negative half-width"),
+        ("dB.1.0", -0.1, "field 'dB' holds a negative half-width"),
+        ("dc.0", -0.1, "field 'dc' holds a negative half-width"),
+        ("v.0", -0.1, "field 'v' holds a negative half-width"),
+        ("states", [], "'states' is empty"),
+        ("states", {}, "states: a list is wanted here"),
+        ("states.0", 5, r"states\[0\]: a mapping is wanted here"),
+        ("states.0.name", ..., r"states\[0\]: 'name' is None"),
+        ("states.0.name", "b", "signal 'b' is listed twice"),
+        ("states.0.colour", "red", r"states\[0\]: unknown key 'colour'"),
+        ("states.0.scale", 0, "signal 'a': scale is 0"),
+        ("states.0.scale", -2.0, "signal 'a': scale is -2.0"),
+        ("states.0.scale", INF, "signal 'a': scale is inf"),
+        ("states.0.scale", NAN, "scale is nan"),
+        ("states.0.scale", "auto", "scale of 'a' is auto; a model file holds numbers"),
+        ("states.0.scale", True, "scale is True"),
+        ("states.0.steady", "auto", "steady of 'a' is auto"),
+        ("states.0.steady", INF, "signal 'a': steady is inf"),
+        ("states.0.steady", 10**400, "steady is 1000"),
+        ("states.0.field", "data[", "signal 'a': field 'data\\[' is not a field path"),
+        ("states.0.max_hold", 1.0, "state 'a' has max_hold or delay"),
+        ("controls.0.max_hold", -1, "signal 'u': max_hold is -1"),
+        ("controls.0.max_hold", INF, "signal 'u': max_hold is inf"),
+        ("controls.0.delay", -1, "signal 'u': delay is -1"),
+        ("controls.0.delay", 1.0, "delay is 1.0; write a whole number"),
+        ("controls.0.delay", 10**30, "signal 'u': delay is 1000"),
+        ("sampling", [], "field 'sampling' is not an object"),
+        ("sampling.maxgap", 1.0, "unknown field 'sampling.maxgap'; known are clock"),
+        ("sampling.clock", "/u", "clock is /u, which carries no state"),
+        ("sampling.clock", 7, "field 'sampling.clock' is 7; it must be a text"),
+        ("sampling.time", {"/a": "wall"}, r"sampling.time\[/a\] is 'wall'; it must be header or log"),
+        ("sampling.time", {"/z": "log"}, "'topics' names /z, which carries no signal"),
+        ("sampling.time", [], "field 'sampling.time' is not an object"),
+        ("sampling.max_gap", 0, "field 'sampling.max_gap' is 0; it must be a positive number"),
+        ("sampling.max_gap", "1", "field 'sampling.max_gap' is '1'"),
+        ("sampling.max_gap", NAN, "field 'sampling.max_gap' is nan"),
+        ("sampling.min_step", -1, "field 'sampling.min_step' is -1"),
+        ("sampling.dt_median", 10**400, "field 'sampling.dt_median' is 1000"),
+        ("sampling.max_skew", INF, "field 'sampling.max_skew' is inf"),
+        ("domain", [], "field 'domain' is not an object"),
+        ("domain.x_min", ..., "field 'domain.x_min' is missing"),
+        ("domain.x_min", [0.0], "field 'domain.x_min' must be a list of 2 numbers"),
+        ("domain.x_min", 0.0, "field 'domain.x_min' must be a list"),
+        ("domain.u_max", ["1"], "field 'domain.u_max' is not an array of numbers"),
+        ("domain.u_max", [NAN], "field 'domain.u_max' holds a number that is not finite"),
+        ("domain.z_min", [], "unknown field 'domain.z_min'"),
+        ("alarm", None, "field 'alarm' is not an object"),
+        ("alarm.violations", 4, "alarm: violations is 4 of window 3"),
+        ("alarm.violations", 0, "alarm: violations is 0"),
+        ("alarm.violations", True, "alarm.violations is True; it must be a whole number"),
+        ("alarm.violations", None, "alarm.violations is None"),
+        ("alarm.window", 3.5, "alarm.window is 3.5"),
+        ("alarm.window", 10**400, "alarm: violations is 2 of window 1000"),
+        ("alarm.margin", 0, "field 'alarm.margin' is 0"),
+        ("alarm.margin", None, "field 'alarm.margin' is None"),
+        ("alarm.margin", 10**400, "field 'alarm.margin' is 1000"),
+        ("alarm.latch", True, "unknown field 'alarm.latch'"),
+        ("fit", [], "field 'fit' is not an object"),
+        ("validation", "good", "field 'validation' is not an object"),
+    ],
+)
+def test_a_damaged_file_is_refused_by_file_and_field(place: str, value: Any, words: str, tmp_path: Path) -> None:
+    path = write(tmp_path, put(place, value))
+    with pytest.raises(ModelError, match=words) as caught:
+        UncertainLTI.load(path)
+    sentence = str(caught.value)
+    assert sentence.startswith(str(path)) and len(sentence.splitlines()) == 1 and len(sentence) < 500
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is not JSON"),
+        (b"\x00\x01\xff\xfe", "is not JSON"),
+        (b"[" * 200_000, "is not JSON"),
+        (b'{"format": ' + b"[" * 900 + b"]" * 900 + b"}", "is not JSON|format is"),
+        (json.dumps(base()).encode()[:-40], "is not JSON"),
+        (b'{"format": "uncertain-lti/1", "format": "uncertain-lti/1"}', "the key 'format' stands twice in one object"),
+        (b"7", "no field 'format'"),
+        (b"[]", "no field 'format'"),
+        (b"null", "no field 'format'"),
+        (b'"uncertain-lti/1"', "no field 'format'"),
+        (b"\xef\xbb\xbf{}", "is not JSON"),
+        (b"9" * 10_000, "is not JSON"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "is not JSON"),
+    ],
+)
+def test_a_file_that_is_no_model_is_refused(content: bytes, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "no.model.json"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=words) as caught:
+        UncertainLTI.load(path)
+    assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["A", "v", "states", "sampling", "domain", "alarm", "fit"])
+def test_nesting_ends_in_a_sentence(name: str, tmp_path: Path) -> None:
+    for depth in (50, 300, 480, 900, 3000):
+        text = json.dumps(put(name, "HERE")).replace('"HERE"', "[" * depth + "]" * depth)
+        path = tmp_path / "deep.model.json"
+        path.write_text(text)
+        with pytest.raises(ModelError) as caught:
+            UncertainLTI.load(path)
+        assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 500
+
+
+def test_a_file_that_is_not_there_or_far_too_large(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="there is no such model file; write one with `uncertain-lti fit`"):
+        UncertainLTI.load(tmp_path / "none.model.json")
+    with pytest.raises(ModelError, match="cannot be read: Is a directory"):
+        UncertainLTI.load(tmp_path)
+    with open(tmp_path / "large.model.json", "wb") as stream:
+        stream.truncate(1 << 40)
+    with pytest.raises(ModelError, match="larger than 64 MiB, so not a model file"):
+        UncertainLTI.load(tmp_path / "large.model.json")
+
+
+scalars = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["auto", "header", "/a", "x", "", "data"])
+)
+anything = st.recursive(
+    scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+)
+
+
+@st.composite
+def damaged(draw: st.DrawFn) -> Any:
+    data = copy.deepcopy(base())
+    for _ in range(draw(st.integers(1, 3))):
+        place: Any = data
+        while keys := list(place) if isinstance(place, dict) else list(range(len(place))):
+            key = draw(st.sampled_from(keys))
+            if isinstance(place[key], (dict, list)) and draw(st.integers(0, 2)):
+                place = place[key]
+                continue
+            if draw(st.integers(0, 3)):
+                place[key] = draw(anything)
+            else:
+                del place[key]
+            break
+    return data
+
+
+@settings(max_examples=300)
+@given(damaged())
+def test_a_damaged_file_is_a_model_or_an_error(tmp_path_factory: pytest.TempPathFactory, data: Any) -> None:
+    """Never another exception; and what loads can be saved, loaded again and used."""
+    path = write(tmp_path_factory.getbasetemp(), data)
+    try:
+        model = UncertainLTI.load(path)
+    except UncertainLTIError as error:
+        assert str(error).startswith(str(path)) and len(str(error).splitlines()) == 1
+        return
+    model.save(path)
+    again = UncertainLTI.load(path)
+    with np.errstate(all="ignore"):
+        for one, other in zip(model.bounds([0.1, 0.2], [0.3], 0.1), again.bounds([0.1, 0.2], [0.3], 0.1), strict=True):
+            assert bits(one) == bits(other)
+
+
+@given(st.integers(0, 2000), st.integers(0, 255))
+def test_a_flipped_byte_is_a_model_or_an_error(tmp_path_factory: pytest.TempPathFactory, at: int, value: int) -> None:
+    content = bytearray(json.dumps(base()).encode())
+    content[at % len(content)] = value
+    path = tmp_path_factory.getbasetemp() / "flipped.model.json"
+    path.write_bytes(content)
+    try:
+        UncertainLTI.load(path)
+    except UncertainLTIError as error:
+        assert str(error).startswith(str(path)) and len(str(error).splitlines()) == 1
+
+
+# --- writing is atomic ---------------------------------------------------------------------------------------
+
+
+def test_a_reader_never_sees_half_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "m.json"
+    rng = np.random.default_rng(0)
+    models = [random_model(rng, 8, 8, size=s) for s in (1.0, 2.0)]
+    models[0].save(path)
+    stop = threading.Event()
+
+    def keep_writing() -> None:
+        while not stop.is_set():
+            for model in models:
+                model.save(path)
+
+    writer = threading.Thread(target=keep_writing)
+    writer.start()
+    try:
+        seen = {bits(UncertainLTI.load(path).A) for _ in range(200)}
+    finally:
+        stop.set()
+        writer.join()
+    assert seen <= {bits(model.A) for model in models}
+    assert os.listdir(tmp_path) == ["m.json"]
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.json"
+    model = random_model(np.random.default_rng(0), 2, 1)
+    model.save(path)
+    whole = path.read_bytes()
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(ModelError, match="cannot be written: No space left on device; choose another place"):
+            model.with_(v=[1.0, 1.0]).save(path)
+    assert path.read_bytes() == whole and os.listdir(tmp_path) == ["m.json"]
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(ModelError, match="folder: cannot be written"):
+        model.save(tmp_path / "folder")
+    with pytest.raises(ModelError, match="cannot be written: No such file or directory"):
+        model.save(tmp_path / "none" / "m.json")
+    assert sorted(os.listdir(tmp_path)) == ["folder", "m.json"]
+
+
+def test_a_saved_file_can_be_read_by_those_the_umask_lets(tmp_path: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        random_model(np.random.default_rng(0), 1, 0).save(tmp_path / "m.json")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "m.json").stat().st_mode & 0o777 == 0o644
