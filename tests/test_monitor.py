@@ -1,16 +1,18 @@
 """EnvelopeMonitor: one sample at a time or a whole transient, the same bits; and which verdicts count."""
 
+import math
+from collections import deque
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.errors import ModelError
 from uncertain_lti.model import Alarm, Domain
-from uncertain_lti.sampler import Status, Step
+from uncertain_lti.sampler import Sampler, Status, Step
 from uncertain_lti.signals import Signal
 
 
@@ -111,3 +113,212 @@ def test_masks_are_held_against_the_states() -> None:
         EnvelopeMonitor(model, masked=["x2"])
     with pytest.raises(ModelError, match="every state of the model is masked"):
         EnvelopeMonitor(model, masked=["x0", "x1"])
+
+
+# --- a stream through the Sampler and the transient of the same messages -------------------------------------
+
+TICK = 10_000_000  # ns
+
+
+@st.composite
+def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
+    """A run with gaps, resets, dropped messages and NaN: as a transient, and as what the Sampler makes of it."""
+    n, m = draw(st.integers(1, 3)), draw(st.integers(0, 2))
+    steps = draw(st.lists(st.sampled_from([1, 1, 1, 2, 0, 9, -1, -30]), max_size=40))
+    t = 1000 * TICK + TICK * np.cumsum(np.array([0, *steps], dtype=np.int64))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    z = rng.normal(size=(len(t), n + m))
+    z[rng.uniform(size=z.shape) < draw(st.sampled_from([0.0, 0.05]))] = draw(st.sampled_from([math.nan, math.inf]))
+    window = draw(st.integers(1, 6))
+    box = Domain(np.full(n, -1.0), np.full(n, 1.0), np.full(m, -1.0), np.full(m, 1.0))
+    signals = SignalMap(
+        tuple(Signal(f"x{i}", "/c", f"x{i}", float(rng.normal()), float(rng.uniform(0.5, 2))) for i in range(n)),
+        tuple(Signal(f"u{j}", "/c", f"u{j}", float(rng.normal()), float(rng.uniform(0.5, 2))) for j in range(m)),
+        clock="/c",
+        max_gap=0.05,
+        time={"/c": "header"},
+    )
+    model = UncertainLTI(
+        rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.uniform(0, 30, (n, n)), rng.uniform(0, 30, (n, m)),
+        rng.normal(size=n), rng.uniform(0, 20, n), rng.uniform(0, 1, n),
+        signals=signals, domain=draw(st.sampled_from([box, None])),
+        alarm=Alarm(draw(st.integers(1, window)), window, draw(st.sampled_from([1.0, 0.5, 3.0]))),
+    )  # fmt: skip
+    sampler = Sampler(signals)
+    pushed = [s for k in range(len(t)) for s in sampler.push("/c", int(t[k]), int(t[k]), z[k].tolist())]
+    return model, Transient(t, z[:, :n], z[:, n:], signals=signals, max_gap=0.05), pushed
+
+
+@settings(max_examples=300)
+@given(streams(), st.booleans())
+def test_a_stream_gives_the_bits_of_its_transient(case: tuple[UncertainLTI, Transient, list[Step]], mask: bool) -> None:
+    """Flags, bounds, utilisation, domain and alarm, through gaps, resets, dropped messages and missing values."""
+    model, transient, steps = case
+    masked = ("x0",) if mask and model.n > 1 else ()
+    monitor = EnvelopeMonitor(model, masked=masked)
+    whole = EnvelopeMonitor(model, masked=masked).check(transient)
+    row = 0
+    for step in steps:
+        verdict = monitor.judge(step)
+        if step.status.dropped:
+            assert not verdict.judged and np.isnan(verdict.flags).all()
+            continue
+        for name in ("flags", "lower", "upper", "utilisation"):
+            assert getattr(verdict, name).tobytes() == getattr(whole, name)[row].tobytes(), name
+        assert (verdict.judged, verdict.outside_domain) == (whole.judged[row], whole.outside_domain[row])
+        assert verdict.alarm == whole.alarm[row]
+        assert bool((verdict.flags == 1.0).any()) == whole.violated[row]
+        assert verdict.state.tobytes() == transient.x[row].tobytes() and verdict.t_ns == transient.t_ns[row]
+        row += 1
+    assert row == len(transient)
+
+
+@settings(max_examples=200)
+@given(streams())
+def test_verdicts_are_those_of_the_rules_worked_out_naively(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
+    model, transient, _ = case
+    verdicts = EnvelopeMonitor(model).check(transient)
+    point, rule = model.operating_point, model.alarm
+    recent: deque[bool] = deque(maxlen=rule.window)
+    alarm = False
+    for k, status in enumerate(transient.statuses()):
+        if status is Status.RESET:
+            recent.clear()
+            alarm = False
+        assert verdicts.judged[k] == (status is Status.OK)
+        if status is Status.OK:
+            x = (transient.x[k - 1] - point.x_s) / point.X
+            u = (transient.u[k - 1] - point.u_s) / point.U
+            after = (transient.x[k] - point.x_s) / point.X
+            lower, upper = model.bounds(x, u, transient.dt[k - 1], margin=rule.margin)
+            inside = [low <= value <= high for low, value, high in zip(lower, after, upper, strict=True)]
+            assert verdicts.flags[k].tolist() == [0.0 if i else 1.0 for i in inside]
+            z, box = [*x, *u], model.domain
+            ranges = zip([*box.x_min, *box.u_min], z, [*box.x_max, *box.u_max], strict=True)
+            assert verdicts.outside_domain[k] == (not all(low <= value <= high for low, value, high in ranges))
+            recent.append(not all(inside))
+            alarm = sum(recent) >= rule.violations
+        else:
+            assert np.isnan(verdicts.flags[k]).all() and np.isnan(verdicts.lower[k]).all()
+            assert not verdicts.outside_domain[k]
+        assert verdicts.alarm[k] == alarm
+
+
+def a_step(x: float, x_next: float, status: Status = Status.OK, dt: float = 1.0) -> Step:
+    return Step(status, 0, 0, dt, np.array([x]), np.empty(0), np.array([x_next]))
+
+
+def scalar(dA: float = 0.0, v: float = 0.0, **options: Any) -> UncertainLTI:
+    """x_next = x up to dA |x| dt + v."""
+    empty = np.empty((1, 0))
+    return UncertainLTI([[0.0]], empty, [[dA]], empty, v=[v], **options)
+
+
+@pytest.mark.parametrize(
+    ("x_next", "flag", "utilisation"),
+    [(1.0, 0, 0.0), (1.5, 0, 1.0), (0.5, 0, -1.0), (np.nextafter(1.5, 2), 1, 1.0), (0.25, 1, -1.5), (2.0, 1, 2.0)],
+)
+def test_a_sample_on_its_bound_is_contained(x_next: float, flag: int, utilisation: float) -> None:
+    verdict = EnvelopeMonitor(scalar(dA=0.5)).judge(a_step(1.0, x_next))
+    assert (verdict.flags[0], verdict.lower[0], verdict.upper[0]) == (flag, 0.5, 1.5)
+    assert verdict.utilisation[0] == pytest.approx(utilisation, rel=1e-12)
+    assert verdict.alarm == bool(flag)
+
+
+def test_where_the_bounds_have_no_width_utilisation_is_zero_or_infinite() -> None:
+    monitor = EnvelopeMonitor(scalar())
+    assert [monitor.judge(a_step(1.0, value)).utilisation[0] for value in (1.0, 2.0, -2.0)] == [0, math.inf, -math.inf]
+    assert [monitor.judge(a_step(1.0, value)).flags[0] for value in (1.0, 2.0, -2.0)] == [0, 1, 1]
+
+
+def test_the_margin_widens_what_is_judged_and_not_the_utilisation() -> None:
+    verdict = EnvelopeMonitor(scalar(v=1.0), margin=3.0).judge(a_step(0.0, 2.0))
+    assert (verdict.flags[0], verdict.lower[0], verdict.upper[0], verdict.utilisation[0]) == (0, -3.0, 3.0, 2.0)
+
+
+def test_silence_is_never_contained_and_ends_no_alarm() -> None:
+    monitor = EnvelopeMonitor(scalar(v=1.0))
+    assert monitor.judge(a_step(0.0, 5.0)).alarm
+    for status in (Status.MISSING, Status.GAP, Status.EQUAL, Status.SHORT, Status.LATE, Status.UNSTAMPED):
+        verdict = monitor.judge(a_step(0.0, 0.0, status))
+        assert verdict.alarm and not verdict.judged
+        assert all(np.isnan(part).all() for part in (verdict.flags, verdict.lower, verdict.upper, verdict.utilisation))
+    assert not monitor.judge(a_step(0.0, 0.0, Status.RESET)).alarm
+    assert not monitor.judge(a_step(0.0, 0.5)).alarm
+
+
+def test_outside_the_fitted_domain_is_said_and_suppresses_nothing() -> None:
+    one, none = np.ones(1), np.empty(0)
+    monitor = EnvelopeMonitor(scalar(v=1.0, domain=Domain(-one, one, none, none)))
+    for x, outside in ((1.0, False), (-1.0, False), (1.5, True), (-1.5, True)):
+        verdict = monitor.judge(a_step(x, x + 5.0))
+        assert verdict.outside_domain == outside and verdict.flags[0] == 1 and verdict.alarm
+
+
+def test_verdicts_do_not_share_what_they_hold() -> None:
+    monitor = EnvelopeMonitor(scalar(v=1.0))
+    first, second = (monitor.judge(a_step(0.0, 0.0, Status.GAP)) for _ in range(2))
+    first.flags[:] = 0.0
+    assert np.isnan(second.flags).all() and np.isnan(monitor.judge(a_step(0.0, 0.0, Status.GAP)).flags).all()
+    first, second = (monitor.judge(a_step(0.0, value)) for value in (0.5, 5.0))
+    assert (first.flags[0], second.flags[0]) == (0.0, 1.0)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(0, 3), st.sampled_from([1.0, 2.5]))
+def test_predicted_bounds_are_those_that_will_be_judged(seed: int, n: int, m: int, margin: float) -> None:
+    model = a_model(n, m, seed)
+    rng = np.random.default_rng(seed)
+    x, u, after, dt = rng.normal(size=n), rng.normal(size=m), rng.normal(size=n), 0.02
+    monitor = EnvelopeMonitor(model, margin=margin)
+    lower, upper = monitor.predict(x, u, dt)
+    verdict = monitor.judge(Step(Status.OK, 0, 0, dt, x, u, after))
+    assert lower.tobytes() == verdict.lower.tobytes() and upper.tobytes() == verdict.upper.tobytes()
+
+
+def test_bounds_are_in_recorded_units() -> None:
+    signals = SignalMap((Signal("x", "", "x", steady=10.0, scale=2.0),))
+    monitor = EnvelopeMonitor(scalar(v=0.5, signals=signals))
+    verdict = monitor.judge(a_step(12.0, 12.5))
+    assert (verdict.lower[0], verdict.upper[0], verdict.state[0]) == (11.0, 13.0, 12.5)
+    assert verdict.utilisation[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"violations": 2}, "violations is 2 of window 1"),
+        ({"violations": 0}, "violations is 0"),
+        ({"window": 0}, "violations is 1 of window 0"),
+        ({"margin": 0.0}, "margin is 0.0"),
+        ({"margin": math.nan}, "margin is nan"),
+        ({"window": 10**9}, "window <= 1000000"),
+    ],
+)
+def test_an_alarm_rule_out_of_range_is_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        EnvelopeMonitor(scalar(), **options)
+
+
+def test_what_is_given_replaces_the_rule_of_the_model() -> None:
+    model = scalar(alarm=Alarm(2, 5, 1.5))
+    assert EnvelopeMonitor(model).rule == Alarm(2, 5, 1.5)
+    assert EnvelopeMonitor(model, violations=3, margin=1.0).rule == Alarm(3, 5, 1.0)
+
+
+def test_a_transient_of_other_size_is_refused() -> None:
+    transient = Transient([0.0, 1.0], np.zeros((2, 2)), np.zeros((2, 1)), name="run")
+    with pytest.raises(ModelError, match="run: 2 states and 1 controls, and the model has 1 and 0"):
+        EnvelopeMonitor(scalar()).check(transient)
+
+
+def test_a_transient_without_samples_has_no_verdict() -> None:
+    for count in (0, 1):
+        verdicts = EnvelopeMonitor(scalar()).check(Transient(np.zeros(count), np.zeros((count, 1)), []))
+        assert len(verdicts.judged) == count and not verdicts.judged.any() and not verdicts.alarm.any()
+
+
+def test_each_check_starts_from_a_cleared_alarm() -> None:
+    monitor = EnvelopeMonitor(scalar(v=1.0))
+    transient = Transient([0.0, 1.0, 2.0], [0.0, 5.0, 5.0], [])
+    first, second = monitor.check(transient), monitor.check(transient)
+    assert first.alarm.tolist() == second.alarm.tolist() == [False, True, False]
