@@ -188,7 +188,7 @@ class EnvelopeMonitor:
         if armed:
             counted = inside if self._all_count else inside | self._uncounted
             self._count(not counted.all())
-        flags: Array = 1.0 - inside
+        flags = np.subtract(1.0, inside, dtype=np.float64)
         return Verdict(step, flags, outside, self.alarm, _Judgement(point, centre, half, lower, upper, x_next))
 
     def _count(self, violated: bool) -> None:
