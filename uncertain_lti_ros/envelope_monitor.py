@@ -92,6 +92,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._failures, self._failed_how, self._failures_told = 0, "", 0
         self._failure_logged: dict[str, float] = {}  # where: when
         self._clock = self.get_clock()
+        self._simulated = self._clock.ros_time_is_active
         self._largest = round(self._real("largest_message") * _MIB)
         self._recent: Recent | None = None  # kept while snapshots can be asked for
         self._album: Album | None = None
@@ -258,6 +259,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         assert self.watch is not None
         result = super().on_activate(state)
         self.watch.restart(time.monotonic())
+        self._simulated = self._clock.ros_time_is_active
         self._subscribe()
         self.active = True
         for output in self._outputs.values():
@@ -352,9 +354,8 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.watch.failed()
 
     def _take(self, watch: Watch, topic: str, data: bytes) -> None:
-        clock = self._clock
         # The clock's own call makes three objects; without simulated time it says the same.
-        arrival = clock.now().nanoseconds if clock.ros_time_is_active else time.time_ns()
+        arrival = self._clock.now().nanoseconds if self._simulated else time.time_ns()
         now = time.monotonic()
         alarms, alarm = watch.alarms, watch.alarm
         verdicts, opened = watch.take(topic, arrival, data, now)
@@ -394,6 +395,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- heartbeat, graph, diagnostics ---
 
     def _on_tick(self) -> None:
+        self._simulated = self._clock.ros_time_is_active
         for task in (self._keep_beating, self._look_around, self._keep_reporting, self._keep_album):
             try:
                 task()
