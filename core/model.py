@@ -164,7 +164,7 @@ class UncertainLTI:
             )
         self.signals = signals
         self.operating_point = OperatingPoint.of(signals.states, signals.controls)
-        self.sampling = sampling or Sampling(time=dict(signals.time))
+        self.sampling = sampling or _sampling(signals)
         unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
         self.domain = domain or unbounded
         self.alarm = alarm or Alarm()
@@ -592,6 +592,19 @@ def _reduced(rows: Array) -> Array:
 
 def _accumulated(rows: Array) -> Array:
     return np.asarray(np.add.accumulate(rows, axis=0)[-1])
+
+
+def _sampling(signals: SignalMap) -> Sampling:
+    """What a signal map says of sampling."""
+    types = [s.type for s in signals.states if s.topic == signals.clock]
+    return Sampling(
+        clock=signals.clock or "",
+        clock_type=types[0] if types else "",
+        time=dict(signals.time),
+        max_gap=signals.max_gap,
+        min_step=signals.min_step,
+        max_skew=signals.max_skew,
+    )
 
 
 # --- reading and writing plain data -------------------------------------------------------------------------

@@ -236,7 +236,8 @@ def read_for_model(
     BagError
         The recording cannot be read, lacks a topic, or a topic has another type than in the fit.
     SignalError
-        The model names no topics (it was fitted to arrays).
+        The model names no topics (it was fitted to arrays) or does not say how they are sampled, or goes by stamps
+        that the recording lacks.
     """
     signals = model.signals
     if any(not s.topic for s in signals.signals):
@@ -251,7 +252,21 @@ def read_for_model(
                 f"{bag.path}: {topic} is {found}, and the model was fitted to {expected}; "
                 f"check a recording of the same topics"
             )
-    return sample(read_stream(bag, signals, progress), signals)
+    if signals.clock is None or signals.max_gap is None or any(t not in signals.time for t in signals.topics):
+        raise SignalError(
+            f"{signals.source}: it does not say clock, max_gap and time of every topic, so not how to cut samples; "
+            f"fit the model to recordings"
+        )
+    stream = read_stream(bag, signals, progress)
+    stamps = stream.stamp[stream.topic == signals.topics.index(signals.clock)]
+    if not len(stamps):
+        raise BagError(f"{bag.path}: {signals.clock} has no message; record it, or choose another recording")
+    if signals.time[signals.clock] == "header" and not (stamps > 0).any():
+        raise SignalError(
+            f"{bag.path}: no message of {signals.clock} has a stamp, and the model goes by them; fit it to such "
+            f"recordings, with time: log for that topic"
+        )
+    return sample(stream, signals)
 
 
 def _types(bags: Sequence[Bag], signals: SignalMap) -> Mapping[str, str]:

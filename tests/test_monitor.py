@@ -223,6 +223,8 @@ def test_a_sample_on_its_bound_is_contained(x_next: float, flag: int, utilisatio
     assert (verdict.flags[0], verdict.lower[0], verdict.upper[0]) == (flag, 0.5, 1.5)
     assert verdict.utilisation[0] == pytest.approx(utilisation, rel=1e-12)
     assert verdict.alarm == bool(flag)
+    whole = EnvelopeMonitor(scalar(dA=0.5)).check(Transient([0.0, 1.0], [1.0, x_next], []))
+    assert whole.flags[1].tolist() == verdict.flags.tolist()
 
 
 def test_where_the_bounds_have_no_width_utilisation_is_zero_or_infinite() -> None:

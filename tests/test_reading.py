@@ -1,0 +1,604 @@
+"""Recordings into transients: synthetic ones against the rules worked out naively, real ones against a plain reader."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_writer import (
+    JAZZY,
+    Layout,
+    Message,
+    Topic,
+    cdr,
+    float64,
+    header,
+    message,
+    metadata_yaml,
+    ramp,
+    write,
+    write_folder,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from test_sampler import Reference, Sent, cases
+
+from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.model import UncertainLTI
+from uncertain_lti.reading import read_for_model, read_transients, unused
+from uncertain_lti.sampler import Status
+from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.transient import Transient
+
+NAN = math.nan
+MS = 1_000_000  # ns
+JOINT_STATE, FLOAT64 = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64"
+
+
+def joint_state(stamp_ns: int, values: Sequence[float], names: Sequence[str] = ()) -> bytes:
+    empty = np.empty(0)
+    return cdr(
+        JOINT_STATE,
+        header=header(stamp_ns),
+        name=list(names),
+        position=np.array(values, dtype=float),
+        velocity=empty,
+        effort=empty,
+    )
+
+
+def save(
+    folder: Path,
+    topics: Mapping[str, str],
+    messages: Sequence[tuple[str, int, bytes]],
+    name: str = "run.mcap",
+    layout: Layout | None = None,
+) -> Path:
+    """A recording of (topic, log time, data)."""
+    channels = [Topic(topic, type_name) for topic, type_name in topics.items()]
+    return write(channels, [Message(t, at, data, at) for t, at, data in messages], layout or Layout()).save(
+        folder / name
+    )
+
+
+# --- synthetic recordings against the naive reference ---------------------------------------------------------
+
+
+def by_position(signals: SignalMap) -> SignalMap:
+    """The same map reading `position[column]` of a JointState per topic."""
+    found = []
+    for signal in signals.signals:
+        mine = [s.name for s in signals.signals if s.topic == signal.topic]
+        path = f"position[{mine.index(signal.name)}]"
+        field = f"unwrap({path})" if signal.field.startswith("unwrap") else path
+        found.append(replace(signal, field=field, type=JOINT_STATE))
+    n = len(signals.states)
+    return replace(signals, states=tuple(found[:n]), controls=tuple(found[n:]))
+
+
+def same(transient: Transient, reference: Reference) -> None:
+    """The transient holds what the reference says of every clock message, to the last bit."""
+    kept = [s for decided in reference.steps() for s in decided if not s.status.dropped]
+    assert transient.statuses() == [s.status for s in kept]
+    assert transient.t_ns.tolist() == [s.t_ns for s in kept]
+    np.testing.assert_array_equal(transient.x, np.reshape([s.x_next for s in kept], transient.x.shape))
+    for k, step in enumerate(kept[1:]):
+        if step.status is not Status.RESET:
+            np.testing.assert_array_equal(transient.u[k], step.u)
+    assert +transient.counters == +reference.counters
+
+
+@settings(max_examples=150)
+@given(cases() | cases(tame=True), st.sampled_from(["none", "lz4", "zstd"]))
+def test_recordings_become_what_the_rules_say(
+    tmp_path_factory: pytest.TempPathFactory, case: tuple[SignalMap, list[Sent]], compression: str
+) -> None:
+    signals, messages = case
+    signals = by_position(signals)
+    path = save(
+        tmp_path_factory.getbasetemp(),
+        dict.fromkeys(signals.topics, JOINT_STATE),
+        [(m.topic, m.arrival, joint_state(max(m.stamp or 0, 0), m.values)) for m in messages],
+        "any.mcap",
+        Layout(compression, chunk_size=300),
+    )
+    arrived = sorted(messages, key=lambda m: m.arrival)  # log time, then file order
+    reference = Reference(signals, arrived, forgets=True)
+    silent = [t for t in signals.topics if not any(m.topic == t for m in messages)]
+    stamped = {m.topic for m in messages if m.stamp and m.stamp > 0}
+    unstamped = [t for t in signals.topics if signals.time[t] == "header" and t not in stamped]
+    instants = [s.instant for s in reference.samples] + [i for _, i in reference.dropped.values()]
+    if silent:
+        with pytest.raises(BagError, match=f"{path}: {silent[0]} has no message"):
+            read_transients(path, signals)
+    elif unstamped:
+        with pytest.raises(SignalError, match=f"topics: {unstamped[0]}: time is header, and no message has a stamp"):
+            read_transients(path, signals)
+    elif len(set(instants)) < 2 or not any(s.dt > 0 for s in reference.samples):
+        try:
+            (transient,) = read_transients(path, signals)
+        except SignalError as error:
+            assert "/c: " in str(error) and "without a forward step in time" in str(error)
+        else:
+            same(transient, reference)
+    else:
+        (transient,) = read_transients([path], signals)
+        same(transient, reference)
+        assert transient.signals == signals
+        assert transient.sources == (str(path),) and transient.name == str(path)
+        for word in unused(transient):
+            assert (
+                any(word.endswith(s) for s in ("missing", "gap", "reset"))
+                or "dropped (" in word
+                or "late " in word
+                or ("stale " in word)
+            )
+
+
+# --- real recordings against a plain reader -------------------------------------------------------------------
+
+VICON = "/vicon/Group466CF/Group466CF/pose"
+
+
+def roll(q: Any) -> float:
+    return math.atan2(
+        2.0 * (q.w * q.x + q.y * q.z), q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w - 2.0 * (q.x * q.x + q.y * q.y)
+    )
+
+
+READ: dict[str, tuple[str, str, Any, str, Any, float | None]] = {
+    # signals file: clock, state values, control topic, control values, max_hold
+    "go2_joint": (
+        "/go2/joint_states", lambda m: [m.position[m.name.index("j0")], m.velocity[m.name.index("j0")]],
+        "/go2/joint_command", lambda m: [m.position[m.name.index("j0")]], 0.05,
+    ),
+    "micro_gas_turbine": ("/mgt/el_power", lambda m: [m.data], "/mgt/input_voltage", lambda m: [m.data], 5.0),
+    "hunter_se": ("/hunter/twist", lambda m: [m.twist.linear.x], "/hunter/cmd", lambda m: [m.vector.x], None),
+    "neato": (
+        "/odom", lambda m: [m.twist.twist.linear.x, m.twist.twist.angular.z],
+        "/cmd_vel", lambda m: [m.linear.x, m.angular.z], None,
+    ),
+    "crazyflie_vicon": (VICON, lambda m: [roll(m.pose.orientation)], "/cf_controll", lambda m: [m.position.x], 0.3),
+    "crazyflie_estimate": (
+        "/cf_logpos", lambda m: [roll(m.orientation)],
+        "/cf_controll", lambda m: [m.position.x], 0.3,
+    ),
+}  # fmt: skip
+
+# Samples, segments and usable transitions of each recording; the last without a delay that a signals file may set.
+RECORDINGS = [
+    ("go2/test_3.mcap", "go2_joint", 10449, 6, 6541),
+    ("micro_gas_turbine/ex_1.mcap", "micro_gas_turbine", 9920, 1, 9919),
+    ("micro_gas_turbine/ex_20.mcap", "micro_gas_turbine", 6495, 2, 6493),
+    ("micro_gas_turbine/ex_24.mcap", "micro_gas_turbine", 9023, 3, 9020),
+    ("hunter_se/straight_even_t_0_2_run_01.mcap", "hunter_se", 2515, 1, 2514),
+    ("hunter_se/straight_even_t_0_2_run_02.mcap", "hunter_se", 2515, 1, 2514),
+    ("hunter_se/straight_odd_t_0_5_run_01.mcap", "hunter_se", 2513, 1, 2512),
+    ("hunter_se/straight_odd_t_0_5_run_02.mcap", "hunter_se", 2518, 1, 2517),
+    ("neato/person_follower.mcap", "neato", 149, 1, 131),
+    ("neato/draw_square.mcap", "neato", 292, 1, 278),
+    ("crazyflie/rollbag_0.mcap", "crazyflie_vicon", 2652, 1, 2645),
+    ("crazyflie/yx3bag_0.mcap", "crazyflie_vicon", 363, 5, 355),
+    ("crazyflie/yx4bag_0.mcap", "crazyflie_vicon", 2359, 1, 275),
+    ("crazyflie/rollbag_0.mcap", "crazyflie_estimate", 315, 5, 310),
+    ("crazyflie/yx3bag_0.mcap", "crazyflie_estimate", 112, 2, 109),
+    ("crazyflie/yx4bag_0.mcap", "crazyflie_estimate", 236, 1, 28),
+]
+
+
+def plain_read(path: Path, topic: str, values: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Log times, stamps (-1 without) and values of a topic, by the mcap library and Jazzy's definitions."""
+    rows = []
+    with open(path, "rb") as stream:
+        for schema, _, record in make_reader(stream).iter_messages([topic], log_time_order=False):
+            decoded = JAZZY.deserialize_cdr(record.data, schema.name)
+            stamp = decoded.header.stamp if hasattr(decoded, "header") else None
+            rows.append((record.log_time, stamp.sec * 10**9 + stamp.nanosec if stamp else -1, *values(decoded)))
+    rows.sort(key=lambda row: row[0])
+    times = np.array([row[:2] for row in rows], dtype=np.int64)
+    return times[:, 0], times[:, 1], np.array([row[2:] for row in rows], dtype=float)
+
+
+def without_delay(path: Path) -> SignalMap:
+    signals = SignalMap.load(path)
+    return replace(signals, controls=tuple(replace(c, delay=0) for c in signals.controls))
+
+
+@pytest.mark.parametrize(("file", "map_name", "samples", "segments", "usable"), RECORDINGS)
+def test_real_recordings_read_as_a_plain_reader_reads_them(
+    recordings: Path, signals_folder: Path, file: str, map_name: str, samples: int, segments: int, usable: int
+) -> None:
+    path = recordings / file
+    (transient,) = read_transients(path, without_delay(signals_folder / f"{map_name}.yaml"))
+    assert (len(transient), transient.segments, int(transient.usable.sum())) == (samples, segments, usable)
+
+    clock, state, control, command, max_hold = READ[map_name]
+    arrival, stamp, x = plain_read(path, clock, state)
+    by_stamp = bool((stamp > 0).all())
+    t = stamp if by_stamp else arrival
+    assert (np.diff(t) > 0).all()  # nothing is dropped in these recordings
+    assert transient.t_ns.tolist() == t.tolist()
+    if map_name.startswith("crazyflie"):  # within a segment, on the branch nearest to the sample before
+        turns = np.round((transient.x[:, 0] - x[:, 0]) / (2 * math.pi))
+        np.testing.assert_array_equal(transient.x[:, 0], x[:, 0] + 2 * math.pi * turns)
+        inside = np.diff(transient.segment) == 0
+        assert (np.abs(np.diff(transient.x[:, 0])[inside]) <= math.pi).all()
+    else:
+        np.testing.assert_array_equal(transient.x, x)
+
+    max_gap = 2.5 * np.median(np.diff(t))
+    assert transient.max_gap == pytest.approx(max_gap * 1e-9, abs=2e-9)
+    assert np.flatnonzero(np.diff(transient.segment)).tolist() == np.flatnonzero(np.diff(t) > max_gap).tolist()
+
+    came, sent, u = plain_read(path, control, command)
+    commands_by_stamp = by_stamp and bool((sent > 0).all())
+    instants, wanted = (sent, t) if commands_by_stamp else (came, arrival)
+    for k in range(len(t) - 1):
+        there = (came <= arrival[k + 1]) & (instants <= wanted[k])
+        if commands_by_stamp and (came == arrival[k + 1]).any():
+            continue  # which of the two came first, the file's order tells
+        expected = np.full(u.shape[1], NAN)
+        if there.any():
+            latest = np.flatnonzero(there & (instants == instants[there].max()))[-1]
+            if max_hold is None or wanted[k] - instants[latest] <= round(max_hold * 1e9):
+                expected = u[latest]
+        np.testing.assert_array_equal(transient.u[k], expected, err_msg=f"u of sample {k}")
+
+
+def test_commands_that_have_ended_are_no_input(recordings: Path, signals_folder: Path) -> None:
+    """Go2: commands end at 13.1 s of 20.9 s; from 0.05 s later on no transition is usable."""
+    (transient,) = read_transients(recordings / "go2" / "test_3.mcap", signals_folder / "go2_joint.yaml")
+    came, _, _ = plain_read(recordings / "go2" / "test_3.mcap", "/go2/joint_command", lambda m: [0.0])
+    _, sent, _ = plain_read(recordings / "go2" / "test_3.mcap", "/go2/joint_command", lambda m: [0.0])
+    end = sent.max() + 50 * MS
+    assert not transient.usable[transient.t_ns[:-1] > end].any()
+    assert transient.usable[(transient.t_ns[:-1] > sent.min()) & (transient.t_ns[:-1] < sent.max())].mean() > 0.99
+    assert 7.0 < (transient.t_ns[-1] - end) * 1e-9 < 8.0
+    assert transient.counters["stale command"] == (transient.t_ns[:-1] > end).sum()
+
+
+def test_a_drop_out_of_vicon_is_a_gap_and_missing_commands_are_no_commands(
+    recordings: Path, signals_folder: Path
+) -> None:
+    (gone,) = read_transients(recordings / "crazyflie" / "yx3bag_0.mcap", signals_folder / "crazyflie_vicon.yaml")
+    assert gone.dt.max() > 0.8 and gone.counters["gaps"] == 4
+    (empty,) = read_transients(recordings / "crazyflie" / "yx4bag_0.mcap", signals_folder / "crazyflie_vicon.yaml")
+    assert empty.counters["missing roll_control"] == np.isnan(empty.u[:-1]).sum() > 2000
+    assert np.isfinite(empty.transitions().u).all()
+
+
+def test_an_underwater_vehicle_whose_clocks_are_days_apart(recordings: Path) -> None:
+    """Header stamps of the IMU are zero and those of the depth lie 515 220 s before log time; types are its own."""
+    signals = SignalMap(
+        (Signal("depth", "/coug2/depth_data", "pose.pose.position.z"),),
+        (Signal("fin", "/coug2/controls/command", "fin[0]"), Signal("yaw", "/coug2/modem_imu", "yaw(orientation)")),
+    )
+    path = recordings / "cougars_auv" / "SO_bag_0.mcap"
+    (transient,) = read_transients(path, signals)
+    assert transient.signals is not None
+    assert transient.signals.time["/coug2/depth_data"] == "header"
+    assert transient.signals.time["/coug2/modem_imu"] == "log"
+    assert np.isfinite(transient.u[1:-1]).mean() > 0.9, (
+        "a held value counts by arrival where stamps are of other clocks"
+    )
+
+
+# --- what a signals file leaves open --------------------------------------------------------------------------
+
+
+def float_bag(folder: Path, name: str, state: Sequence[int], control: Sequence[int]) -> Path:
+    messages = sorted([*ramp("/x", state), *ramp("/u", control)], key=lambda m: m.log_time)
+    return write([Topic("/x"), Topic("/u")], messages).save(folder / name)
+
+
+XU = SignalMap((Signal("x", "/x", "data"),), (Signal("u", "/u", "data"),))
+
+
+def test_recordings_are_resolved_together(tmp_path: Path) -> None:
+    """One clock and one max_gap for all, from all steps pooled; each recording starts on its own."""
+    short = float_bag(tmp_path, "a.mcap", range(0, 400 * MS, 100 * MS), range(0, 400 * MS, 50 * MS))
+    long = float_bag(tmp_path, "b.mcap", range(0, 10_000 * MS, 40 * MS), range(0, 10_000 * MS, 50 * MS))
+    transients = read_transients([short, long], XU)
+    assert [t.name for t in transients] == [str(short), str(long)]
+    assert [t.max_gap for t in transients] == [pytest.approx(0.1), pytest.approx(0.1)]
+    assert transients[0].signals == transients[1].signals
+    alone = read_transients(short, XU)[0]
+    assert alone.max_gap == pytest.approx(0.25)
+    np.testing.assert_array_equal(alone.x, transients[0].x)
+
+
+@pytest.mark.parametrize(("zero", "source"), [(0, "header"), (4, "header"), (5, "log"), (10, "log")])
+def test_stamps_count_where_most_messages_have_one(tmp_path: Path, zero: int, source: str) -> None:
+    data = [joint_state(0 if k < zero else (k + 1) * MS, [k]) for k in range(10)]
+    path = save(tmp_path, {"/x": JOINT_STATE}, [("/x", (k + 1) * 3 * MS, d) for k, d in enumerate(data)])
+    (transient,) = read_transients(path, SignalMap((Signal("x", "/x", "position[0]"),)))
+    assert transient.signals is not None and transient.signals.time == {"/x": source}
+    assert transient.dt.tolist() == [MS * 1e-9 if source == "header" else 3 * MS * 1e-9] * (len(transient) - 1)
+    assert transient.counters["no stamp"] == (zero if source == "header" else 0)
+    said = SignalMap((Signal("x", "/x", "position[0]"),), time={"/x": "log"})
+    assert read_transients(path, said)[0].dt.tolist() == [3 * MS * 1e-9] * 9
+
+
+def test_the_resolved_map_has_types_numbers_and_sources(tmp_path: Path) -> None:
+    path = float_bag(tmp_path, "a.mcap", range(0, 1000 * MS, 100 * MS), range(0, 1000 * MS, 30 * MS))
+    (transient,) = read_transients(str(path), XU)
+    signals = transient.signals
+    assert signals is not None
+    assert (signals.clock, signals.max_gap, signals.time) == ("/x", pytest.approx(0.25), {"/x": "log", "/u": "log"})
+    assert {s.type for s in signals.signals} == {FLOAT64}
+
+
+def test_auto_is_resolved_once_over_all_recordings_and_told(tmp_path: Path) -> None:
+    def bag(name: str, levels: Sequence[float]) -> Path:
+        data = [("/x", k * 10 * MS, float64(v)) for k, v in enumerate(levels)]
+        return save(tmp_path, {"/x": FLOAT64}, data, name)
+
+    one = bag("a.mcap", [2.0] * 20 + list(np.linspace(2, 9, 9)) + [9.0] * 40)
+    two = bag("b.mcap", [-11.0] * 15 + [0.0] * 5)
+    signals = SignalMap((Signal("x", "/x", "data", steady="auto", scale="auto"),))
+    transients = read_transients([one, two], signals)
+    for transient in transients:
+        assert transient.signals is not None
+        assert (transient.signals.states[0].steady, transient.signals.states[0].scale) == (9.0, 11.0)
+    assert [len(t.notes) for t in transients] == [1, 0]
+    assert transients[0].notes[0].startswith("operating point from 39 still samples") or (
+        "x 9 (scale 11)" in transients[0].notes[0]
+    )
+
+
+def test_an_angle_starts_on_the_branch_nearest_to_a_steady_value_that_was_resolved(tmp_path: Path) -> None:
+    """Still at 3 rad, of which one recording starts just beyond the seam: both end up on one branch."""
+    angles = [3.0] * 30 + list(np.linspace(3.0, 3.6, 13))
+    wrapped = [math.remainder(a, 2 * math.pi) for a in angles]
+    data = [("/x", k * 10 * MS, float64(v)) for k, v in enumerate(wrapped)]
+    one = save(tmp_path, {"/x": FLOAT64}, data, "a.mcap")
+    two = save(tmp_path, {"/x": FLOAT64}, [(t, at, d) for t, at, d in data[-5:]], "b.mcap")
+    signals = SignalMap((Signal("x", "/x", "unwrap(data)", steady="auto"),))
+    first, second = read_transients([one, two], signals)
+    np.testing.assert_allclose(first.x[:, 0], angles, atol=1e-12)
+    np.testing.assert_allclose(second.x[:, 0], angles[-5:], atol=1e-12)
+
+
+@settings(max_examples=30)
+@given(st.lists(st.floats(-0.5, 0.5), min_size=2, max_size=60), st.floats(-20, 20))
+def test_unwrapping_a_quaternion_gives_the_angle_that_turned(
+    tmp_path_factory: pytest.TempPathFactory, turns: list[float], steady: float
+) -> None:
+    angles = np.concatenate([[steady], steady + np.cumsum(turns)])
+    type_name = "geometry_msgs/msg/QuaternionStamped"
+    data = []
+    for k, a in enumerate(angles.tolist()):
+        q = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(a / 2), w=math.cos(a / 2))
+        data.append(("/q", k * 10 * MS, cdr(type_name, header=header((k + 1) * 10 * MS), quaternion=q)))
+    path = save(tmp_path_factory.getbasetemp(), {"/q": type_name}, data, "turning.mcap")
+    signals = SignalMap((Signal("yaw", "/q", "unwrap(yaw(quaternion))", steady=steady),))
+    (transient,) = read_transients(path, signals)
+    np.testing.assert_allclose(transient.x[:, 0], angles, atol=1e-9)
+
+
+# --- files ---------------------------------------------------------------------------------------------------
+
+
+def test_parts_of_a_split_bag_are_one_run(tmp_path: Path) -> None:
+    whole = ramp("/x", range(0, 3000 * MS, 10 * MS))
+    parts = {f"run_{i}.mcap": write([Topic("/x")], whole[100 * i : 100 * (i + 1)]) for i in range(3)}
+    folder = write_folder(tmp_path / "run", parts, metadata_yaml(parts))
+    signals = SignalMap((Signal("x", "/x", "data"),))
+    (transient,) = read_transients(folder, signals)
+    assert len(transient) == 300 and transient.segments == 1
+    assert transient.sources == tuple(str(folder / name) for name in parts)
+    (again,) = read_transients(sorted(folder.glob("*.mcap"), reverse=True), signals)
+    assert again.t_ns.tolist() == transient.t_ns.tolist()
+
+
+def test_what_the_reader_has_to_say_goes_with_the_run(tmp_path: Path) -> None:
+    file = write([Topic("/x")], ramp("/x", range(0, 3000 * MS, 10 * MS)))
+    path = file.save(tmp_path / "cut.mcap", cut=len(file.data) // 2)
+    (transient,) = read_transients(path, SignalMap((Signal("x", "/x", "data"),)))
+    assert 50 < len(transient) < 300
+    assert any(str(path) in note for note in transient.notes)
+
+
+def test_messages_as_rclpy_serialises_them(tmp_path: Path) -> None:
+    """It leaves bytes after empty sequences of doubles; a bag written through rosbag2_py is full of them."""
+    serialization = pytest.importorskip("rclpy.serialization", reason="rclpy is not installed")
+    from sensor_msgs.msg import JointState
+
+    def encoded(k: int) -> bytes:
+        state = JointState(name=["fan"], position=[float(k)])
+        state.header.stamp.sec = k + 1
+        return bytes(serialization.serialize_message(state))
+
+    path = save(tmp_path, {"/x": JOINT_STATE}, [("/x", k * MS, encoded(k)) for k in range(20)])
+    (transient,) = read_transients(path, SignalMap((Signal("x", "/x", "position[fan]"),)))
+    assert transient.x[:, 0].tolist() == list(range(20)) and set(transient.dt.tolist()) == {1.0}
+    assert not transient.notes
+
+
+def test_progress_sees_every_message(tmp_path: Path) -> None:
+    path = float_bag(tmp_path, "a.mcap", range(0, 1000 * MS, 10 * MS), range(0, 1000 * MS, 50 * MS))
+    totals: list[int] = []
+
+    def progress(messages: Any, total: int) -> Any:
+        totals.append(total)
+        return messages
+
+    (transient,) = read_transients(path, XU, progress)
+    assert len(transient) == 100 and sum(totals) > 0
+
+
+# --- bad input: one sentence that names what is there ---------------------------------------------------------
+
+
+def joints(folder: Path, values: Sequence[float] = (1.0, 2.0), names: Sequence[str] = ("fan", "core")) -> Path:
+    data = [("/x", k * 10 * MS, joint_state((k + 1) * 10 * MS, values, names)) for k in range(20)]
+    data += [("/s", k * 10 * MS, cdr("std_msgs/msg/String", data="on")) for k in range(20)]
+    types = {"/x": JOINT_STATE, "/s": "std_msgs/msg/String", "/silent": FLOAT64}
+    return save(folder, types, data)
+
+
+@pytest.mark.parametrize(
+    ("signal", "words"),
+    [
+        (("x", "/nope", "data"), "there is no topic /nope; topics there: /s, /silent, /x"),
+        (("x", "/silent", "data"), "/silent has no message; record it, or choose another topic"),
+        (
+            ("x", "/x", "data[0]"),
+            r"of /x \(sensor_msgs/msg/JointState\): there is no 'data' .* fields there: header, name",
+        ),
+        (("x", "/x", "position"), "is not one number but an array; give an index, for example \\[0\\]; numeric field"),
+        (("x", "/x", "position[hub]"), "there is no 'hub' in the message's names; names there: fan, core"),
+        (("x", "/x", "velocity[hub]"), "there is no 'hub' in the message's names; names there: fan, core"),
+        (("x", "/x", "name[0]"), "not one number but a string; numeric field paths of /x: header.stamp.sec"),
+        (("x", "/s", "data"), "not one number but a string; numeric field paths of /s: none"),
+        (("x", "/s", "norm(data)"), "wants a vector"),
+    ],
+)
+def test_a_signal_that_the_recording_lacks_is_named(signal: tuple[str, str, str], words: str, tmp_path: Path) -> None:
+    path = joints(tmp_path)
+    with pytest.raises((BagError, SignalError), match=words) as caught:
+        read_transients(path, SignalMap((Signal(*signal),)))
+    sentence = str(caught.value)
+    assert "\n" not in sentence and (str(path) in sentence or signal[1] in sentence)
+
+
+def test_a_name_or_an_index_that_comes_later_is_no_error(tmp_path: Path) -> None:
+    late = [("/x", k * 10 * MS, joint_state((k + 1) * 10 * MS, [1.0], ["fan"])) for k in range(3)]
+    late += [("/x", k * 10 * MS, joint_state((k + 1) * 10 * MS, [1.0, 7.0], ["fan", "core"])) for k in range(3, 9)]
+    path = save(tmp_path, {"/x": JOINT_STATE}, late)
+    for field in ("position[core]", "position[1]"):
+        (transient,) = read_transients(path, SignalMap((Signal("x", "/x", field),)))
+        np.testing.assert_array_equal(transient.x[:, 0], [NAN] * 3 + [7.0] * 6)
+        assert transient.counters["missing"] == 3 and transient.usable.sum() == 5
+        assert unused(transient) == ["3 missing"]
+
+
+def test_values_that_are_nan_or_infinite_cost_the_transitions_that_need_them(tmp_path: Path) -> None:
+    values = [0.0, 1.0, NAN, 3.0, math.inf, 5.0, 6.0, 7.0]
+    path = save(tmp_path, {"/x": FLOAT64}, [("/x", k * 10 * MS, float64(v)) for k, v in enumerate(values)])
+    (transient,) = read_transients(path, SignalMap((Signal("x", "/x", "data"),)))
+    assert transient.usable.tolist() == [True, False, False, False, False, True, True]
+    all_nan = save(tmp_path, {"/x": FLOAT64}, [("/x", k * 10 * MS, float64(NAN)) for k in range(5)], "nan.mcap")
+    (transient,) = read_transients(all_nan, SignalMap((Signal("x", "/x", "data", "auto", "auto"),)))
+    assert not transient.usable.any()
+
+
+def test_recordings_of_other_types_are_not_fitted_together(tmp_path: Path) -> None:
+    one = float_bag(tmp_path, "a.mcap", range(0, 100 * MS, 10 * MS), range(0, 100 * MS, 10 * MS))
+    two = save(
+        tmp_path,
+        {"/x": "std_msgs/msg/Float32", "/u": FLOAT64},
+        [("/x", k * MS, cdr("std_msgs/msg/Float32", data=1.0)) for k in range(9)] + [("/u", 0, float64(1.0))],
+        "b.mcap",
+    )
+    with pytest.raises(BagError, match=f"{two}: /x is std_msgs/msg/Float32, and std_msgs/msg/Float64 in {one}"):
+        read_transients([one, two], XU)
+
+
+def test_a_clock_that_stands_still_is_named(tmp_path: Path) -> None:
+    path = save(tmp_path, {"/x": FLOAT64}, [("/x", 5 * MS, float64(float(k))) for k in range(9)])
+    with pytest.raises(SignalError, match="/x: 9 messages without a forward step in time"):
+        read_transients(path, SignalMap((Signal("x", "/x", "data"),)))
+
+
+def test_header_time_without_any_stamp_is_named(tmp_path: Path) -> None:
+    path = float_bag(tmp_path, "a.mcap", range(0, 100 * MS, 10 * MS), range(0, 100 * MS, 10 * MS))
+    with pytest.raises(SignalError, match="topics: /u: time is header, and no message has a stamp; write log"):
+        read_transients(path, replace(XU, time={"/u": "header"}))
+
+
+def test_no_recording_is_an_error() -> None:
+    with pytest.raises(BagError, match="no recording is named; give at least one"):
+        read_transients([], XU)
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("odd/empty.mcap", "empty"),
+        ("odd/lfs_pointer.mcap", "Git LFS"),
+        ("odd/none.mcap", "no such"),
+        ("neato/db3", "sqlite"),
+        ("odd/talker.mcap", "there is no topic /x; topics there: "),
+    ],
+)
+def test_files_that_are_no_recording_of_this(recordings: Path, file: str, words: str) -> None:
+    with pytest.raises(BagError, match=f"(?i){words}") as caught:
+        read_transients(recordings / file, XU)
+    assert str(recordings / file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_truncated_recording_gives_what_is_there(recordings: Path, signals_folder: Path) -> None:
+    map_file = signals_folder / "crazyflie_vicon.yaml"
+    (cut,) = read_transients(recordings / "odd" / "rollbag_truncated.mcap", map_file)
+    (whole,) = read_transients(recordings / "crazyflie" / "rollbag_0.mcap", map_file)
+    assert 100 < len(cut) < len(whole) and cut.notes
+    assert cut.t_ns.tolist() == whole.t_ns[: len(cut)].tolist()
+
+
+# --- for a model ---------------------------------------------------------------------------------------------
+
+
+def model_of(signals: SignalMap) -> UncertainLTI:
+    n, m = len(signals.states), len(signals.controls)
+    return UncertainLTI(np.eye(n), np.zeros((n, m)), np.zeros((n, n)), np.zeros((n, m)), signals=signals)
+
+
+def test_a_model_reads_as_the_fit_did(tmp_path: Path) -> None:
+    one = float_bag(tmp_path, "a.mcap", range(0, 1000 * MS, 100 * MS), range(0, 1000 * MS, 30 * MS))
+    (fitted,) = read_transients(one, XU)
+    assert fitted.signals is not None
+    model = model_of(fitted.signals)
+    model.save(tmp_path / "m.model.json")
+    transient = read_for_model(one, UncertainLTI.load(tmp_path / "m.model.json"))
+    for name in ("t_ns", "x", "u", "segment"):
+        assert getattr(transient, name).tobytes() == getattr(fitted, name).tobytes()
+    slower = float_bag(tmp_path, "b.mcap", range(0, 9000 * MS, 300 * MS), range(0, 9000 * MS, 30 * MS))
+    assert read_for_model(slower, model).segments == 30, "the limits are those of the fit, not of the recording"
+
+
+def test_a_recording_of_another_type_is_not_judged(tmp_path: Path) -> None:
+    one = float_bag(tmp_path, "a.mcap", range(0, 1000 * MS, 100 * MS), range(0, 1000 * MS, 30 * MS))
+    (fitted,) = read_transients(one, XU)
+    assert fitted.signals is not None
+    two = save(
+        tmp_path,
+        {"/x": "std_msgs/msg/Float32", "/u": FLOAT64},
+        [("/x", k * MS, cdr("std_msgs/msg/Float32", data=1.0)) for k in range(9)],
+        "b.mcap",
+    )
+    with pytest.raises(BagError, match=f"{two}: /x is std_msgs/msg/Float32, and the model was fitted to {FLOAT64}"):
+        read_for_model(two, model_of(fitted.signals))
+    three = save(tmp_path, {"/y": FLOAT64}, [("/y", 1, float64(1.0))], "c.mcap")
+    with pytest.raises(BagError, match="there is no topic /x; topics there: /y"):
+        read_for_model(three, model_of(fitted.signals))
+
+
+def test_a_model_of_arrays_names_no_topics(tmp_path: Path) -> None:
+    model = UncertainLTI(np.eye(1), np.zeros((1, 0)), np.eye(1), np.zeros((1, 0)))
+    path = float_bag(tmp_path, "a.mcap", range(0, 100 * MS, 10 * MS), [0])
+    with pytest.raises(SignalError, match="the model was fitted to arrays and names no topics"):
+        read_for_model(path, model)
+
+
+def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path: Path) -> None:
+    """A model that goes by stamps, and a recording without; or whose clock never speaks."""
+    good = save(tmp_path, {"/x": JOINT_STATE}, [("/x", k * MS, joint_state((k + 1) * MS, [k])) for k in range(9)])
+    (fitted,) = read_transients(good, SignalMap((Signal("x", "/x", "position[0]"),)))
+    assert fitted.signals is not None
+    model = model_of(fitted.signals)
+    zero = save(tmp_path, {"/x": JOINT_STATE}, [("/x", k * MS, joint_state(0, [k])) for k in range(9)], "zero.mcap")
+    with pytest.raises(SignalError, match="zero.mcap: no message of /x has a stamp, and the model goes by them"):
+        read_for_model(zero, model)
+    silent = save(tmp_path, {"/x": JOINT_STATE, "/y": FLOAT64}, [("/y", 1, float64(1.0))], "silent.mcap")
+    with pytest.raises(BagError, match="silent.mcap: /x has no message; record it"):
+        read_for_model(silent, model)
+    vague = model_of(SignalMap((Signal("x", "/x", "position[0]"),)))
+    with pytest.raises(SignalError, match="does not say clock, max_gap and time of every topic"):
+        read_for_model(good, vague)
