@@ -180,10 +180,10 @@ def test_mutated_messages_do_no_harm(world: World, tmp_path: Path) -> None:
         time.sleep(0.002)
     until(lambda: world.status()["received"].get(STATE) == 400, "all of them")
     assert sum(world.status()["unreadable"].values()) > 50
-    diagnostics.reaches(STALE, saying=f"{STATE}: a message cannot be decoded")
+    until(lambda: ever(diagnostics, STALE, f"{STATE}: a message cannot be decoded"), "a word on them", 10)
     plant.state.publish(JointState(name=["a", "b"], position=[0.0] * 100_000))
     until(lambda: world.status()["received"].get(STATE) == 401, "the huge one")
-    diagnostics.reaches(STALE, saying="more than parameter largest_message allows")
+    until(lambda: ever(diagnostics, STALE, "more than parameter largest_message allows"), "a word on it", 10)
     plant.t_ns = EPOCH_NS + 10**12  # later than whatever stamp got through, or a step back: a new segment either way
     heard = len(flags.messages)
     plant.send(6)
