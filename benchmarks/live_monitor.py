@@ -61,7 +61,7 @@ def publish(n: int, rate: float, seconds: float) -> None:
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
 
-    from uncertain_lti_ros.outputs import NamedVector
+    from uncertain_lti.verdict_messages import NamedVector
 
     rclpy.init()
     node = rclpy.create_node("publisher")

@@ -31,13 +31,14 @@ from uncertain_lti.errors import ModelError, UncertainLTIError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdict
 from uncertain_lti.signals import FieldPath
+from uncertain_lti.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti_ros.arming import Condition
 from uncertain_lti_ros.layout import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
-from uncertain_lti_ros.outputs import FALSE, TRUE, NamedVector
+from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living
-from uncertain_lti_ros.snapshot import JUDGED, Album, Entry, Recent, Scene
+from uncertain_lti_ros.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, MatchedSubscription, Wish
 from uncertain_lti_ros.watch import ERROR, STALE, Report, Rule, Watch, topic_types
 
@@ -133,7 +134,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         model = UncertainLTI.load(path)
         types = topic_types(model, path, _type_fields)
         for names in (model.state_names, model.control_names):
-            NamedVector(names)
+            sendable(names)
         arming = self.watch.arming if self.watch else None
         return Watch(model, rule, types, _type_fields, self._make_reader, time.monotonic(), arming)
 
@@ -249,7 +250,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _prepare_outputs(self) -> None:
         assert self.watch is not None
         names = self.watch.model.state_names
-        self._plain, self._marked = NamedVector(names), NamedVector(names, velocities=True)
+        self._plain, self._marked = sendable(names), sendable(names, velocities=True)
         n = len(names)
         self._marks = {mark: struct.pack(f"<{n}d", *[mark] * n) for mark in (0.0, 1.0)}
         self._no_mark = struct.pack(f"<{n}d", *[_NAN] * n)

@@ -13,13 +13,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from uncertain_lti.errors import ModelError, UncertainLTIError
+from uncertain_lti.mcap_writer import McapWriter
 from uncertain_lti.monitor import Verdict
-from uncertain_lti_ros.mcap_writer import McapWriter
+from uncertain_lti.verdict_messages import FALSE, JUDGED, TOPICS, TRUE, NamedVector
 from uncertain_lti_ros.messages import definition
-from uncertain_lti_ros.outputs import FALSE, TRUE, NamedVector
 
-VECTOR_TYPE, FLAG_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
-JUDGED = ("lower", "upper", "state", "utilisation")
 _OVERHEAD = 500  # bytes that one kept message takes beside its data, a verdict on it included
 
 
@@ -82,9 +80,8 @@ class Scene:
             writer.metadata("uncertain_lti", self.notes)
             inputs = {t: writer.channel(t, kind, definition(kind)) for t, kind in self.inputs.items()}
             outputs = {
-                name: writer.channel(topic, FLAG_TYPE if name == "violation" else VECTOR_TYPE, text)
+                name: writer.channel(topic, TOPICS[name], definition(TOPICS[name]))
                 for name, topic in self.outputs.items()
-                for text in [definition(FLAG_TYPE if name == "violation" else VECTOR_TYPE)]
             }
             log_time = 0
             for entry in self.entries:

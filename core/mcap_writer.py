@@ -1,0 +1,227 @@
+"""McapWriter: MCAP files with the standard library alone, for machines that only monitor.
+
+Chunked, indexed and with a summary (https://mcap.dev/spec), so that the usual tools open them; compressed where
+zstandard is installed, or as another file is.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import BinaryIO
+
+_MAGIC = b"\x89MCAP0\r\n"
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
+_ATTACHMENT, _ATTACHMENT_INDEX, _STATISTICS, _METADATA, _METADATA_INDEX, _SUMMARY_OFFSET, _DATA_END = range(9, 16)
+_CHUNK_BYTES = 1 << 20
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+"""Opcode and length of the record; channel, sequence, log time, publish time."""
+INDEX_ENTRY = struct.Struct("<QQ")
+"""Log time of a message, and where in the chunk its record begins."""
+
+
+def _text(text: str) -> bytes:
+    data = text.encode(errors="replace")
+    return struct.pack("<I", len(data)) + data
+
+
+def _map(pairs: Mapping[str, str]) -> bytes:
+    body = b"".join(_text(key) + _text(value) for key, value in pairs.items())
+    return struct.pack("<I", len(body)) + body
+
+
+def _record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def _compressor(name: str | None) -> tuple[str, Callable[[bytes], bytes]]:
+    if name == "lz4":
+        import lz4.frame  # type: ignore[import-untyped]
+
+        return name, lz4.frame.compress
+    if name == "":
+        return "", bytes
+    try:
+        import zstandard
+    except ImportError:
+        return "", bytes
+    return "zstd", zstandard.ZstdCompressor(level=1).compress
+
+
+class McapWriter:
+    """Records to an open binary file, one after the other; `finish` ends it.
+
+    Parameters
+    ----------
+    stream : binary file
+    library : str
+        Who writes.
+    profile : str
+    compression : str, optional
+        Of the chunks made here: zstd, lz4 or "" for none; default zstd where it is installed.
+    """
+
+    def __init__(self, stream: BinaryIO, library: str, profile: str = "ros2", compression: str | None = None) -> None:
+        self._stream, self._at, self._sum = stream, 0, 0
+        self._name, self._compress = _compressor(compression)
+        self._schemas: dict[int, bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._metadata: list[bytes] = []
+        self._attachments: list[bytes] = []
+        self._chunks: list[bytes] = []
+        self._counts: Counter[int] = Counter()
+        self._parts: list[bytes] = []
+        self._length = 0
+        self._index: dict[int, bytearray] = {}
+        self._first: int | None = None
+        self._last = 0
+        self._begin_of_chunk, self._end_of_chunk = 0, 0
+        self._write(_MAGIC + _record(_HEADER, _text(profile) + _text(library)))
+
+    def metadata(self, name: str, pairs: Mapping[str, str]) -> None:
+        """Add named texts."""
+        self.copied_metadata(_text(name) + _map(pairs), name)
+
+    def channel(self, topic: str, type_name: str, definition: str) -> int:
+        """Declare a topic with CDR messages of a type that is defined as in .msg files; returns its number."""
+        schema, number = max(self._schemas, default=0) + 1, max(self._channels, default=0) + 1
+        self.declare_schema(schema, type_name, "ros2msg", definition.encode())
+        self.declare_channel(number, schema, topic, "cdr", {})
+        return number
+
+    def declare_schema(self, number: int, name: str, encoding: str, data: bytes) -> None:
+        """A schema of this number, which none has yet."""
+        body = struct.pack("<H", number) + _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
+        self._schemas[number] = _record(_SCHEMA, body)
+        self._write(self._schemas[number])
+
+    def declare_channel(self, number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> None:
+        """A channel of this number, which none has yet; schema 0 for none."""
+        body = struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + _map(metadata)
+        self._channels[number] = _record(_CHANNEL, body)
+        self._write(self._channels[number])
+
+    def message(self, channel: int, log_time: int, data: bytes) -> None:
+        """Add one message; log_time in ns, not less than the one before."""
+        if not self._parts:
+            self._begin_of_chunk = log_time
+        self._end_of_chunk = log_time
+        entry = INDEX_ENTRY.pack(log_time, self._length)
+        self._index.setdefault(channel, bytearray()).extend(entry)
+        sequence = self._counts[channel] + len(self._index[channel]) // INDEX_ENTRY.size - 1
+        head = MESSAGE_HEAD.pack(_MESSAGE, 22 + len(data), channel, sequence, log_time, log_time)
+        self._parts += (head, data)
+        self._length += len(head) + len(data)
+        if self._length >= _CHUNK_BYTES:
+            self._end_chunk()
+
+    def chunk(
+        self,
+        records: bytes,
+        index: Mapping[int, bytes | bytearray],
+        span: tuple[int, int],
+        packed: tuple[str, bytes] | None = None,
+    ) -> None:
+        """Add a chunk of records that stand as they are.
+
+        Parameters
+        ----------
+        records : bytes
+        index : mapping
+            Per channel the log time and the place of each of its messages in the records, as `INDEX_ENTRY`.
+        span : (int, int)
+            Smallest and largest log time, ns.
+        packed : (str, bytes), optional
+            The name of a compression, and the records compressed by it.
+        """
+        self._end_chunk()
+        self._write_chunk(records, index, span, packed)
+
+    def copied_metadata(self, body: bytes, name: str) -> None:
+        """A metadata record of this content."""
+        self._end_chunk()
+        record = _record(_METADATA, body)
+        self._metadata.append(_record(_METADATA_INDEX, struct.pack("<QQ", self._at, len(record)) + _text(name)))
+        self._write(record)
+
+    def copied_attachment(self, pieces: Iterable[bytes], length: int, head: tuple[int, int, int, str, str]) -> None:
+        """An attachment whose content is these pieces, in all `length` bytes.
+
+        head: its log time and time of creation, ns, the size of its data, its name and its media type.
+        """
+        self._end_chunk()
+        start = self._at
+        self._write(struct.pack("<BQ", _ATTACHMENT, length))
+        for piece in pieces:
+            self._write(piece)
+        log_time, create_time, size, name, media_type = head
+        body = struct.pack("<QQQQQ", start, self._at - start, log_time, create_time, size)
+        self._attachments.append(_record(_ATTACHMENT_INDEX, body + _text(name) + _text(media_type)))
+
+    def copied_record(self, opcode: int, body: bytes) -> None:
+        """A record that no index knows, for example a private one."""
+        self._end_chunk()
+        self._write(_record(opcode, body))
+
+    def finish(self) -> None:
+        """Write the rest and the summary."""
+        self._end_chunk()
+        self._write(_record(_DATA_END, struct.pack("<I", self._sum)))
+        counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(self._counts.items()))
+        sizes = (len(self._schemas), len(self._channels), len(self._attachments), len(self._metadata))
+        statistics = struct.pack("<QHIIII", sum(self._counts.values()), *sizes, len(self._chunks))
+        statistics += struct.pack("<QQI", self._first or 0, self._last, len(counts)) + counts
+        summary, offsets = self._at, b""
+        self._sum = 0
+        groups = {
+            _SCHEMA: list(self._schemas.values()), _CHANNEL: list(self._channels.values()),
+            _STATISTICS: [_record(_STATISTICS, statistics)], _CHUNK_INDEX: self._chunks,
+            _ATTACHMENT_INDEX: self._attachments, _METADATA_INDEX: self._metadata,
+        }  # fmt: skip
+        for opcode, records in groups.items():
+            if records:
+                group = b"".join(records)
+                offsets += _record(_SUMMARY_OFFSET, struct.pack("<BQQ", opcode, self._at, len(group)))
+                self._write(group)
+        start = self._at
+        self._write(offsets + struct.pack("<BQQQ", _FOOTER, 20, summary, start))
+        self._write(struct.pack("<I", self._sum) + _MAGIC)
+
+    def _end_chunk(self) -> None:
+        if self._parts:
+            parts, index = self._parts, self._index
+            self._parts, self._length, self._index = [], 0, {}
+            self._write_chunk(b"".join(parts), index, (self._begin_of_chunk, self._end_of_chunk), None)
+
+    def _write_chunk(
+        self,
+        records: bytes,
+        index: Mapping[int, bytes | bytearray],
+        span: tuple[int, int],
+        packed: tuple[str, bytes] | None,
+    ) -> None:
+        name, data = (self._name, self._compress(records)) if packed is None else packed
+        times = struct.pack("<QQ", *span)
+        self._first = span[0] if self._first is None else min(self._first, span[0])
+        self._last = max(self._last, span[1])
+        head = times + struct.pack("<QI", len(records), zlib.crc32(records)) + _text(name)
+        head += struct.pack("<Q", len(data))
+        start, length = self._at, len(head) + len(data)
+        self._write(struct.pack("<BQ", _CHUNK, length) + head)
+        self._write(data)
+        places, indexes = b"", b""
+        for channel, entries in index.items():
+            self._counts[channel] += len(entries) // INDEX_ENTRY.size
+            places += struct.pack("<HQ", channel, self._at + len(indexes))
+            indexes += _record(_MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
+        self._write(indexes)
+        body = times + struct.pack("<QQI", start, length + 9, len(places)) + places
+        body += struct.pack("<Q", len(indexes)) + _text(name) + struct.pack("<QQ", len(data), len(records))
+        self._chunks.append(_record(_CHUNK_INDEX, body))
+
+    def _write(self, data: bytes) -> None:
+        self._stream.write(data)
+        self._sum = zlib.crc32(data, self._sum)
+        self._at += len(data)
