@@ -358,7 +358,9 @@ def cases(quick: bool) -> Iterator[tuple[str, str, Callable[[int], Case], int]]:
         "Hunter SE",
         "fitted on one run at throttle 0.5, fresh: its repeat and a run at throttle 0.2; m/s",
         real(
-            "hunter", [f"{straight}odd_t_0_5_run_01"], [f"{straight}odd_t_0_5_run_02", f"{straight}even_t_0_2_run_01"],
+            "hunter",
+            [f"{straight}odd_t_0_5_run_01"],
+            [f"{straight}odd_t_0_5_run_02", f"{straight}even_t_0_2_run_01"],
             "hunter_se",
         ),  # fmt: skip
         1,
@@ -397,9 +399,10 @@ def main() -> None:
     }
     said = []
     for name, module in (("PyIPM", "PyIPM"), ("MAPIE", "mapie")):
-        if not Path(options.peers).exists() or subprocess.run(
-            [options.peers, "-c", f"import {module}"], capture_output=True
-        ).returncode:
+        if (
+            not Path(options.peers).exists()
+            or subprocess.run([options.peers, "-c", f"import {module}"], capture_output=True).returncode
+        ):
             said.append(f"{name} is not compared: it is not installed for {options.peers} (see --help).")
         else:
             methods[name if name == "PyIPM" else "MAPIE split conformal, 99 %"] = peer(name, options.peers)

@@ -52,7 +52,7 @@ def this_python(setting: str = "") -> str:
 
 def python_of_version(version: str) -> str:
     """Shell text that answers like an interpreter of that version; asked for more, it fails."""
-    return f'[[ $2 == *version_info* ]] && echo {version}'
+    return f"[[ $2 == *version_info* ]] && echo {version}"
 
 
 def refusal(result: subprocess.CompletedProcess) -> str:

@@ -440,9 +440,7 @@ def test_validate_then_watch_with_the_rule_found(folder, capsys):
     assert main(["validate", model, "--false-alarms", "2000", "--output", better]) == 0
     assert "at most 2000 false alarms per hour" in capsys.readouterr().out
     found, before = UncertainLTI.load(better), UncertainLTI.load(model)
-    chosen = [
-        (c["violations"], c["window"], c["margin"]) for c in found.validation["calibration"]["candidates"]
-    ]
+    chosen = [(c["violations"], c["window"], c["margin"]) for c in found.validation["calibration"]["candidates"]]
     assert (found.alarm.violations, found.alarm.window, found.alarm.margin) in chosen
     assert np.array_equal(found.A, before.A) and before.alarm == Alarm()
     assert main(["validate", model, "--blocks", "3", "--gap", "0.1", "--json"]) == 0

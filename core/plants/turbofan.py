@@ -404,9 +404,7 @@ class GasPathSolver:
         self._inverse = None
         return None
 
-    def _try(
-        self, q: Array, x: Sequence[float], u: Sequence[float], health: Health
-    ) -> tuple[Array, GasPath | None]:
+    def _try(self, q: Array, x: Sequence[float], u: Sequence[float], health: Health) -> tuple[Array, GasPath | None]:
         """As `Engine._path`; None where the trial lies outside what the components are defined for."""
         try:
             mismatch, path = self._engine._path(q.tolist(), x, u, health)

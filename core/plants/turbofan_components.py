@@ -73,8 +73,8 @@ class CompressorMap:
 class TurbineMap:
     """Flow by Stodola's ellipse, efficiency over the ratio of blade speed to spouting velocity.
 
-        W sqrt(T) / P = capacity sqrt(1 - (p / P)^2)
-        efficiency    = efficiency (1 - narrow (nu - 1)^2),  nu = speed / sqrt(ideal drop) over its design value
+    W sqrt(T) / P = capacity sqrt(1 - (p / P)^2)
+    efficiency    = efficiency (1 - narrow (nu - 1)^2),  nu = speed / sqrt(ideal drop) over its design value
     """
 
     capacity: float  # kg sqrt(K) / (s Pa)
@@ -92,18 +92,14 @@ class TurbineMap:
         return flow, P * ratio, gas.temperature(h - efficiency * drop, w)
 
 
-def burn(
-    air: float, T: float, fuel: float, efficiency: float
-) -> tuple[float, float]:
+def burn(air: float, T: float, fuel: float, efficiency: float) -> tuple[float, float]:
     """Combustor: exit temperature K and mass fraction of fuel, from air kg/s at T and fuel kg/s at 298.15 K."""
     w = fuel / (air + fuel)
     heat = (1.0 - w) * (gas.enthalpy(T, 0.0) - gas.enthalpy(gas.T_REFERENCE, 0.0)) + w * efficiency * gas.HEATING_VALUE
     return gas.temperature(gas.enthalpy(gas.T_REFERENCE, w) + heat, w), w
 
 
-def nozzle(
-    area: float, P: float, T: float, w: float, ambient: float, velocity: float
-) -> tuple[float, float]:
+def nozzle(area: float, P: float, T: float, w: float, ambient: float, velocity: float) -> tuple[float, float]:
     """Convergent nozzle: flow kg/s and gross thrust N; area is the effective one, velocity its coefficient."""
     flow = gas.mass_flow(area, P, T, w, ambient)
     g = gas.gamma(T, w)
