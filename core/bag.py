@@ -480,16 +480,20 @@ class TopicFacts:
     stamp_offset: float | None
 
 
-def describe(bag: Bag) -> list[TopicFacts]:
+def describe(bag: Bag, progress: Callable[[Iterable[Any], int], Iterable[Any]] | None = None) -> list[TopicFacts]:
     """Facts about every topic of a recording; reads it once, and decodes one message of each topic.
 
-    Field paths are taken from the longest message of a topic, so that its arrays have their lengths.
+    progress wraps the messages, given their number, as in `read_transients`. Field paths are taken from the longest
+    message of a topic, so that its arrays have their lengths.
     """
     times: dict[str, array[int]] = {topic: array("Q") for topic in bag.topics}
     offsets: dict[str, array[float]] = {topic: array("d") for topic in bag.topics}
     zeros = dict.fromkeys(bag.topics, 0)
     longest: dict[str, RawMessage] = {}
-    for raw in bag.raw_messages():
+    messages: Iterable[RawMessage] = bag.raw_messages()
+    if progress is not None:
+        messages = progress(messages, sum(info.count for info in bag.topics.values()))
+    for raw in messages:
         channel, topic = raw.channel, raw.channel.topic
         if not channel.counted:
             continue

@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import json
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -15,20 +16,22 @@ from typing import TYPE_CHECKING, Any
 
 from uncertain_lti import __version__
 from uncertain_lti.errors import BagError, FitError, UncertainLTIError
+from uncertain_lti.progress import Progress
 
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
 
-DONE, ALARM, BAD_INPUT = 0, 1, 2
+DONE, ALARM, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; exit status 0 done, 1 the alarm was raised, 2 bad usage or input."""
+    """Run one command; exit status 0 done, 1 the alarm was raised, 2 bad usage or input, 130 interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     command = next((a for a in given if not a.startswith("-")), "")
     try:
         options = _parser(command).parse_args(given)
-        return int(options.run(options))
+        with Progress(getattr(options, "quiet", False), getattr(options, "verbose", False)) as options.progress:
+            return int(options.run(options))
     except UncertainLTIError as error:
         print(f"uncertain-lti {command}: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -45,8 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except KeyboardInterrupt:
-        print(f"uncertain-lti {command}: interrupted; nothing was written", file=sys.stderr)
-        return BAD_INPUT
+        print(f"uncertain-lti {command}: interrupted; no half-written file is left", file=sys.stderr)
+        return INTERRUPTED
 
 
 _FIT = "install what fitting needs: pip install 'uncertain-lti-ros[fit]'"
@@ -64,21 +67,35 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="uncertain-lti",
         description="Fit an uncertain linear model to recorded transients, and tell when a machine leaves it.",
-        epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input.",
+        epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 130 interrupted by Ctrl-C.",
     )
     parser.add_argument("--version", action="version", version=f"uncertain-lti {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
 
-    def command(name: str, run: Any, text: str) -> argparse.ArgumentParser:
+    def command(name: str, run: Any, text: str, quiet: str = "", verbose: str = "") -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         sub.set_defaults(run=run)
+        if quiet:
+            talk = sub.add_mutually_exclusive_group()
+            talk.add_argument("-q", "--quiet", action="store_true", help=quiet)
+            if verbose:
+                talk.add_argument("-v", "--verbose", action="store_true", help=verbose)
         return sub
 
-    topics = command("topics", _topics, "list the topics of a recording, and which fields could be signals")
+    silent = "print errors only (and with --json the data): no summary, no notes, no progress"
+
+    topics = command(
+        "topics",
+        _topics,
+        "list the topics of a recording, and which fields could be signals",
+        "print the list and errors only: no notes, no progress",
+    )
     topics.add_argument("bag", metavar="BAG", help="MCAP file, or folder of a recording")
     topics.add_argument("--json", action="store_true", help="print JSON")
 
-    fit = command("fit", _fit, "fit a model to recordings")
+    fit = command(
+        "fit", _fit, "fit a model to recordings", silent, "say every pass over the data, and what took how long"
+    )
     fit.add_argument(
         "bags", metavar="BAG", nargs="+", help="MCAP files and folders; parts of a split bag are one recording"
     )
@@ -111,7 +128,7 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     fit.add_argument("--scheduler", metavar="ADDRESS", help="fit on the workers of this Dask scheduler")
     fit.add_argument("--workers", type=int, metavar="N", help="fit on a Dask cluster of N workers on this machine")
 
-    check = command("check", _check, "check a recording against a model")
+    check = command("check", _check, "check a recording against a model", silent, "say what took how long")
     check.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     check.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders")
     check.add_argument("--violations", type=int, help="alarm: so many violations (default: the model's)")
@@ -119,7 +136,13 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     check.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
     check.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
 
-    validate = command("validate", _validate, "tell how far to trust a model, by leaving out what it was fitted to")
+    validate = command(
+        "validate",
+        _validate,
+        "tell how far to trust a model, by leaving out what it was fitted to",
+        silent,
+        "say every fit, and what took how long",
+    )
     validate.add_argument("model", metavar="MODEL", help="model file")
     validate.add_argument(
         "bags", metavar="BAG", nargs="*", help="MCAP files and folders (default: those the model was fitted to)"
@@ -139,7 +162,12 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     info.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     info.add_argument("--json", action="store_true", help="print the file as JSON")
 
-    reproduce = command("reproduce", _reproduce, "run the paper's experiment on the nonlinear turbofan")
+    reproduce = command(
+        "reproduce",
+        _reproduce,
+        "run the paper's experiment on the nonlinear turbofan",
+        "print errors only; everything is in the folder",
+    )
     reproduce.add_argument(
         "--output", default="reproduce-output", metavar="FOLDER", help="for figures, models and numbers"
     )
@@ -167,23 +195,12 @@ def _budget(text: str) -> float:
     return int(text) if text.isdigit() else float(text)
 
 
-def _progress(text: str) -> Any:
-    """A bar on a terminal, nothing elsewhere."""
-    from tqdm import tqdm
-
-    def wrap(messages: Iterable[object], total: int) -> Iterable[object]:
-        bar: Iterable[object] = tqdm(messages, desc=text, total=total, unit=" messages", leave=False, disable=None)
-        return bar
-
-    return wrap
-
-
 def _topics(options: argparse.Namespace) -> int:
     from uncertain_lti.bag import Bag, describe
     from uncertain_lti.report import number, table
 
     bag = Bag(options.bag)
-    facts = describe(bag)
+    facts = describe(bag, options.progress.iterate("reading"))
     if options.json:
         _print_json(
             {
@@ -207,7 +224,7 @@ def _topics(options: argparse.Namespace) -> int:
             }
         )
         return DONE
-    _say(bag.warnings)
+    _say(options, bag.warnings)
     rows = []
     for f in facts:
         stamps: str = f.stamps
@@ -233,16 +250,25 @@ def _fit(options: argparse.Namespace) -> int:
         raise BagError(f"{output}: the folder {output.parent} is not there; make it first")
     if options.cache or options.scheduler or options.workers:
         return _fit_archive(options, output)
-    transients = read_transients(options.bags, options.signals, _progress("reading"))
-    if not options.json:
-        for transient in transients:
-            _say(transient.notes)
-            print(recording_text(transient))
+    transients = read_transients(options.bags, options.signals, options.progress.iterate("reading"))
+    for transient in transients:
+        if not options.json:
+            _say(options, transient.notes)
+        _tell(options, recording_text(transient))
     began = time.perf_counter()
-    model = fit(transients, options.criterion, additive=options.additive, discard=options.discard, count=options.count)
+    with options.progress.stage("fitting") as step:
+        model = fit(
+            transients,
+            options.criterion,
+            additive=options.additive,
+            discard=options.discard,
+            count=options.count,
+            progress=step,
+        )
     sources = [{"file": name, "sha256": _sha256(name)} for t in transients for name in t.sources]
     model = model.with_(fit={**model.fit, "sources": sources})
-    left_out = leave_out_cheaply(transients, model, time.perf_counter() - began)
+    with options.progress.stage("validating") as step:
+        left_out = leave_out_cheaply(transients, model, time.perf_counter() - began, step)
     if left_out is not None:
         model = model.with_(validation=left_out)
     model.save(output)
@@ -250,10 +276,10 @@ def _fit(options: argparse.Namespace) -> int:
         data = model.to_dict()
         _print_json({"model": str(output), "fit": data["fit"], "validation": data["validation"]})
     else:
-        print(fit_text(model, transients))
+        _tell(options, fit_text(model, transients))
         if left_out is not None:
-            print(left_out_text(left_out))
-        print(f"model written to {output}")
+            _tell(options, left_out_text(left_out))
+        _tell(options, f"model written to {output}")
     return DONE
 
 
@@ -274,34 +300,39 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
         if options.scheduler or options.workers:
             dask: Any = import_module("distributed")
 
-            where = options.scheduler or stack.enter_context(
-                dask.LocalCluster(
-                    n_workers=options.workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-                )
-            )
+            where = options.scheduler or stack.enter_context(_local_cluster(dask, options.workers))
             try:
                 client = stack.enter_context(dask.Client(where, timeout=10))
             except (OSError, TimeoutError, ValueError):
                 raise FitError(f"no Dask scheduler answers at {where}; start one with `dask scheduler`") from None
-        say = print if sys.stderr.isatty() and not options.json else None
-        model = fit_archive(
-            options.bags,
-            options.signals,
-            options.criterion,
-            options.additive,
-            cache=options.cache,
-            client=client,
-            progress=say,
-        )
+        with options.progress.stage("fitting") as step:
+            model = fit_archive(
+                options.bags,
+                options.signals,
+                options.criterion,
+                options.additive,
+                cache=options.cache,
+                client=client,
+                progress=step,
+            )
     sources = [{**s, "sha256": _sha256(s["file"])} for s in model.fit["sources"]]
     model = model.with_(fit={**model.fit, "sources": sources})
     model.save(output)
     if options.json:
         _print_json({"model": str(output), "fit": model.to_dict()["fit"]})
     else:
-        print(archive_text(model))
-        print(f"model written to {output}")
+        _tell(options, archive_text(model))
+        _tell(options, f"model written to {output}")
     return DONE
+
+
+def _local_cluster(dask: Any, workers: int) -> Any:
+    """Worker processes that leave Ctrl-C to this one, which ends them."""
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # what a child is born with
+    try:
+        return dask.LocalCluster(n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def _sha256(path: str) -> str:
@@ -319,12 +350,11 @@ def _check(options: argparse.Namespace) -> int:
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
     results = []
     for bag in group_recordings(options.bags):
-        transient = read_for_model(bag, model, _progress("reading"))
-        _say(transient.notes)
+        transient = read_for_model(bag, model, options.progress.iterate("reading"))
+        _say(options, transient.notes)
         data = check_data(model, monitor.check(transient), samples=options.json)
         results.append(data)
-        if not options.json:
-            print(check_text(data))
+        _tell(options, check_text(data))
     if options.json:
         _print_json({"model": options.model, "alarm": any(r["alarm"] for r in results), "recordings": results})
     return ALARM if any(r["alarm"] for r in results) else DONE
@@ -345,12 +375,13 @@ def _validate(options: argparse.Namespace) -> int:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
     if options.output is not None and not Path(options.output).parent.is_dir():
         raise BagError(f"{options.output}: the folder {Path(options.output).parent} is not there; make it first")
-    transients = [read_for_model(bag, model, _progress("reading")) for bag in group_recordings(bags)]
+    transients = [read_for_model(bag, model, options.progress.iterate("reading")) for bag in group_recordings(bags)]
     for transient in transients:
-        _say(transient.notes)
-    validation = validate_model(
-        model, transients, blocks=options.blocks, gap=options.gap, confidence=options.confidence
-    )
+        _say(options, transient.notes)
+    with options.progress.stage("validating") as step:
+        validation = validate_model(
+            model, transients, blocks=options.blocks, gap=options.gap, confidence=options.confidence, progress=step
+        )
     data = validation.to_dict()
     if options.false_alarms is not None:
         calibration = calibrate(validation, options.false_alarms)
@@ -363,9 +394,9 @@ def _validate(options: argparse.Namespace) -> int:
     if options.json:
         _print_json({"model": options.output or options.model, "validation": model.to_dict()["validation"]})
     else:
-        print(validation_text(data))
+        _tell(options, validation_text(data))
         if options.output is not None:
-            print(f"model written to {options.output}")
+            _tell(options, f"model written to {options.output}")
     return DONE
 
 
@@ -373,7 +404,8 @@ def _reproduce(options: argparse.Namespace) -> int:
     from uncertain_lti.reproduce import reproduce
 
     try:
-        reproduce(options.output)
+        with options.progress.stage("reproducing") as step:
+            reproduce(options.output, options.progress.say, step)
     except OSError as error:
         raise BagError(f"{options.output}: cannot be written: {error.strerror}; choose another folder") from None
     return DONE
@@ -398,14 +430,20 @@ def _info(options: argparse.Namespace) -> int:
     return DONE
 
 
+def _tell(options: argparse.Namespace, text: str) -> None:
+    """Print part of a summary for a person, unless told otherwise."""
+    if not options.json:
+        options.progress.say(text)
+
+
 def _print_json(data: Any) -> None:
     json.dump(data, sys.stdout, allow_nan=False, indent=1)
     sys.stdout.write("\n")
 
 
-def _say(notes: Iterable[str]) -> None:
+def _say(options: argparse.Namespace, notes: Iterable[str]) -> None:
     for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+        options.progress.note(note)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import reprlib
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.errors import ModelError, SignalError
+from uncertain_lti.files import whole_file
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.signals import Signal, SignalMap
 from uncertain_lti.transient import Transient
@@ -439,21 +439,10 @@ class UncertainLTI:
             raise ModelError(
                 f"{path}: the model holds what JSON cannot ({error}); mend its fit or validation"
             ) from None
-        folder = os.path.dirname(os.path.abspath(path))
-        temporary = None
         try:
-            descriptor, temporary = tempfile.mkstemp(dir=folder, prefix=".model-", suffix=".tmp")
-            with os.fdopen(descriptor, "wb") as stream:
+            with whole_file(path) as stream:
                 stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-            mask = os.umask(0)
-            os.umask(mask)
-            os.chmod(temporary, 0o666 & ~mask)
-            os.replace(temporary, path)
         except OSError as error:
-            if temporary is not None and os.path.exists(temporary):
-                os.unlink(temporary)
             raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
     @classmethod

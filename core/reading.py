@@ -7,6 +7,7 @@ import os
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,7 +128,7 @@ def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, 
     return sources
 
 
-def sample(stream: Stream, signals: SignalMap) -> Transient:
+def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Transient:
     """One recording through the `Sampler`; signals must be resolved."""
     sampler = Sampler(signals)
     topics = signals.topics
@@ -136,9 +137,10 @@ def sample(stream: Stream, signals: SignalMap) -> Transient:
     x: list[NDArray[np.float64]] = []
     u: list[NDArray[np.float64]] = []
     m = len(signals.controls)
-    for position, arrival, stamp in zip(
-        stream.topic.tolist(), stream.arrival.tolist(), stream.stamp.tolist(), strict=True
-    ):
+    messages: Iterable[Any] = zip(stream.topic.tolist(), stream.arrival.tolist(), stream.stamp.tolist(), strict=True)
+    if progress is not None:
+        messages = progress(messages, len(stream.topic))
+    for position, arrival, stamp in messages:
         for step in sampler.push(topics[position], arrival, stamp if stamp >= 0 else None, next(rows[position])):
             if step.status.dropped:
                 continue
@@ -180,7 +182,8 @@ def read_transients(
     signals : SignalMap or path
         A map, or the signals file.
     progress : callable, optional
-        Wraps the message iterator, given the number of messages: (iterable, total) -> iterable.
+        Wraps what goes through the messages of a recording, given their number: (iterable, total) -> iterable; once
+        while they are read and once while samples are cut from them.
 
     Returns
     -------
@@ -214,13 +217,13 @@ def read_transients(
             times = s.stamp[chosen] if sources[topic] == "header" else s.arrival[chosen]
             instants[topic].append(times[times >= 0])
     resolved = resolve(signals, instants, sources)
-    transients = [sample(stream, resolved) for stream in streams]
+    transients = [sample(stream, resolved, progress) for stream in streams]
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
     if not asked:
         return transients
     resolved, words = _resolve_operating_point(resolved, transients)
     if any(FieldPath(s.field).unwrap for s in asked):  # the branch of an angle starts nearest to steady
-        transients = [sample(stream, resolved) for stream in streams]
+        transients = [sample(stream, resolved, progress) for stream in streams]
     numbers = ", ".join(f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals)
     note = f"operating point from {words}: {numbers}"
     return [_with_signals(t, resolved, note if t is transients[0] else None) for t in transients]
@@ -266,7 +269,7 @@ def read_for_model(
             f"{bag.path}: no message of {signals.clock} has a stamp, and the model goes by them; fit it to such "
             f"recordings, with time: log for that topic"
         )
-    return sample(stream, signals)
+    return sample(stream, signals, progress)
 
 
 def _types(bags: Sequence[Bag], signals: SignalMap) -> Mapping[str, str]:

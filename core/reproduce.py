@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from uncertain_lti.files import whole_file
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.model import UncertainLTI
@@ -103,7 +104,11 @@ class Case:
         }
 
 
-def reproduce(output: str | os.PathLike[str], say: Callable[[str], None] = print) -> dict[str, Any]:
+def reproduce(
+    output: str | os.PathLike[str],
+    say: Callable[[str], None] = print,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, Any]:
     """Run the experiment, write figures, models, `reproduce.txt` and `reproduce.json` to a folder.
 
     Parameters
@@ -112,6 +117,8 @@ def reproduce(output: str | os.PathLike[str], say: Callable[[str], None] = print
         Folder; made where it is not there.
     say : callable
         Takes each part of the text as it is ready.
+    progress : callable, optional
+        Called with one line of text before each simulation, fit and search.
 
     Returns
     -------
@@ -131,14 +138,16 @@ def reproduce(output: str | os.PathLike[str], say: Callable[[str], None] = print
         lines.append(text)
         say(text)
 
+    step = progress or (lambda text: None)
     tell(trim_text())
+    step("simulating the recordings")
     up, down = (simulate(make_run("pulses", a)) for a in (SMALL, -SMALL))
     large = [simulate(make_run("pulses", a)) for a in (LARGE, -LARGE)]
     noisy = [simulate(make_run("pulses", a, NOISE, seed)) for a, seed in ((LARGE, 1), (-LARGE, 2))]
     check, noisy_check = simulate(make_run("check")), simulate(make_run("check", noise=NOISE, seed=4))
     paper, both, wide = f"+{SMALL:.0%} (the paper's)", f"±{SMALL:.0%}", f"±{LARGE:.0%}"
-    cases = [
-        Case.of(name, transients, recording, criterion, additive)
+    wanted = [
+        (name, transients, recording, criterion, additive)
         for name, transients, recording, additive in (
             (paper, [up], check, "none"),
             (both, [up, down], check, "none"),
@@ -149,6 +158,10 @@ def reproduce(output: str | os.PathLike[str], say: Callable[[str], None] = print
         )
         for criterion in ("qp", "lp")
     ]
+    cases = []
+    for number_of, (name, transients, recording, criterion, additive) in enumerate(wanted, start=1):
+        step(f"fit {number_of} of {len(wanted)}: {name}")
+        cases.append(Case.of(name, transients, recording, criterion, additive))
     tell(cases_text(cases))
     tell(width_text(cases))
     first, chosen = cases[0], next(c for c in cases if c.name == wide)
@@ -156,6 +169,7 @@ def reproduce(output: str | os.PathLike[str], say: Callable[[str], None] = print
     tell(matrix_text(chosen.model, f"(10) from {wide}"))
     searches = []
     for name, transients in ((paper, [up]), (wide, large)):
+        step(f"direct search from {name}")
         exact = next(c for c in cases if c.name == name)
         found = direct_search(transients)
         searches.append(
@@ -181,8 +195,9 @@ def reproduce(output: str | os.PathLike[str], say: Callable[[str], None] = print
         "direct_search": searches,
         "published_eigenvalues": [[v.real, v.imag] for v in leibov2006().eigenvalues().tolist()],
     }
-    (folder / "reproduce.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    (folder / "reproduce.txt").write_text("\n\n".join(lines) + "\n", encoding="utf-8")
+    for name, text in (("reproduce.json", json.dumps(data, indent=1)), ("reproduce.txt", "\n\n".join(lines))):
+        with whole_file(folder / name) as stream:
+            stream.write(f"{text}\n".encode())
     say(f"models, figures (check.png, check_paper_pulses.png), reproduce.txt and reproduce.json are in {folder}")
     return data
 
@@ -328,4 +343,5 @@ def check_figure(case: Case, path: str | os.PathLike[str]) -> None:
         f"Lever from 68 to 60 deg. Identified by (10) from pulses of {case.name}: {case.inside_all:.0%} of the "
         f"transitions inside all bounds"
     )
-    figure.savefig(path, dpi=110)
+    with whole_file(path) as stream:
+        figure.savefig(stream, dpi=110, format=os.path.splitext(path)[1][1:] or "png")

@@ -494,14 +494,19 @@ def validate_model(
     blocks: int | None = None,
     gap: float | None = None,
     confidence: float = 0.9,
+    progress: Callable[[str], None] | None = None,
 ) -> Validation:
     """Validate a fitted model, or one from a file, with the recordings it was fitted to and the options it names.
+
+    Arguments as in `validate`.
 
     Raises
     ------
     FitError
         Beside those of `validate`: the model does not say how it was fitted, or the recordings do not give it again.
     """
+    if progress is not None:
+        progress("the fit to all recordings")
     again = fit(transients, operating_point=model.operating_point, **_options(model))
     if not _same(again, model):
         raise FitError(
@@ -516,6 +521,7 @@ def validate_model(
         gap=gap,
         confidence=confidence,
         full=again,
+        progress=progress,
         **_options(model),
     )
 
@@ -543,7 +549,11 @@ def _same(one: UncertainLTI, other: UncertainLTI) -> bool:
 
 
 def leave_out_cheaply(
-    transients: Sequence[Transient], model: UncertainLTI, seconds: float, budget: float = 5.0
+    transients: Sequence[Transient],
+    model: UncertainLTI,
+    seconds: float,
+    progress: Callable[[str], None] | None = None,
+    budget: float = 5.0,
 ) -> dict[str, Any] | None:
     """The summary of `validate` beside a fit that took so many seconds; None where it would take over `budget` s."""
     parts = len(transients) if len(transients) > 1 else BLOCKS
@@ -551,7 +561,12 @@ def leave_out_cheaply(
         return None
     try:
         return validate(
-            transients, operating_point=model.operating_point, alarm=model.alarm, full=model, **_options(model)
+            transients,
+            operating_point=model.operating_point,
+            alarm=model.alarm,
+            full=model,
+            progress=progress,
+            **_options(model),
         ).to_dict()
     except FitError:  # too little is left when a part is left out: the fit itself stands
         return None

@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 import uncertain_lti
 
 ROOT = Path(__file__).resolve().parent.parent
-LIVE = ["errors", "signals", "sampler", "transient", "operating_point", "model", "monitor"]
+LIVE = ["errors", "files", "signals", "sampler", "transient", "operating_point", "model", "monitor"]
 
 # Where the name to import is not the name to install.
 PIP_NAME = {"yaml": "pyyaml"}

@@ -24,7 +24,7 @@ from uncertain_lti.errors import BagError, SignalError, UncertainLTIError
 from uncertain_lti.signals import TypeFields
 from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.process import Life, living
-from uncertain_lti_ros.terminal import Progress, say, seconds
+from uncertain_lti_ros.terminal import Progress, hush, say, seconds, tell
 
 CLOCK = "/clock"
 _DEPTH = 1000
@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="wait after each message until this envelope_monitor has taken it; as fast as it can, and exact also "
         "where log time is the clock (then with --clock, and the node with use_sim_time)",
     )  # fmt: skip
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
 
 
 @dataclass
@@ -72,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
     UncertainLTIError
         The node of --lockstep is not there or does not take a message.
     """
+    hush(args.quiet)
     if args.lockstep and args.rate is not None:
         raise UncertainLTIError("--lockstep goes as fast as the node takes messages; leave out --rate")
     bag = Bag(args.bag)
@@ -96,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         if missed:
             say(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     sent = sum(p.sent for p in played.values())
-    print(f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s")
+    tell(f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s")
     return 0
 
 

@@ -17,7 +17,7 @@ from uncertain_lti.errors import BagError
 from uncertain_lti_ros.messages import definition, message_class
 from uncertain_lti_ros.process import Life, living
 from uncertain_lti_ros.subscriptions import MatchedSubscription
-from uncertain_lti_ros.terminal import Progress, say, seconds
+from uncertain_lti_ros.terminal import Progress, hush, say, seconds, tell
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
 _LOOK = 0.5  # s between two looks at the graph
@@ -34,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--note", action="append", default=[], type=_note, metavar="NAME=TEXT",
         help="write this to the file as well, in a metadata record; may be given several times",
     )  # fmt: skip
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     SignalError
         The message type of a topic is not installed.
     """
+    hush(args.quiet)
     output = Path(args.output)
     if output.suffix != ".mcap":
         output = output.with_name(f"{output.name}.mcap")
@@ -56,12 +58,12 @@ def run(args: argparse.Namespace) -> int:
         types = _wait_for(life, topics, args.wait)
         subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics if topic in types]
         if subscriptions:
-            print(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C", flush=True)
+            tell(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
             _record(life, subscriptions, file, args.duration)
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
-    print(
+    tell(
         f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s"
         + (f", {lost} lost on the way" if lost else "")
     )

@@ -3,10 +3,25 @@
 import sys
 import time
 
+_hushed = False
+
+
+def hush(wanted: bool) -> None:
+    """From here on say nothing to the person who waits, or speak again."""
+    global _hushed
+    _hushed = wanted
+
 
 def say(text: str) -> None:
     """Remark to the person who waits, apart from the result."""
-    print(text, file=sys.stderr, flush=True)
+    if not _hushed:
+        print(text, file=sys.stderr, flush=True)
+
+
+def tell(text: str) -> None:
+    """Part of the result."""
+    if not _hushed:
+        print(text, flush=True)
 
 
 def seconds(text: str) -> float:
@@ -21,7 +36,7 @@ class Progress:
     """One line on standard error that is written over, where that is a terminal."""
 
     def __init__(self) -> None:
-        self._terminal = sys.stderr.isatty()
+        self._terminal = sys.stderr.isatty() and not _hushed
         self._shown = 0.0
 
     def show(self, text: str) -> None:

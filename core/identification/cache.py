@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.errors import FitError
+from uncertain_lti.files import whole_file
 from uncertain_lti.identification.problem import BLOCK, Block, Columns, Problem
 
 Array = NDArray[np.float64]
@@ -66,7 +67,7 @@ class DiskPartition:
 class CacheWriter:
     """Writes a `DiskPartition` from problems that come one after the other, each of which fits in memory.
 
-    Use it as a context: left without an error, the folder is complete; else it has no facts and is not read.
+    Use it as a context: left without an error, the folder is complete; else what was written is removed.
 
     Parameters
     ----------
@@ -87,6 +88,7 @@ class CacheWriter:
         self._shape: tuple[int, int] | None = None
 
     def __enter__(self) -> CacheWriter:
+        self._made = not self.folder.exists()
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             strangers = {f.name for f in self.folder.iterdir()} - {_DATA, _FACTS}
@@ -123,15 +125,27 @@ class CacheWriter:
         self._count += size
 
     def __exit__(self, kind: object, *_: Any) -> None:
-        if kind is None and self._waiting:
-            self._write(self._waiting)
+        complete = False
+        try:
+            if kind is None and self._waiting:
+                self._write(self._waiting)
+            self._stream.close()
+            if kind is None and self._shape is not None:
+                n, p = self._shape
+                facts = {"format": _FORMAT, "transitions": self._count, "n": n, "p": p}
+                with whole_file(self.folder / _FACTS) as stream:
+                    stream.write(json.dumps(facts).encode())
+            complete = kind is None
+        finally:
+            if not complete:
+                self._remove()
+
+    def _remove(self) -> None:
         self._stream.close()
-        if kind is None and self._shape is not None:
-            n, p = self._shape
-            facts = {"format": _FORMAT, "transitions": self._count, "n": n, "p": p}
-            temporary = self.folder / (_FACTS + ".tmp")
-            temporary.write_text(json.dumps(facts))
-            temporary.replace(self.folder / _FACTS)
+        for name in (_FACTS, _DATA):
+            (self.folder / name).unlink(missing_ok=True)
+        if self._made:
+            self.folder.rmdir()
 
     def partition(self, weights: Array, columns: Columns) -> DiskPartition:
         """What was written."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,11 @@ _ACTIVE = 1e-7
 
 
 def choose_discards(
-    problem: Problem, criterion: str, structure: Structure | None, budget: int
+    problem: Problem,
+    criterion: str,
+    structure: Structure | None,
+    budget: int,
+    progress: Callable[[str], None] | None = None,
 ) -> list[tuple[int, float]]:
     """Greedy choice: again and again the transition whose absence lowers the objective most.
 
@@ -34,6 +39,8 @@ def choose_discards(
         The objective is the sum over rows of (10), or of δ of (11) relative to what it was.
     structure : Structure, optional
     budget : int
+    progress : callable, optional
+        Called with one line of text per transition that is sought.
 
     Returns
     -------
@@ -48,6 +55,8 @@ def choose_discards(
     gains: list[dict[int, float]] = [{} for _ in engine.rows]
     stale = set(range(len(engine.rows)))
     while len(chosen) < budget:
+        if progress is not None:
+            progress(f"discard {len(chosen) + 1} of {budget}")
         for i in stale:
             gains[i] = _gains(engine, engine.rows[i], criterion)
         total: dict[int, float] = {}

@@ -81,7 +81,7 @@ def fit(
     alarm : Alarm, optional
         Goes to the model file.
     progress : callable, optional
-        Called with one line of text per pass over the data.
+        Called with one line of text per pass over the data, and per discard.
 
     Returns
     -------
@@ -133,7 +133,7 @@ def fit(
 
     discarded: list[dict[str, Any]] = []
     if budget := _budget(discard, problem.N):
-        chosen = choose_discards(problem, criterion, structure, budget)
+        chosen = choose_discards(problem, criterion, structure, budget, progress)
         before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure, describe_on=None)
         for index, effect in chosen:
             transient, k = transients[problem.source[index]], int(problem.k[index])

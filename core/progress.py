@@ -1,0 +1,140 @@
+"""Progress: what a command says of itself while it works, on standard error."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, TextIO
+
+_DELAY = 0.4  # s; what is done sooner shows no bar
+_REDRAW = 0.1  # s
+_COUNTED = re.compile(r"\b(\d+) of (\d+)\b")
+
+
+class Progress:
+    """Bars on a terminal, nothing elsewhere; remarks, unless quiet; every line of the work, where verbose.
+
+    `iterate` gives what `read_transients(progress=)` takes, `stage` what `fit(progress=)`, `validate(progress=)` and
+    `fit_archive(progress=)` take. As a context it takes its bars away however the block ends.
+
+    Parameters
+    ----------
+    quiet : bool
+        Say nothing.
+    verbose : bool
+        Say every line that a stage is given, with the time since this object was made, also where no terminal is.
+    stream : text stream, optional
+        Default standard error.
+    """
+
+    def __init__(self, quiet: bool = False, verbose: bool = False, stream: TextIO | None = None) -> None:
+        self.quiet, self.verbose = quiet, verbose
+        self._stream = sys.stderr if stream is None else stream
+        self._began = time.perf_counter()
+        self._bars: list[Any] = []
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for bar in self._bars:
+            bar.close()
+        self._bars.clear()
+
+    @property
+    def shown(self) -> bool:
+        """Whether bars are drawn."""
+        return not self.quiet and self._stream.isatty()
+
+    def note(self, text: str) -> None:
+        """A remark that the reader should know, unless quiet."""
+        if not self.quiet:
+            self._write(f"note: {text}")
+
+    def say(self, text: str) -> None:
+        """Part of the result, on standard output, unless quiet; a bar stays below it."""
+        if self.quiet:
+            return
+        if any(not bar.disable for bar in self._bars):
+            from tqdm import tqdm
+
+            tqdm.write(text, file=sys.stdout)
+        else:
+            print(text)
+
+    def detail(self, text: str) -> None:
+        """A line for who asked to see the work."""
+        if self.verbose:
+            self._write(f"{time.perf_counter() - self._began:8.2f} s  {text}")
+
+    def iterate(self, what: str, unit: str = "messages") -> Callable[[Iterable[object], int], Iterable[object]] | None:
+        """Wrapper (iterable, total) -> iterable that shows how far it has come; None where nobody would see it."""
+
+        def wrap(items: Iterable[object], total: int) -> Iterator[object]:
+            began = time.perf_counter()
+            with self._bar(
+                iterable=items, desc=what, total=total, unit=f" {unit}", unit_scale=True, delay=_DELAY
+            ) as bar:
+                yield from bar
+            self.detail(f"{what}: {total} {unit} in {time.perf_counter() - began:.2f} s")
+
+        return wrap if self.shown or self.verbose else None
+
+    @contextmanager
+    def stage(self, what: str) -> Iterator[Callable[[str], None]]:
+        """Yields a callable for one line of text per step; a line that says `3 of 10` moves the bar there."""
+        began = drawn = time.perf_counter()
+        with ExitStack() as stack:
+            bar: Any = None
+
+            def step(text: str) -> None:
+                nonlocal bar, drawn
+                self.detail(f"{what}: {text}")
+                now = time.perf_counter()
+                if not self.shown or now - began < _DELAY or (bar is not None and now - drawn < _REDRAW):
+                    return
+                drawn = now
+                if bar is None:
+                    bar = stack.enter_context(self._bar(bar_format="{desc} [{elapsed}]"))
+                    bar.start_t -= now - began
+                if counted := _COUNTED.search(text):
+                    bar.bar_format = "{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
+                    bar.n, bar.total = int(counted[1]) - 1, int(counted[2])
+                bar.set_description_str(f"{what}: {text if len(text) <= 50 else f'{text[:47]}...'}")
+
+            yield step
+        self.detail(f"{what}: done in {time.perf_counter() - began:.2f} s")
+
+    @contextmanager
+    def _bar(self, **options: Any) -> Iterator[Any]:
+        from tqdm import tqdm
+
+        columns, lines = self._size()
+        bar = tqdm(file=self._stream, leave=False, ncols=columns, nrows=lines, disable=not self.shown, **options)
+        self._bars.append(bar)
+        try:
+            yield bar
+        finally:
+            bar.close()
+            if bar in self._bars:
+                self._bars.remove(bar)
+
+    def _size(self) -> tuple[int, int]:
+        """Columns and lines of the terminal; some say 0."""
+        try:
+            columns, lines = os.get_terminal_size(self._stream.fileno())
+        except (OSError, ValueError):
+            columns = lines = 0
+        return columns or 80, lines or 24
+
+    def _write(self, text: str) -> None:
+        if any(not bar.disable for bar in self._bars):
+            from tqdm import tqdm
+
+            tqdm.write(text, file=self._stream)
+        else:
+            print(text, file=self._stream, flush=True)

@@ -1,0 +1,229 @@
+"""Bars on a terminal and silence elsewhere; an interrupt leaves whole files or none."""
+
+import io
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from engine_bag import SIGNALS, engine_bag
+
+from uncertain_lti.cli import main
+from uncertain_lti.files import whole_file
+from uncertain_lti.identification.cache import CacheWriter
+from uncertain_lti.progress import Progress
+
+CLI = [sys.executable, "-m", "uncertain_lti.cli"]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "signals.yaml").write_text(SIGNALS)
+    engine_bag(tmp_path / "run.mcap")
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def long_run(tmp_path_factory):
+    """A recording whose fit, with the left-out ones, takes seconds."""
+    folder = tmp_path_factory.mktemp("long")
+    (folder / "signals.yaml").write_text(SIGNALS.replace("auto", "1.0"))
+    engine_bag(folder / "run.mcap", steps=12_000)
+    return folder
+
+
+def fit_arguments(folder, output="m.model.json"):
+    files = [str(folder / "run.mcap"), "--signals", str(folder / "signals.yaml")]
+    return ["fit", *files, "--output", str(folder / output), "--additive", "noise"]
+
+
+def on_a_terminal(command):
+    """What a process writes to a terminal that is its standard error."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs)
+    os.close(theirs)
+    written = b""
+    while True:
+        try:
+            piece = os.read(ours, 65536)
+        except OSError:  # the other end is closed
+            break
+        if not piece:
+            break
+        written += piece
+    os.close(ours)
+    return process.wait(), written.decode()
+
+
+def test_a_terminal_sees_bars_that_are_gone_at_the_end(long_run):
+    assert main(fit_arguments(long_run)) == 0
+    command = [*CLI, "validate", str(long_run / "m.model.json"), "--blocks", "300"]
+    status, written = on_a_terminal(command)
+    assert status == 0
+    assert "validating: fit" in written and "%|" in written
+    last = [line for line in written.replace("\r\n", "\n").splitlines() if not line.startswith("note: ")][-1]
+    assert not last.split("\r")[-1].strip(), "the last thing drawn is an empty line"
+    status, written = on_a_terminal([*command, "--quiet"])
+    assert (status, written) == (0, "")
+
+
+def test_no_terminal_no_bars(folder, capsys):
+    assert main(fit_arguments(folder)) == 0
+    said = capsys.readouterr()
+    assert "model written" in said.out
+    assert all(line.startswith("note: ") for line in said.err.splitlines())
+    assert main([*fit_arguments(folder), "--quiet"]) == 0
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", "")
+
+
+def test_quiet_keeps_errors_data_and_status(folder, capsys):
+    assert main(fit_arguments(folder)) == 0
+    model, run = str(folder / "m.model.json"), str(folder / "run.mcap")
+    bad = str(engine_bag(folder / "bad.mcap", change=lambda k, x: x + 5.0 * (k == 100)))
+    capsys.readouterr()
+    assert main(["check", model, bad, "-q"]) == 1
+    assert main(["validate", model, run, "-q"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert main(["check", model, run, "-q", "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["alarm"] is False and not said.err
+    assert main(["check", model, str(folder / "none.mcap"), "-q"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(SystemExit) as refusal:
+        main(["check", model, run, "-q", "-v"])
+    assert refusal.value.code == 2
+
+
+def test_verbose_tells_every_step(folder, capsys):
+    assert main([*fit_arguments(folder), "--verbose"]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note: ")]
+    assert sum("validating: fit" in line for line in lines) == 10
+    assert any("reading: " in line and "messages" in line for line in lines)
+    times = [float(line.split()[0]) for line in lines]
+    assert times == sorted(times)
+
+
+def test_a_line_that_counts_moves_the_bar():
+    screen = Terminal()
+    with Progress(stream=screen) as progress, progress.stage("fitting") as step:
+        time.sleep(0.5)
+        step("fit 4 of 10: without the third")
+        time.sleep(0.2)
+        step("pass 7: 12 samples outside")
+        progress.note("said while the bar stands")
+    assert " 30%" in screen.getvalue() and "pass 7: 12 samples outside" in screen.getvalue()
+    assert "note: said while the bar stands\n" in screen.getvalue()
+
+
+def test_bars_go_where_an_error_passes_through():
+    screen = Terminal()
+    with pytest.raises(KeyboardInterrupt), Progress(stream=screen) as progress:
+        wrap = progress.iterate("reading")
+        for number in wrap(range(100), 100):
+            time.sleep(0.02)
+            if number == 50:
+                raise KeyboardInterrupt
+    assert "reading" in screen.getvalue()
+    assert not screen.getvalue().rsplit("\r", 1)[-1].strip()
+
+
+# --- whole files -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError, ValueError, SystemExit])
+def test_a_file_is_whole_or_as_it_was(tmp_path, error):
+    target = tmp_path / "a.bin"
+    for before in (None, b"before"):
+        if before is not None:
+            target.write_bytes(before)
+        with pytest.raises(error), whole_file(target) as stream:
+            stream.write(b"half")
+            raise error
+        assert sorted(p.name for p in tmp_path.iterdir()) == ([] if before is None else ["a.bin"])
+        assert before is None or target.read_bytes() == before
+    with whole_file(target) as stream:
+        stream.write(b"after")
+    assert target.read_bytes() == b"after" and len(list(tmp_path.iterdir())) == 1
+    assert target.stat().st_mode & 0o777 == 0o666 & ~_umask()
+
+
+def _umask():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_what_is_no_file_is_written_to_and_stays():
+    with whole_file(os.devnull) as stream:
+        stream.write(b"gone")
+    assert not os.path.isfile(os.devnull)
+
+
+def test_an_interrupted_cache_leaves_nothing(tmp_path):
+    from uncertain_lti.identification.problem import assemble
+    from uncertain_lti.operating_point import OperatingPoint
+    from uncertain_lti.transient import Transient
+
+    rng = np.random.default_rng(0)
+    run = Transient(np.arange(50) * 0.1, rng.normal(size=(50, 1)), rng.normal(size=(50, 1)))
+    problem = assemble([run], OperatingPoint.identity(1, 1), None, "none")
+    for folder in (tmp_path / "new", tmp_path):
+        with pytest.raises(KeyboardInterrupt), CacheWriter(folder) as writer:
+            writer.add(problem)
+            raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cache", [False, True])
+def test_ctrl_c_at_any_time(long_run, cache):
+    """One line, status 130, and either the whole model or the file of before; no temporary files."""
+    output = long_run / "out"
+    output.mkdir(exist_ok=True)
+    model, folder = output / "m.model.json", output / "cache"
+    model.write_text("before")
+    more = ["--cache", str(folder)] if cache else []
+    began = time.monotonic()
+    finished = subprocess.run([*CLI, *fit_arguments(long_run, "out/m.model.json"), *more], capture_output=True)
+    took = time.monotonic() - began
+    assert finished.returncode == 0, finished.stderr
+    whole = json.loads(model.read_text())
+    interrupted, early = 0, []
+    for share in np.linspace(0.15, 1.0, 18):
+        model.write_text("before")
+        for file in folder.glob("*") if cache else ():
+            file.unlink()
+        process = subprocess.Popen(
+            [*CLI, *fit_arguments(long_run, "out/m.model.json"), *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        time.sleep(share * took)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+        lines = [line for line in said.decode().splitlines() if not line.startswith("note: ")]
+        left = {p.name for p in output.iterdir()} - {"cache"}
+        assert left == {"m.model.json"}
+        if process.returncode in (130, -signal.SIGINT) and b"uncertain-lti fit" in said:  # the same to a shell
+            interrupted += 1
+            assert len(lines) == 1 and "interrupted" in lines[0], said
+        elif process.returncode == 0:
+            assert not lines
+        else:  # before the command could begin: Python itself was starting
+            assert process.returncode == -signal.SIGINT or b"KeyboardInterrupt" in said
+            early.append(share)
+        text = model.read_text()
+        assert text == "before" or json.loads(text)["A"] == whole["A"]
+        if cache and folder.exists():
+            files = {p.name for p in folder.iterdir()}
+            assert files in (set(), {"transitions.f64", "facts.json"}), files
+    assert interrupted >= 5 and max(early, default=0.0) < 0.4, early
