@@ -247,19 +247,18 @@ class UncertainLTI:
     def columns_centre_and_half(self, z: Array, dt: Array, centre: Array, half: Array) -> None:
         """`centre_and_half` for samples in columns, into given arrays: z (n + m, K), dt (K,), centre, half (n, K)."""
         size = np.abs(z)
-        product = np.empty(len(dt))
-        for i in range(self.n):
-            rate = np.multiply(z[0], self._nominal[0][i], out=centre[i])
-            spread = np.multiply(size[0], self._spread[0][i], out=half[i])
-            for j in range(1, self.n + self.m):
-                rate += np.multiply(z[j], self._nominal[j][i], out=product)
-                spread += np.multiply(size[j], self._spread[j][i], out=product)
-            rate += self.c[i]
-            spread += self.dc[i]
-            rate *= dt
-            spread *= dt
-            rate += z[i]  # x + Δt (...), to the bit: addition commutes
-            spread += self.v[i]
+        product = np.empty(centre.shape)
+        np.multiply(z[0], self._nominal[0][:, None], out=centre)
+        np.multiply(size[0], self._spread[0][:, None], out=half)
+        for j in range(1, self.n + self.m):
+            centre += np.multiply(z[j], self._nominal[j][:, None], out=product)
+            half += np.multiply(size[j], self._spread[j][:, None], out=product)
+        centre += self.c[:, None]
+        half += self.dc[:, None]
+        centre *= dt
+        half *= dt
+        centre += z[: self.n]  # x + Δt (...), to the bit: addition commutes
+        half += self.v[:, None]
 
     def bounds(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0) -> tuple[Array, Array]:
         """One-step bounds, Leibov (2006), eqs. (6)(7) with the additive terms.

@@ -74,16 +74,52 @@ class Moments:
         return np.where(scale > 0, scale, 1.0)
 
 
+_PIECE = 2**18
+"""Numbers of z and x_next in a piece: they stay in the cache, and numpy is long enough at each operation on them for
+other threads not to wait for the interpreter."""
 _SINGLE_THREADED = 2**18
-"""Multiplications up to which OpenBLAS keeps a product on one thread; beyond, waking the others costs more here."""
+"""Multiplications up to which OpenBLAS keeps a product on one thread; waking the others costs more, for narrow ones."""
 
 
-def _pieces(part: Partition, rows: int) -> Iterator[Block]:
-    """All transitions, in pieces whose products of `rows` rows stay on one thread where that is still efficient."""
-    most = max(_SINGLE_THREADED // (rows * (part.p + 2)), 512)
+def _pieces(part: Partition) -> Iterator[Block]:
+    """All transitions, in pieces of a size that suits the cache."""
+    most = max(_PIECE // (part.p + part.n), 2048)
     for block in part.blocks():
+        if len(block) <= most:
+            yield block
+            continue
         for start in range(0, len(block), most):
             yield block.piece(start, start + most)
+
+
+def _stacked(columns: Array, width: int) -> Array:
+    """(r, K) as a stack (K / width, r, width), without a copy."""
+    rows, count = columns.shape
+    return columns.reshape(rows, count // width, width).transpose(1, 0, 2)
+
+
+def _gram(a: Array, b: Array) -> Array:
+    """a bᵀ, (r, s), of columns (r, K) and (s, K), on one thread where they are narrow."""
+    count = a.shape[1]
+    width = max(_SINGLE_THREADED // (len(a) * len(b)), 512)
+    whole = count - count % width
+    total: Array = a[:, whole:] @ b[:, whole:].T
+    if whole:
+        total = total + (_stacked(a[:, :whole], width) @ _stacked(b[:, :whole], width).transpose(0, 2, 1)).sum(axis=0)
+    return total
+
+
+def _product(matrix: Array, columns: Array) -> Array:
+    """matrix (s, r) @ columns (r, K), on one thread where it is narrow."""
+    count = columns.shape[1]
+    width = max(_SINGLE_THREADED // matrix.size, 512)
+    whole = count - count % width
+    total = np.empty((len(matrix), count))
+    if whole:
+        np.matmul(matrix, _stacked(columns[:, :whole], width), out=_stacked(total[:, :whole], width))
+    if whole < count:
+        np.matmul(matrix, columns[:, whole:], out=total[:, whole:])
+    return total
 
 
 def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Samples]]:
@@ -94,32 +130,37 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
     columns, n, p = part.columns, part.n, part.p
     q = p + columns.disturbance + columns.noise
     sums: Moments | None = None
-    sampled: list[list[Samples]] = [[] for _ in range(n)]
-    for block in _pieces(part, part.p + 2):
+    sampled: list[Block] = []
+    index: list[Index] = []
+    for block in _pieces(part):
         if stride:
-            chosen = np.arange(-(block.start + offset) % stride, len(block), stride)
-            for i in range(n):
-                sampled[i].append(_take(block, i, chosen, offset))
+            first = -(block.start + offset) % stride
+            sampled.append(block.every(first, stride))
+            index.append(np.arange(first, len(block), stride) + (block.start + offset))
         phi = block.phi(columns) * block.dt
-        psi = block.psi(columns)
-        psi *= block.dt
+        psi = np.empty((q, len(block)))
+        np.abs(phi[:p], out=psi[:p])  # Δt > 0
+        if columns.disturbance:
+            psi[p] = block.dt
+        if columns.noise:
+            psi[-1] = 1.0
         step = block.x_next - block.z[:n]
         weights = block.weights
-        gram = np.stack([(psi * weights[:, i]) @ psi.T for i in range(n)]) if weights.ndim == 2 else None
+        gram = np.stack([_gram(psi * weights[:, i], psi) for i in range(n)]) if weights.ndim == 2 else None
         coupled = None
         if weights.ndim == 3:
             parts = np.empty((n, q, n, q))
             for i in range(n):
                 for j in range(i, n):
-                    parts[i, :, j] = (psi * weights[:, i, j]) @ psi.T
+                    parts[i, :, j] = _gram(psi * weights[:, i, j], psi)
                     parts[j, :, i] = parts[i, :, j].T
             coupled = parts.reshape(n * q, n * q)
         found = Moments(
-            psi @ psi.T,
+            _gram(psi, psi),
             gram,
             coupled,
-            phi @ phi.T,
-            phi @ step.T,
+            _gram(phi, phi),
+            _gram(phi, step),
             np.einsum("ik,ik->i", step, step),
             psi.sum(axis=1),
             block.z.min(axis=1),
@@ -131,7 +172,18 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
         sums = found if sums is None else sums + found
     if sums is None:
         raise ValueError("a partition without transitions")
-    return sums, [Samples.join(s, p) for s in sampled]
+    return sums, _per_row(sampled, index, n, p)
+
+
+def _per_row(blocks: list[Block], index: list[Index], n: int, p: int) -> list[Samples]:
+    """Transitions as every row sees them."""
+    if not blocks:
+        return [Samples.join([], p)] * n
+    z, dt = np.hstack([b.z for b in blocks]), np.concatenate([b.dt for b in blocks])
+    rate = (np.hstack([b.x_next for b in blocks]) - z[:n]) / dt
+    root = np.hstack([np.broadcast_to(b.root_weights(), (n, len(b))) for b in blocks])
+    order = np.concatenate(index)
+    return [Samples(order, z, rate[i], dt, root[i]) for i in range(n)]
 
 
 @dataclass(frozen=True)
@@ -155,9 +207,12 @@ class Samples:
     @classmethod
     def join(cls, parts: Sequence[Samples], p: int) -> Samples:
         """All of them, in order of index, each index once."""
+        parts = [s for s in parts if len(s)]
         if not parts:
             nothing = np.empty(0)
             return cls(np.empty(0, dtype=np.intp), np.empty((p, 0)), nothing, nothing, nothing)
+        if len(parts) == 1:
+            return parts[0]
         index, first = np.unique(np.concatenate([s.index for s in parts]), return_index=True)
         return cls(
             index,
@@ -185,8 +240,8 @@ class Candidate:
     """A solution to hold against all samples, and the units in which its slack is measured.
 
     theta (r, n), d (q, n); size_unit (q,): size of a sample is size_unit·ψ; scale (n,): slack of row i is divided by
-    size x scale_i. limit (n,): δ of (11), or None; reach (n,): samples with less slack than this are wanted; most: so
-    many of them per row at most.
+    size x scale_i. limit (n,): δ of (11), or None. Samples are wanted that have less slack than reach (n,) from leaving
+    the bounds, or than room (n,) from being wider than the limit; most: so many of them per row at most.
     """
 
     theta: Array
@@ -195,6 +250,7 @@ class Candidate:
     scale: Array
     limit: Array | None
     reach: Array
+    room: Array
     most: int
 
 
@@ -212,36 +268,56 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     slacks: list[list[Array]] = [[] for _ in range(n)]
     kept = [0] * n
     reach = candidate.reach.copy()
-    scale = candidate.scale[:, None]
-    for block in _pieces(part, part.n):
+
+    # slack < reach is a comparison with half-widths that are smaller, for the width of (11) larger, by the reach
+    def shifted() -> tuple[Array, Array]:
+        unit = candidate.size_unit
+        return (
+            d - np.outer(reach * candidate.scale, unit),
+            d + np.outer(np.minimum(reach, candidate.room) * candidate.scale, unit),
+        )
+
+    inner, outer = shifted()
+    for block in _pieces(part):
         psi = block.psi(columns)
-        size = candidate.size_unit @ psi
-        size[size == 0.0] = np.inf  # at rest without an additive term nothing but rest is contained
-        half = d @ psi
-        slack = theta @ block.phi(columns)
-        slack -= block.rate()
-        np.abs(slack, out=slack)
-        np.subtract(half, slack, out=slack)
+        residual = _product(theta, block.phi(columns))
+        residual -= block.rate()
+        np.abs(residual, out=residual)
+        below = residual > _product(inner, psi)
         if candidate.limit is not None:
-            room = candidate.limit[:, None] / (2.0 * block.root_weights() * block.dt) - half
-            np.minimum(slack, room, out=slack)
-        slack /= size
-        slack /= scale
-        for i, row in enumerate(slack):
-            below = np.flatnonzero(row < reach[i])
-            if not len(below):
+            width = _product(outer, psi)
+            width *= block.dt
+            below |= width > candidate.limit[:, None] / (2.0 * block.root_weights())
+        changed = False
+        for i, row in enumerate(below):
+            chosen = np.flatnonzero(row)
+            if not len(chosen):
                 continue
-            found[i].append(_take(block, i, below, offset))
-            slacks[i].append(row[below])
-            kept[i] += len(below)
+            found[i].append(_take(block, i, chosen, offset))
+            slacks[i].append(_slack(candidate, i, psi[:, chosen], residual[i, chosen], found[i][-1]))
+            kept[i] += len(chosen)
             if kept[i] > 2 * candidate.most:
                 found[i], slacks[i], reach[i] = _least(found[i], slacks[i], candidate.most, part.p, reach[i])
                 kept[i] = len(found[i][0])
+                changed = True
+        if changed:
+            inner, outer = shifted()
     pairs = []
     for i in range(n):
         samples, _, held = _least(found[i], slacks[i], candidate.most, part.p, reach[i])
-        pairs.append((samples[0], held))
+        pairs.append((samples[0], held if candidate.limit is None else min(held, float(candidate.room[i]))))
     return pairs
+
+
+def _slack(candidate: Candidate, i: int, psi: Array, residual: Array, samples: Samples) -> Array:
+    """Slack of some samples of row i, in scaled units; see `scan`."""
+    half = candidate.d[:, i] @ psi
+    slack = half - residual
+    if candidate.limit is not None:
+        slack = np.minimum(slack, candidate.limit[i] / (2.0 * samples.root_weight * samples.dt) - half)
+    size = candidate.size_unit @ psi
+    size[size == 0.0] = 1.0  # at rest without an additive term nothing but rest is contained
+    return np.asarray(slack / (size * candidate.scale[i]))
 
 
 def _least(
@@ -278,17 +354,18 @@ def judge(part: Partition, model: UncertainLTI) -> Judged:
     """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`."""
     zeros = np.zeros(part.n)
     total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
-    for block in part.blocks():
+    for block in _pieces(part):
         centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
         model.columns_centre_and_half(block.z, block.dt, centre, half)
-        inside = (centre - half <= block.x_next) & (block.x_next <= centre + half)
-        outside = len(block) - np.count_nonzero(inside, axis=1)
         largest = 2.0 * half.max(axis=1)
         if block.weights.ndim == 1:
             weighted = largest * np.sqrt(block.weights)
         else:
             weighted = 2.0 * (half * block.root_weights()).max(axis=1)
-        total = total + Judged(outside, largest, weighted)
+        inside = centre - half <= block.x_next
+        centre += half
+        inside &= block.x_next <= centre
+        total = total + Judged(len(block) - np.count_nonzero(inside, axis=1), largest, weighted)
     return total
 
 

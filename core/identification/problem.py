@@ -16,7 +16,7 @@ from uncertain_lti.transient import Transient
 Array = NDArray[np.float64]
 Additive = Literal["none", "disturbance", "noise", "both"]
 
-BLOCK = 8192
+BLOCK = 16384
 """Transitions per pass block: their regressors stay in the cache."""
 
 
@@ -68,6 +68,12 @@ class Block:
         weights = self.weights if self.weights.ndim == 1 else self.weights[start:stop]
         part = slice(start, stop)
         return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights)
+
+    def every(self, first: int, stride: int) -> Block:
+        """A copy of every stride-th transition from the first."""
+        weights = self.weights if self.weights.ndim == 1 else self.weights[first::stride].copy()
+        part = slice(first, None, stride)
+        return Block(self.start, self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy(), weights)
 
     def rate(self) -> Array:
         """(x_next - x) / Δt, 1/s, (n, K)."""

@@ -32,6 +32,12 @@ WIDTH_SLACK = 1e-9
 """Relative room above δ of (11) in which its ties are broken; a solver needs some."""
 BOUNDED_TIE_BREAK = 1e-5
 """The same as TIE_BREAK among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
+REGULARISATION = 1e-4
+"""Weight of the squared widths beside δ in (11), for a solver of strictly convex programmes.
+
+With a weight that is small enough, and a small one is, the minimum of the sum is that of δ. Whether it was is seen from
+the optimum of δ alone, at the end.
+"""
 MAX_ROUNDS = 200
 _JOIN = 48  # samples that join a working set per round, at least; more where there are many unknowns
 
@@ -92,6 +98,7 @@ class Row:
         self.samples = Samples.join([], len(sums.low))
         self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
         self.limit: float | None = None  # δ of (11) in units of scale
+        self.exact = False  # (11) by the simplex method
         self._simplex: Simplex | None = None
         self._known: Index = np.empty(0, dtype=np.intp)
 
@@ -138,15 +145,30 @@ class Row:
         self.half = (self.fixed_d @ psi) / (size * self.scale)
         self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
 
-    def slack(self) -> Array:
-        """Slack of every held sample, (K,); see `passes.scan`."""
+    def slacks(self) -> tuple[Array, Array | None]:
+        """Slack of every held sample from leaving the bounds, and from being wider than (11) allows, (K,) each."""
         theta = self.theta[self.free_phi] / (self.unit_phi * self.scale)
         d = self.d[self.free_psi] / (self.unit_psi * self.scale)
         half = self.psi @ d + self.half
-        slack = half - np.abs(self.y - self.phi @ theta)
-        if self.limit is not None:
-            slack = np.minimum(slack, self.limit / self.width - half)
-        return np.asarray(slack)
+        inside = half - np.abs(self.y - self.phi @ theta)
+        return inside, None if self.limit is None else self.limit / self.width - half
+
+    def slack(self) -> Array:
+        """Slack of every held sample, (K,); see `passes.scan`."""
+        inside, room = self.slacks()
+        return inside if room is None else np.minimum(inside, room)
+
+    def reach(self, share: float) -> tuple[float, float]:
+        """Slack below which so large a share of all samples is expected: from leaving the bounds, from being too wide.
+
+        Where the widths of many samples are the largest one, which is so where noise alone makes them, only those
+        that are too wide matter.
+        """
+        inside, room = self.slacks()
+        least = 10 * TOLERANCE
+        wanted = max(float(np.quantile(inside, share)), least)
+        width = 0.0 if room is None else float(np.quantile(room, share))
+        return wanted, min(width, wanted) if width > 1e-6 else 0.0
 
     def widen_pool(self, tolerance: float = TOLERANCE, most: int | None = None) -> bool:
         """Let the most violated held samples join the working set; False where there is none to join."""
@@ -183,27 +205,73 @@ class Row:
         self.store(answer)
         return solver
 
+    def solve_regularised(self) -> str:
+        """(11) with a little of the squared widths."""
+        H, f = self.hessian(self.plain, self.plain_linear, BOUNDED_TIE_BREAK)
+        G, h = self._rows(self.pool)
+        size = len(f)
+        whole = np.zeros((size + 1, size + 1))
+        whole[:size, :size] = REGULARISATION * H
+        whole[size, size] = REGULARISATION
+        answer, solver = solve_qp(
+            whole,
+            np.append(REGULARISATION * f, 1.0),
+            G,
+            h,
+            np.append(self.lower, 0.0),
+            np.append(self.upper, np.inf),
+        )
+        self.store(answer[:-1])
+        self.limit = max(float(answer[-1]), 0.0)
+        return solver
+
     def solve_linear(self) -> str:
         """(11)."""
         if self._simplex is None:
-            cost = np.append(np.zeros(self.r + self.q), 1.0)  # minimise δ
-            self._simplex = Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
+            self._simplex = self._minimax()
         index = self.samples.index[self.pool]
         fresh = self.pool[~np.isin(index, self._known)]
         if len(fresh):
-            G, h = self.containment(fresh)
-            self._simplex.add(np.hstack([G, np.zeros((len(G), 1))]), h)
-            width = self.width[fresh]
-            unit = np.minimum(1.0, 1.0 / width)[:, None]  # δ - width x (ψ d + half) >= 0, scaled to order one
-            rows = np.hstack(
-                [np.zeros((len(fresh), self.r)), -width[:, None] * self.psi[fresh], np.ones((len(fresh), 1))]
-            )
-            self._simplex.add(rows * unit, width * self.half[fresh] * unit[:, 0])
+            self._simplex.add(*self._rows(fresh))
             self._known = index
         answer = self._simplex.solve()
         self.store(answer[:-1])
         self.limit = max(float(answer[-1]), 0.0)
         return "HiGHS simplex"
+
+    def least_width(self) -> float:
+        """A lower bound of δ, in units of scale: the optimum of (11) on the samples that decide it, then on more."""
+        assert self.limit is not None
+        inside, room = self.slacks()
+        assert room is not None
+        few = 2 * (self.r + self.q)
+        inside, room = inside[self.pool], room[self.pool]
+        least = np.argpartition(room, few)[:few] if len(room) > few else np.arange(len(room))
+        decisive = np.union1d(np.flatnonzero(inside < 1e-7), least)
+        bound = 0.0
+        for pool in (self.pool[decisive], self.pool):
+            simplex = self._minimax()
+            simplex.add(*self._rows(pool))
+            bound = max(bound, float(simplex.solve()[-1]))
+            if self.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+                break
+        return bound
+
+    def _minimax(self) -> Simplex:
+        """Minimise δ, the last unknown."""
+        cost = np.append(np.zeros(self.r + self.q), 1.0)
+        return Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
+
+    def _rows(self, pool: Index) -> tuple[Array, Array]:
+        """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
+        G, h = self.containment(pool)
+        width = self.width[pool]
+        unit = np.minimum(1.0, 1.0 / width)[:, None]  # δ - width x (ψ d + half) >= 0, scaled to order one
+        rows = np.hstack([np.zeros((len(pool), self.r)), -width[:, None] * self.psi[pool], np.ones((len(pool), 1))])
+        return (
+            np.vstack([np.hstack([G, np.zeros((len(G), 1))]), rows * unit]),
+            np.concatenate([h, width * self.half[pool] * unit[:, 0]]),
+        )
 
     def solve_bounded(self) -> str:
         """Least squared widths, then the centre, among the optima of (11)."""
@@ -222,8 +290,7 @@ class Row:
 
     def contradiction(self) -> tuple[int, float] | None:
         """(index of a sample, distance) that no elements within the structure can contain; None where there is none."""
-        cost = np.append(np.zeros(self.r + self.q), 1.0)
-        simplex = Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
+        simplex = self._minimax()
         G, h = self.containment(self.pool)
         simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
         answer = simplex.solve()
@@ -280,6 +347,7 @@ class WorkingSet:
         self.rows = [Row(i, self.sums, bounds) for i in range(fleet.n)]
         self.solvers: set[str] = set()
         self.rounds, self.passes = 0, 1
+        self._reach: Array | None = None  # (2, n)
 
     def quadratic(self) -> Solution:
         """Criterion (10)."""
@@ -293,16 +361,36 @@ class WorkingSet:
 
         def settle(rows: list[Row]) -> None:
             for row in rows:
-                row.limit = None if row.limit is None else float(deltas[row.i]) / row.scale
-            self._settle(rows, Row.solve_linear)
-            for row in rows:
+                if not row.exact:
+                    try:
+                        self._settle([row], Row.solve_regularised)
+                    except InfeasibleError:
+                        raise
+                    except FitError:
+                        row.exact = True
+                if row.exact:
+                    row.limit = None if row.limit is None else float(deltas[row.i]) / row.scale
+                    self._settle([row], Row.solve_linear)
                 if row.limit is None:  # nothing unknown: the widths are what the structure says
                     row.limit = float((row.width * row.half).max(initial=0.0))
                 deltas[row.i] = row.limit * row.scale
                 row.limit *= 1.0 + WIDTH_SLACK
             self._settle(rows, Row.solve_bounded)
 
-        self._run(settle)
+        self._start(settle)
+        self._prove(settle)
+        again = []
+        for row in self.rows:
+            if row.unknown and not row.exact:
+                least = row.least_width() * row.scale
+                self.solvers.add("HiGHS simplex")
+                row.exact = deltas[row.i] > (1.0 + WIDTH_SLACK) * least + 1e-13 * row.scale
+                deltas[row.i] = min(deltas[row.i], least)
+                if row.exact:
+                    again.append(row)
+        if again:  # the weight beside δ was too large for these rows
+            settle(again)
+            self._prove(settle)
         return self._solution(deltas)
 
     @property
@@ -314,7 +402,8 @@ class WorkingSet:
         """Largest violation of given elements over all transitions, in scaled units, (n,): one pass."""
         for row in self.rows:
             row.theta, row.d, row.limit = theta[:, row.i], d[:, row.i], None
-        found = self.fleet.scan(self._candidate(np.full(self.fleet.n, np.inf), 1))
+        everything = np.full(self.fleet.n, np.inf)
+        found = self.fleet.scan(self._candidate(everything, everything, most=1))
         for row, (samples, _) in zip(self.rows, found, strict=True):
             self._hold(row, samples)
         return self._solution().violation
@@ -337,23 +426,30 @@ class WorkingSet:
     # --- all samples ---
 
     def _run(self, settle: Callable[[list[Row]], None]) -> None:
+        self._start(settle)
+        self._prove(settle)
+
+    def _start(self, settle: Callable[[list[Row]], None]) -> None:
+        """Solve on the first samples."""
         for row, samples in zip(self.rows, self._first, strict=True):
             self._hold(row, samples)
             row.start()
             row.widen_pool(most=4 * (row.r + row.q))
         settle(self.rows)
+
+    def _prove(self, settle: Callable[[list[Row]], None]) -> None:
+        """Hold the solution against all samples, and solve again, until it contains them all."""
         if self.whole:
             return
         most = 2 * SUBSAMPLE + self.fleet.N // 500
+        share = 0.3 * most / self.fleet.N
         for _ in range(MAX_ROUNDS):
-            share = 0.7 * most / self.fleet.N
-            reach = np.array([max(float(np.quantile(row.slack(), share)), 10 * TOLERANCE) for row in self.rows])
+            wanted = np.array([row.reach(share) for row in self.rows]).T
             # the samples held after a pass are those of least slack, so the next reach would shrink: keep the first
-            reach = np.maximum(reach, getattr(self, "_reach", reach))
-            self._reach = reach
-            found = self.fleet.scan(self._candidate(reach, most))
+            self._reach = wanted = wanted if self._reach is None else np.maximum(wanted, self._reach)
+            found = self.fleet.scan(self._candidate(wanted[0], wanted[1], most))
             self.passes += 1
-            before = [(row.theta.copy(), row.d.copy()) for row in self.rows]
+            before = [(row.theta.copy(), row.d.copy(), row.limit) for row in self.rows]
             todo = []
             left = 0
             for row, (samples, _) in zip(self.rows, found, strict=True):
@@ -366,11 +462,11 @@ class WorkingSet:
                 return
             settle(self.rows if self.sums.coupled is not None else todo)
             moved = [self._moved(row, *old) for row, old in zip(self.rows, before, strict=True)]
-            if all(change < held for change, (_, held) in zip(moved, found, strict=True)):
+            if all(change == 0.0 or change < held for change, (_, held) in zip(moved, found, strict=True)):
                 return
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} passes; scale the signals to order one")
 
-    def _candidate(self, reach: Array, most: int) -> Candidate:
+    def _candidate(self, reach: Array, room: Array, most: int) -> Candidate:
         limits = [row.limit for row in self.rows]
         limit = None
         if all(value is not None for value in limits):
@@ -382,11 +478,14 @@ class WorkingSet:
             self.sums.rate_scale,
             limit,
             reach,
+            room,
             most,
         )
 
-    def _moved(self, row: Row, theta: Array, d: Array) -> float:
-        """Largest change of any sample's slack, in scaled units, since theta and d."""
+    def _moved(self, row: Row, theta: Array, d: Array, limit: float | None) -> float:
+        """Largest change of any sample's slack, in scaled units, since theta, d and the limit."""
+        if limit is not None and row.limit is not None and row.limit < limit * (1.0 - 1e-12):
+            return np.inf  # the optimum over more samples is no less, so this is rare
         p = self.fleet.p
         with np.errstate(divide="ignore", invalid="ignore"):
             per_column = np.abs(row.d - d) * np.where(row.size_unit > 0, 1.0 / row.size_unit, 0.0)
