@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
 from uncertain_lti.errors import FitError
-from uncertain_lti.identification import formulation
+from uncertain_lti.identification import formulation, passes, solvers
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import assemble
 from uncertain_lti.identification.structure import Structure
@@ -400,6 +400,71 @@ def test_moments_are_plain_sums():
     assert first.index.tolist() == second.index.tolist() == list(range(0, 200, 7))
     assert second.rate == pytest.approx(((s.x_next - s.x) / s.dt[:, None])[::7, 1])
     assert second.root_weight == pytest.approx(np.sqrt(weights[::7, 1]))
+
+
+@pytest.mark.parametrize("weights", ["ones", "per sample"])
+@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("most", [40, 10**6])
+def test_scan_brings_every_sample_below_the_reach_that_it_reports(weights, limited, most):
+    """Against the slack written out, with pieces and products that do not divide the number of samples."""
+    rng = np.random.default_rng(5)
+    transient = drawn(leibov2006(), 40_001, 3, noise=1e-3, jitter=0.3)
+    W = None if weights == "ones" else rng.uniform(0.5, 2, (40_001, 5))
+    problem = assemble([transient], OperatingPoint.identity(5, 4), W, "both")
+    sums, sampled = passes.moments(problem, 0, 7)
+    assert all(np.array_equal(s.index, np.arange(0, problem.N, 7)) for s in sampled)
+    unit = 1.0 / sums.psi_scale
+    theta = np.linalg.solve(sums.centre, sums.target)
+    d = rng.uniform(0.5, 1.0, (len(unit), 5)) * unit[:, None] * sums.rate_scale
+    limit = rng.uniform(0.5, 2.0, 5) * sums.rate_scale if limited else None
+    phi, psi, root = problem.phi(), problem.psi(), np.sqrt(problem.row_weights())
+    half = psi @ d
+    size = (psi @ unit)[:, None] * sums.rate_scale
+    inside = (half - np.abs(problem.rate() - phi @ theta)) / size
+    room = (limit / (2 * root * problem.dt[:, None]) - half) / size if limited else np.full(inside.shape, np.inf)
+    reach = np.quantile(inside, 0.02, axis=0)
+    room_reach = np.maximum(np.quantile(room, 0.01, axis=0), 0.0) if limited else reach
+    found = passes.scan(problem, passes.Candidate(theta, d, unit, sums.rate_scale, limit, reach, room_reach, most))
+    for i, (samples, held) in enumerate(found):
+        edge = 1e-9 * np.abs(reach[i])
+        below = (inside[:, i] < held - edge) | (room[:, i] < min(held, room_reach[i]) - edge)
+        assert np.isin(np.flatnonzero(below), samples.index).all()
+        assert len(samples) <= most and (np.diff(samples.index) > 0).all()
+        if most > problem.N:
+            assert held == pytest.approx(min(reach[i], room_reach[i]) if limited else reach[i])
+            assert (np.minimum(inside, room)[samples.index, i] < max(reach[i], room_reach[i]) + edge).all()
+        np.testing.assert_allclose(samples.rate, problem.rate()[samples.index, i])
+        np.testing.assert_allclose(samples.root_weight, root[samples.index, i])
+
+
+def test_products_are_those_of_whole_matrices():
+    rng = np.random.default_rng(0)
+    for rows, count in ((3, 1), (9, 511), (9, 20_000), (70, 5000), (1, 2049)):
+        a, b = rng.standard_normal((rows, 2 * count))[:, ::2], rng.standard_normal((4, count))
+        np.testing.assert_allclose(passes._gram(a, b), a @ b.T, atol=1e-9)
+        np.testing.assert_allclose(passes._gram(b, b), b @ b.T, atol=1e-9)
+        M = rng.standard_normal((5, rows))
+        np.testing.assert_allclose(passes._product(M, a), M @ a, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_dual_bound_is_below_every_feasible_value_and_meets_the_optimum(seed):
+    rng = np.random.default_rng(seed)
+    M, G = rng.standard_normal((6, 6)), rng.standard_normal((40, 6))
+    H, f, h = M @ M.T + 1e-3 * np.eye(6), rng.standard_normal(6), G @ rng.uniform(0, 1, 6) - rng.uniform(0, 1, 40)
+    lower, upper = np.full(6, -5.0), np.full(6, 5.0)
+    answer = solvers.solve_qp(H, f, G, h, lower, upper)
+
+    def value(xi):
+        return 0.5 * xi @ H @ xi + f @ xi
+
+    best = value(answer.xi)
+    assert solvers.dual_bound(H, f, G, h, lower, upper, answer.xi) == pytest.approx(best, rel=1e-9, abs=1e-9)
+    for _ in range(20):  # a bound wherever it is taken
+        anywhere = answer.xi + 0.1 * rng.standard_normal(6)
+        assert solvers.dual_bound(H, f, G, h, lower, upper, anywhere) <= best + 1e-9
+    again = solvers.solve_qp(H, f, G, h, lower, upper, answer.active)
+    np.testing.assert_allclose(again.xi, answer.xi, atol=1e-10)
 
 
 def test_transients_weigh_as_the_user_says():

@@ -111,16 +111,19 @@ class CacheWriter:
         table = np.vstack([problem.z_columns, problem.next_columns, problem.dt])
         self._pending.append(table)
         self._waiting += table.shape[1]
-        while self._waiting >= BLOCK:
-            self._write(BLOCK)
+        if self._waiting >= BLOCK:
+            self._write(self._waiting - self._waiting % BLOCK)
 
     def _write(self, size: int) -> None:
+        """Write the first transitions that wait, so many of them, in blocks."""
         whole = np.hstack(self._pending)
         try:
-            np.ascontiguousarray(whole[:, :size], dtype="<f8").tofile(self._stream)
+            for start in range(0, size, BLOCK):
+                stop = min(start + BLOCK, size)
+                np.ascontiguousarray(whole[:, start:stop], dtype="<f8").tofile(self._stream)
         except OSError as error:
             raise FitError(f"{self.folder}: cannot be written: {error.strerror}; free some space") from None
-        self._pending = [whole[:, size:]]
+        self._pending = [whole[:, size:].copy()]
         self._waiting -= size
         self._count += size
 

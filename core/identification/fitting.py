@@ -243,7 +243,7 @@ def fit_fleet(
     facts: dict[str, Any] = {
         "criterion": criterion,
         "objective": float(objective[0]) if criterion == "qp" else objective,
-        "gap": max(gap, 0.0),
+        "gap": max(gap, 0.0) + (solution.gap or 0.0),
         "transitions": sums.count,
         "mean_width": mean_width,
         "max_width": max_width,

@@ -267,7 +267,7 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     found: list[list[Samples]] = [[] for _ in range(n)]
     slacks: list[list[Array]] = [[] for _ in range(n)]
     kept = [0] * n
-    reach = candidate.reach.copy()
+    reach = np.minimum(candidate.reach, 1e100)  # inf asks for all, and inf x 0 is nothing
 
     # slack < reach is a comparison with half-widths that are smaller, for the width of (11) larger, by the reach
     def shifted() -> tuple[Array, Array]:

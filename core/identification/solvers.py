@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,22 +11,45 @@ from numpy.typing import NDArray
 from uncertain_lti.errors import FitError
 
 Array = NDArray[np.float64]
+Sense = NDArray[np.int32]
 
 FEASIBLE = 1e-9
 """Largest violation, in scaled units, of an answer that counts as solved; the repair covers it."""
 
 
-def solve_qp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array) -> tuple[Array, str]:
+@dataclass(frozen=True)
+class Answer:
+    """Minimiser ξ (variables,) of a programme, who found it, and what is active of [bounds of ξ; rows of G].
+
+    active: 0 not, 1 at the upper, 3 at the lower bound (DAQP's words); None where the solver does not say.
+    """
+
+    xi: Array
+    solver: str
+    active: Sense | None
+
+
+def solve_qp(
+    H: Array,
+    f: Array,
+    G: Array,
+    h: Array,
+    lower: Array,
+    upper: Array,
+    active: Sense | None = None,
+    any_solver: bool = True,
+) -> Answer:
     """Minimise ½ ξᵀHξ + fᵀξ subject to G ξ >= h, lower <= ξ <= upper.
 
     H must be positive definite, everything scaled to order one. DAQP (dual active set, exact to rounding) first;
     PIQP, then OSQP with polishing, where it gives up.
 
-    Returns
-    -------
-    ξ : array (variables,)
-    solver : str
-        Who solved it.
+    Parameters
+    ----------
+    active : array of int, optional
+        `Answer.active` of a programme like this one, to start from.
+    any_solver : bool
+        The others may try where DAQP gives up.
 
     Raises
     ------
@@ -37,36 +61,44 @@ def solve_qp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array)
     H, f, G, lower, upper = H * np.outer(s, s), f * s, G * s, lower / s, upper / s
     norm = np.maximum(np.abs(G).max(axis=1, initial=0.0), 1e-300)
     G, h = G / norm[:, None], h / norm
-    best: tuple[float, Array, str] | None = None
-    for name, solver in (("DAQP", _daqp), ("PIQP", _piqp), ("OSQP", _osqp)):
-        answer = solver(H, f, G, h, lower, upper)
+    best: tuple[float, Answer] | None = None
+    for name, solver in _SOLVERS if any_solver else _SOLVERS[:1]:
+        answer, found = solver(H, f, G, h, lower, upper, active)
         if answer is None or not np.isfinite(answer).all():
             continue
         answer = np.clip(answer, lower, upper)
         violation = float(np.max(h - G @ answer, initial=0.0))
         if best is None or violation < best[0]:
-            best = (violation, answer * s, name)
+            best = (violation, Answer(answer * s, name, found))
         if violation <= FEASIBLE:
-            return answer * s, name
+            return best[1]
     if best is not None and best[0] <= 1e-4:  # the repair makes it contained; the gap reported says how good it is
-        return best[1], best[2]
-    raise FitError("no solver (DAQP, PIQP, OSQP) could solve the quadratic programme; scale the signals to order one")
+        return best[1]
+    names = ", ".join(name for name, _ in _SOLVERS)
+    raise FitError(f"no solver ({names}) could solve the quadratic programme; scale the signals to order one")
 
 
-def _daqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
+_Found = tuple[Array | None, Sense | None]
+
+
+def _daqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, active: Sense | None) -> _Found:
     import daqp
 
     size = len(f)
     bupper = np.concatenate([np.minimum(upper, 1e30), np.full(len(h), 1e30)])
     blower = np.concatenate([np.maximum(lower, -1e30), h])
-    sense = np.zeros(size + len(h), dtype=np.int32)
-    x, _, flag, _ = daqp.solve(
-        np.ascontiguousarray(H), f, np.ascontiguousarray(G), bupper, blower, sense, primal_tol=1e-11, iter_limit=20_000
-    )
-    return np.asarray(x, dtype=np.float64) if flag == 1 else None
+    H, G = np.ascontiguousarray(H), np.ascontiguousarray(G)
+    cold = np.zeros(size + len(h), dtype=np.int32)
+    for sense in (cold,) if active is None else (active.copy(), cold):
+        x, _, flag, info = daqp.solve(H, f, G, bupper, blower, sense, primal_tol=1e-11, iter_limit=20_000)
+        if flag == 1:
+            multiplier = np.asarray(info["lam"])
+            found = np.where(multiplier < 0, 3, np.where(multiplier > 0, 1, 0)).astype(np.int32)
+            return np.asarray(x, dtype=np.float64), found
+    return None, None
 
 
-def _piqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
+def _piqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, _: Sense | None) -> _Found:
     import piqp
 
     solver = piqp.DenseSolver()
@@ -76,10 +108,10 @@ def _piqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array) ->
     solver.setup(H, f, None, None, G, h, np.full(len(h), np.inf), lower, upper)
     status = solver.solve()
     done = (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED)
-    return np.array(solver.result.x, dtype=np.float64) if status in done else None
+    return (np.array(solver.result.x, dtype=np.float64) if status in done else None), None
 
 
-def _osqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
+def _osqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, _: Sense | None) -> _Found:
     import osqp
     import scipy.sparse as sparse
 
@@ -98,7 +130,31 @@ def _osqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array) ->
         verbose=False,
     )
     result = solver.solve()
-    return None if result.x is None or result.x[0] is None else np.asarray(result.x, dtype=np.float64)
+    return (None if result.x is None or result.x[0] is None else np.asarray(result.x, dtype=np.float64)), None
+
+
+_SOLVERS = (("DAQP", _daqp), ("PIQP", _piqp), ("OSQP", _osqp))
+
+
+def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array) -> float:
+    """A lower bound of the optimum of `solve_qp`, whoever found ξ: the dual objective at multipliers made for ξ.
+
+    Any non-negative multipliers give a bound; those that balance the gradient with what is active at ξ, by least
+    squares, give a tight one where ξ is optimal. -inf where there are none.
+    """
+    from scipy.optimize import nnls
+
+    rows = np.vstack([np.eye(len(f)), -np.eye(len(f)), G])
+    limits = np.concatenate([lower, -upper, h])
+    near = np.flatnonzero(rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0))
+    C = rows[near]
+    gradient = H @ xi + f
+    try:
+        multiplier = nnls(C.T, gradient)[0] if len(near) else np.empty(0)
+        left = C.T @ multiplier - f
+        return float(limits[near] @ multiplier - 0.5 * left @ np.linalg.solve(H, left))
+    except (RuntimeError, np.linalg.LinAlgError):  # too many iterations; singular
+        return -np.inf
 
 
 class Simplex:

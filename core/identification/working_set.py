@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uncertain_lti.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Moments, Samples
-from uncertain_lti.identification.solvers import Simplex, solve_qp
+from uncertain_lti.identification.solvers import Sense, Simplex, dual_bound, solve_qp
 from uncertain_lti.identification.structure import Structure
 
 Array = NDArray[np.float64]
@@ -47,7 +47,8 @@ class Solution:
     """theta (r, n) and d (q, n), one column per row of the model, and how they were found.
 
     violation (n,): largest violation left, in scaled units; delta (n,): optimum of (11) on the working set, a lower
-    bound of the optimum over all samples; None for (10).
+    bound of the optimum over all samples; None for (10). gap: how far (10) is above a lower bound of its optimum at
+    most, relative, by the dual objective; None for (11).
     """
 
     theta: Array
@@ -58,6 +59,7 @@ class Solution:
     passes: int = 1
     working: list[int] = field(default_factory=list)
     solvers: set[str] = field(default_factory=set)
+    gap: float | None = None
 
 
 class Row:
@@ -91,24 +93,25 @@ class Row:
         self.centre = sums.centre[inside] * np.outer(self.unit_phi, self.unit_phi) / sums.count
         target = sums.target[:, i] - sums.centre @ self.fixed_theta
         self.target = target[self.free_phi] * self.unit_phi / (sums.count * self.scale)
-        self.plain, self.plain_linear = self._gram(sums.plain_gram, sums.count)
-        self.gram, self.linear = (
-            (self.plain, self.plain_linear) if sums.gram is None else self._gram(sums.gram[i], sums.count)
-        )
+        plain = self._gram(sums.plain_gram, sums.count)
+        self.plain, self.plain_linear, _ = plain
+        self.gram, self.linear, self.known = plain if sums.gram is None else self._gram(sums.gram[i], sums.count)
         self.samples = Samples.join([], len(sums.low))
         self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
         self.limit: float | None = None  # δ of (11) in units of scale
         self.exact = False  # (11) by the simplex method
+        self._active: dict[str, Sense] = {}  # what was active in the last programme of a kind
         self._simplex: Simplex | None = None
         self._known: Index = np.empty(0, dtype=np.intp)
 
-    def _gram(self, gram: Array, count: int) -> tuple[Array, Array]:
-        """Squared widths as ½ dᵀ G d + gᵀ d in scaled units; G has order one."""
+    def _gram(self, gram: Array, count: int) -> tuple[Array, Array, float]:
+        """Squared widths as ½ dᵀ G d + gᵀ d + k in scaled units; G has order one."""
         unit = self.unit_psi
         inside = gram[np.ix_(self.free_psi, self.free_psi)] * np.outer(unit, unit) / count
         linear = (gram @ self.fixed_d)[self.free_psi] * unit / (count * self.scale)
         largest = float(np.diagonal(inside).max(initial=0.0)) or 1.0
-        return inside / largest, linear / largest
+        known = 0.5 * float(self.fixed_d @ gram @ self.fixed_d) / (count * self.scale**2)
+        return inside / largest, linear / largest, known / largest
 
     @property
     def unknown(self) -> bool:
@@ -198,10 +201,35 @@ class Row:
 
     # --- programmes of this row on its working set ---
 
+    def _solve(
+        self,
+        kind: str,
+        H: Array,
+        f: Array,
+        G: Array,
+        h: Array,
+        lower: Array,
+        upper: Array,
+        any_solver: bool = True,
+    ) -> tuple[Array, str]:
+        """Solve a programme whose rows are some for each sample of the pool, from what was active last time."""
+        fixed, per_sample = len(f), len(h) // max(len(self.pool), 1)
+        start = None
+        if kind in self._active:
+            known = self._active[kind][fixed:].reshape(per_sample, -1)
+            known = known[:, : len(self.pool)]  # the pool grows, but for discards
+            start = np.zeros(fixed + len(h), dtype=np.int32)
+            start[:fixed] = self._active[kind][:fixed]
+            start[fixed:].reshape(per_sample, -1)[:, : known.shape[1]] = known
+        answer = solve_qp(H, f, G, h, lower, upper, start, any_solver)
+        if answer.active is not None:
+            self._active[kind] = answer.active
+        return answer.xi, answer.solver
+
     def solve_quadratic(self) -> str:
         """(10)."""
         H, f = self.hessian(self.gram, self.linear, TIE_BREAK)
-        answer, solver = solve_qp(H, f, *self.containment(self.pool), self.lower, self.upper)
+        answer, solver = self._solve("quadratic", H, f, *self.containment(self.pool), self.lower, self.upper)
         self.store(answer)
         return solver
 
@@ -213,7 +241,8 @@ class Row:
         whole = np.zeros((size + 1, size + 1))
         whole[:size, :size] = REGULARISATION * H
         whole[size, size] = REGULARISATION
-        answer, solver = solve_qp(
+        answer, solver = self._solve(
+            "regularised",
             whole,
             np.append(REGULARISATION * f, 1.0),
             G,
@@ -223,6 +252,8 @@ class Row:
         )
         self.store(answer[:-1])
         self.limit = max(float(answer[-1]), 0.0)
+        if (found := self._active.get("regularised")) is not None:
+            self._active["bounded"] = np.delete(found, size)  # all but δ
         return solver
 
     def solve_linear(self) -> str:
@@ -262,6 +293,19 @@ class Row:
         cost = np.append(np.zeros(self.r + self.q), 1.0)
         return Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
 
+    def duality_gap(self) -> float:
+        """How far the squared widths of this row are above the optimum at most, relative to it.
+
+        The tie-break adds at most TIE_BREAK / 4 of them to the optimum of the programme that is solved.
+        """
+        theta = self.theta[self.free_phi] / (self.unit_phi * self.scale)
+        d = self.d[self.free_psi] / (self.unit_psi * self.scale)
+        H, f = self.hessian(self.gram, self.linear, TIE_BREAK)
+        xi = np.concatenate([theta, d])
+        bound = dual_bound(H, f, *self.containment(self.pool), self.lower, self.upper, xi)
+        value = float(0.5 * d @ self.gram @ d + self.linear @ d) + self.known
+        return _relative_gap(float(0.5 * xi @ H @ xi + f @ xi) - bound, value)
+
     def _rows(self, pool: Index) -> tuple[Array, Array]:
         """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
         G, h = self.containment(pool)
@@ -276,16 +320,26 @@ class Row:
     def solve_bounded(self) -> str:
         """Least squared widths, then the centre, among the optima of (11)."""
         assert self.limit is not None
-        H, f = self.hessian(self.plain, self.plain_linear, BOUNDED_TIE_BREAK)
         G, h = self.containment(self.pool)
         width, limit = self.width[self.pool], self.limit
         if limit > 0:
             width, limit = width / limit, 1.0
         G = np.vstack([G, np.hstack([np.zeros((len(width), self.r)), -width[:, None] * self.psi[self.pool]])])
-        answer, solver = solve_qp(
-            H, f, G, np.concatenate([h, width * self.half[self.pool] - limit]), self.lower, self.upper
-        )
-        self.store(answer)
+        h = np.concatenate([h, width * self.half[self.pool] - limit])
+        for weight in (1.0, 10.0, 100.0):
+            H, f = self.hessian(self.plain, self.plain_linear, weight * BOUNDED_TIE_BREAK)
+            try:
+                answer, solver = self._solve(
+                    "bounded", H, f, G, h, self.lower, self.upper, any_solver=self.exact and weight == 100.0
+                )
+                self.store(answer)
+                return solver
+            except FitError:
+                if self.exact and weight == 100.0:
+                    raise
+        before = self.limit  # rounding has closed the room that WIDTH_SLACK leaves: as near to the ties' rule
+        solver = self.solve_regularised()
+        self.limit = max(before, self.limit * (1.0 + WIDTH_SLACK))
         return solver
 
     def contradiction(self) -> tuple[int, float] | None:
@@ -300,6 +354,10 @@ class Row:
         worst = self.pool[int(np.argmax(short)) % len(self.pool)]
         size = self.width[worst] / (2.0 * self.samples.root_weight[worst])
         return int(self.samples.index[worst]), float(answer[-1] * size * self.scale)
+
+
+def _relative_gap(above: float, value: float) -> float:
+    return (max(above, 0.0) / value if value > 0 else 0.0) + TIE_BREAK / 4
 
 
 class InfeasibleError(FitError):
@@ -348,12 +406,14 @@ class WorkingSet:
         self.solvers: set[str] = set()
         self.rounds, self.passes = 0, 1
         self._reach: Array | None = None  # (2, n)
+        self._coupled_gap = 0.0
 
     def quadratic(self) -> Solution:
         """Criterion (10)."""
         coupled = self.sums.coupled is not None
         self._run(self._settle_coupled if coupled else lambda rows: self._settle(rows, Row.solve_quadratic))
-        return self._solution()
+        gap = self._coupled_gap if coupled else self._largest_gap()
+        return replace(self._solution(), gap=gap)
 
     def linear(self) -> Solution:
         """Criterion (11), then least sum of squared widths among its optima, then the centre."""
@@ -392,6 +452,9 @@ class WorkingSet:
             settle(again)
             self._prove(settle)
         return self._solution(deltas)
+
+    def _largest_gap(self) -> float:
+        return max((row.duality_gap() for row in self.rows if row.unknown), default=0.0)
 
     @property
     def weights(self) -> Array | None:
@@ -576,13 +639,18 @@ class WorkingSet:
         H[np.ix_(where_d, where_d)] = gram / largest + 1e-13 * np.diag(np.diagonal(gram) / largest)
         f[where_d] = linear / largest
         lower, upper = (np.concatenate([getattr(row, side) for row in rows]) for side in ("lower", "upper"))
+        h = np.concatenate([h for _, h in parts])
         try:
-            answer, solver = solve_qp(H, f, G, np.concatenate([h for _, h in parts]), lower, upper)
+            answer = solve_qp(H, f, G, h, lower, upper)
         except FitError:
             for row in rows:
                 if found := row.contradiction():
                     raise InfeasibleError(row.i, *found) from None
             raise
-        self.solvers.add(solver)
+        self.solvers.add(answer.solver)
         for k, row in enumerate(rows):
-            row.store(answer[starts[k] : starts[k + 1]])
+            row.store(answer.xi[starts[k] : starts[k + 1]])
+        xi, d = answer.xi, answer.xi[where_d]
+        above = float(0.5 * xi @ H @ xi + f @ xi) - dual_bound(H, f, G, h, lower, upper, xi)
+        value = (0.5 * d @ gram @ d + linear @ d + 0.5 * fixed @ self.sums.coupled @ fixed) / largest
+        self._coupled_gap = _relative_gap(above, float(value))
