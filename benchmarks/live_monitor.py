@@ -3,6 +3,12 @@
     ./run python benchmarks/live_monitor.py                        # the table: rates 500 Hz and 1 kHz, n = 5 and 50
     ./run python benchmarks/live_monitor.py --soak 600             # ten minutes at 1 kHz: memory and counters
 
+What the ratios are held against: with every output heard at most 0.6 times the CPU of the bare node on the default
+executor and 1.5 times that on the events executor, with only ~/violation heard 1.1 times; the flags at most 1 ms
+later than the bare node's callback in 99 of 100 cases; nothing lost. The rows "publishing only" are a node that takes
+the same messages as bytes and publishes as much as the monitor does, but samples and judges nothing: what is in
+that row is the price of rclpy and DDS, and only the rest is the monitor's own.
+
 One process publishes a state and a control message per sample (sensor_msgs/JointState, reliable, stamped with the
 time of publishing). Another one takes them: a bare node that subscribes and does nothing, on either executor, or the
 monitor. A third subscribes to what the monitor publishes. CPU is user and system time of the whole process from
@@ -113,6 +119,41 @@ def take(executor: str) -> None:
     listen_for_end(spinner, lambda: {"received": count[0]})
 
 
+def relay(n: int, names: list[str]) -> None:
+    """Publishes what the monitor would, on each state message, without looking at it."""
+    import rclpy
+    from rclpy.duration import Duration
+    from rclpy.experimental import EventsExecutor
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Bool
+
+    from uncertain_lti_ros.outputs import FALSE, NamedVector
+
+    rclpy.init()
+    node = rclpy.create_node("envelope_monitor")
+    vector, numbers, count = NamedVector([f"x{i}" for i in range(n)]), bytes(8 * n), [0]
+    beat = QoSProfile(depth=QUEUE, deadline=Duration(seconds=1.0))
+    kinds = {name: (Bool, beat) if name == "violation" else (JointState, QoSProfile(depth=QUEUE)) for name in names}
+    publishers = {name: node.create_publisher(kind, f"~/{name}", qos) for name, (kind, qos) in kinds.items()}
+    raw = {name: publisher.handle.publish_raw for name, publisher in publishers.items()}
+
+    def pass_on(data: bytes) -> None:
+        count[0] += 1
+        stamp = int.from_bytes(data[4:8], "little") * 10**9 + int.from_bytes(data[8:12], "little")
+        for name, publish in raw.items():
+            publish(FALSE if name == "violation" else vector(stamp, numbers))
+
+    def nothing(_: bytes) -> None:
+        count[0] += 1
+
+    node.create_subscription(JointState, STATE, pass_on, QoSProfile(depth=QUEUE), raw=True)
+    node.create_subscription(JointState, CONTROL, nothing, QoSProfile(depth=QUEUE), raw=True)
+    spinner = EventsExecutor()
+    spinner.add_node(node)
+    listen_for_end(spinner, lambda: {"received": count[0]})
+
+
 def bare_delay(executor: str) -> None:
     """As `take`, with a look at the clock in each callback, which is not part of what costs are held against."""
     import rclpy
@@ -167,10 +208,12 @@ def hear(names: list[str]) -> None:
 def listen_for_end(spinner: Any, say: Any) -> None:
     import select
 
+    from rclpy.task import Future
+
+    never: Future = Future(executor=spinner)
     print("ready", flush=True)
     while not select.select([sys.stdin], [], [], 0)[0]:
-        for _ in range(200):
-            spinner.spin_once(timeout_sec=0.1)
+        spinner.spin_until_future_complete(never, timeout_sec=0.1)  # as the monitor does
     print(json.dumps(say()), flush=True)
 
 
@@ -218,6 +261,8 @@ OUTPUTS = "flags violation lower upper state utilisation predicted_lower predict
 SUBJECTS = {
     "bare, default executor": ("take", "default", []),
     "bare, events executor": ("take", "events", []),
+    "publishing only, all outputs": ("relay", "", OUTPUTS),
+    "publishing only, ~/violation": ("relay", "", ["violation"]),
     "monitor, all outputs heard": ("monitor", "", OUTPUTS),
     "monitor, ~/violation heard": ("monitor", "", ["violation"]),
 }
@@ -273,12 +318,15 @@ class Run:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 hearer = None
-                if kind == "monitor":
-                    subject = self.monitor(folder)
-                    if outputs:
-                        hearer = self.part("hear", *outputs)
-                        hearer.line()
-                    status(self.domain)
+                if kind in ("monitor", "relay"):
+                    subject = self.monitor(folder) if kind == "monitor" else self.part("relay", str(self.n), *outputs)
+                    hearer = self.part("hear", *outputs)
+                    hearer.line()
+                    if kind == "monitor":
+                        status(self.domain)
+                    else:
+                        subject.line()
+                        time.sleep(2.0)  # until the hearer is known
                 else:
                     subject = self.part("delay" if delays else "take", executor)
                     subject.line()
@@ -298,6 +346,7 @@ class Run:
                     found["missed"] = sent - 1 - said["verdicts"]
                     if hearer is not None and "flags" in outputs:
                         found["delays"] = hearer.ask()["delays"]
+                        found["unheard"] = sent - len(found["delays"])
                 elif delays:
                     found["delays"] = subject.ask()["delays"]
                 else:
@@ -308,36 +357,81 @@ class Run:
                 child.end()
 
 
+LIMITS = (
+    ("monitor, all outputs heard", "bare, default executor", 0.6),
+    ("monitor, all outputs heard", "bare, events executor", 1.5),
+    ("monitor, ~/violation heard", "bare, events executor", 1.1),
+)
+
+
 def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int) -> None:
     from uncertain_lti.report import table
 
-    rows = []
+    rows, held = [], []
     for n in sizes:
         for rate in rates:
             best: dict[str, dict[str, Any]] = {}
+            late = {"bare": float("inf"), "monitor": float("inf")}  # p99, ms
             for _ in range(repeats):
                 for name, subject in SUBJECTS.items():
                     found = Run(n, rate, seconds).measure(*subject)
-                    if name not in best or found["cpu"] < best[name]["cpu"]:
-                        best[name] = found | {"missed": max(found["missed"], best.get(name, found)["missed"])}
+                    if "delays" in found:
+                        late["monitor"] = min(late["monitor"], float(np.percentile(found["delays"][100:], 99)) / 1e6)
+                    known = best.get(name, found)
+                    worst = {key: max(found[key], known[key]) for key in ("missed", "unheard") if key in found}
+                    best[name] = (found if found["cpu"] <= known["cpu"] else known) | worst
                 delay = Run(n, rate, seconds).measure("take", "events", [], delays=True)["delays"]
-                p99 = float(np.percentile(delay[100:], 99)) / 1e6
-                events = best["bare, events executor"]
-                events["p99"] = min(p99, events.get("p99", np.inf))
-            default = best["bare, default executor"]["cpu"]
+                late["bare"] = min(late["bare"], float(np.percentile(delay[100:], 99)) / 1e6)
+            default, events = best["bare, default executor"]["cpu"], best["bare, events executor"]["cpu"]
             for name, found in best.items():
-                if "delays" in found:
-                    found["p99"] = float(np.percentile(found["delays"][100:], 99)) / 1e6
+                p99 = late["bare" if name == "bare, events executor" else "monitor"]
+                timed = name in ("bare, events executor", "monitor, all outputs heard")
                 rows.append(
                     [
                         f"{n}", f"{rate:g}", name, f"{found['cpu']:.0f}", f"{found['cpu'] / default:.2f}",
-                        f"{found['cpu'] / events['cpu']:.2f}", f"{found['p99']:.2f}" if "p99" in found else "",
-                        str(found["missed"]),
+                        f"{found['cpu'] / events:.2f}", f"{p99:.2f}" if timed else "", str(found["missed"]),
+                        str(found.get("unheard", "")),
                     ]
                 )  # fmt: skip
                 print("  ".join(rows[-1]), file=sys.stderr, flush=True)
-    head = ["n", "Hz", "", "CPU, µs/sample", "/ default", "/ events", "p99 delay, ms", "not received"]
+            for name, peer, limit in LIMITS:
+                cost, without = (
+                    best[name]["cpu"],
+                    best[name.replace("monitor,", "publishing only,").removesuffix(" heard")]["cpu"],
+                )
+                ratio = cost / best[peer]["cpu"]
+                held.append(
+                    [
+                        f"{n}", f"{rate:g}", f"{name} / {peer}", f"{limit:g}", f"{ratio:.2f}",
+                        "yes" if ratio <= limit else "no", f"{without / best[peer]['cpu']:.2f}",
+                    ]
+                )  # fmt: skip
+            beyond = late["monitor"] - late["bare"]
+            held.append(
+                [
+                    f"{n}",
+                    f"{rate:g}",
+                    "p99 beyond the bare node, ms",
+                    "1",
+                    f"{beyond:.2f}",
+                    "yes" if beyond < 1 else "no",
+                    "",
+                ]
+            )
+    head = [
+        "n",
+        "Hz",
+        "",
+        "CPU, µs/sample",
+        "/ default",
+        "/ events",
+        "p99 delay, ms",
+        "not received",
+        "flags not heard",
+    ]
     print(table(head, rows))
+    print()
+    print(table(["n", "Hz", "", "at most", "measured", "held", "publishing only"], held))
 
 
 def soak(seconds: float, rate: float, n: int) -> dict[str, float]:
@@ -385,6 +479,8 @@ def main() -> None:
             publish(int(rest[0]), float(rest[1]), float(rest[2]))
         elif kind == "hear":
             hear(rest)
+        elif kind == "relay":
+            relay(int(rest[0]), rest[1:])
         else:
             {"take": take, "delay": bare_delay}[kind](rest[0])
     elif args.soak:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+import operator
+import struct
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.errors import ModelError
 from uncertain_lti.model import Alarm, UncertainLTI
@@ -18,6 +22,11 @@ from uncertain_lti.transient import Transient
 Array = NDArray[np.float64]
 
 
+NUMBERS = ("flags", "lower", "upper", "state", "utilisation")
+"""What a verdict says of each state."""
+_SMALL = 150  # elements of [A B] up to which plain floats are faster than arrays
+
+
 class Verdict:
     """What the monitor says of one clock message.
 
@@ -25,17 +34,15 @@ class Verdict:
     the sample, in recorded units; NaN where there is none. utilisation (n,): (x_next - centre) / half with half
     before the margin. outside_domain: z(t_k) lies outside the ranges seen in the fit. alarm: after this verdict.
 
-    A live monitor makes one per message, and often nobody asks for more than the flags: the rest is worked out where
-    it is asked for.
+    A live monitor makes one per message, and often nobody asks for more than the alarm: numbers are worked out where
+    they are asked for, by `numbers`, by `packed`, or as a new array by the attribute of that name.
     """
 
-    __slots__ = ("t_ns", "arrival_ns", "status", "flags", "state", "outside_domain", "alarm", "_judgement")
+    __slots__ = ("t_ns", "arrival_ns", "status", "outside_domain", "alarm", "_after", "_judgement")
 
-    def __init__(
-        self, step: Step, flags: Array, outside_domain: bool, alarm: bool, judgement: _Judgement | None
-    ) -> None:
+    def __init__(self, step: Step, outside_domain: bool, alarm: bool, judgement: _Floats | _Arrays | None) -> None:
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, step.status
-        self.flags, self.state = flags, step.x_next
+        self._after = step.after
         self.outside_domain, self.alarm = outside_domain, alarm
         self._judgement = judgement
 
@@ -45,34 +52,113 @@ class Verdict:
         return self._judgement is not None
 
     @property
+    def violated(self) -> bool:
+        """Some state left its bounds."""
+        return self._judgement is not None and not self._judgement.contained
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self._after)
+
+    def numbers(self, name: str) -> list[float]:
+        """One of `NUMBERS`, n floats."""
+        if name == "state":
+            return list(self._after)
+        if self._judgement is None:
+            return [math.nan] * len(self._after)
+        found = getattr(self._judgement, name)()
+        return found if isinstance(found, list) else list[float](found.tolist())
+
+    def packed(self, name: str) -> bytes:
+        """The same as little-endian doubles."""
+        found = self._after
+        if name != "state":
+            found = [math.nan] * len(found) if self._judgement is None else getattr(self._judgement, name)()
+        return _packer(len(found))(*found) if isinstance(found, list) else bytes(np.asarray(found, "<f8").tobytes())
+
+    @property
+    def flags(self) -> Array:
+        """0 contained, 1 violated, NaN no verdict (n,)."""
+        return np.array(self.numbers("flags"), dtype=np.float64)
+
+    @property
+    def state(self) -> Array:
+        """The sample judged, in recorded units (n,)."""
+        return np.array(self._after, dtype=np.float64)
+
+    @property
     def lower(self) -> Array:
         """Lower bound that was judged, in recorded units (n,)."""
-        return self.flags if self._judgement is None else self._judgement.recorded(self._judgement.lower)
+        return np.array(self.numbers("lower"), dtype=np.float64)
 
     @property
     def upper(self) -> Array:
         """Upper bound that was judged, in recorded units (n,)."""
-        return self.flags if self._judgement is None else self._judgement.recorded(self._judgement.upper)
+        return np.array(self.numbers("upper"), dtype=np.float64)
 
     @property
     def utilisation(self) -> Array:
         """Where between its bounds the sample lies (n,)."""
-        return self.flags if self._judgement is None else self._judgement.utilisation()
+        return np.array(self.numbers("utilisation"), dtype=np.float64)
 
 
-class _Judgement:
-    """Centre, half-width, bounds and sample of one verdict, normalised, (n,) each."""
+@cache
+def _packer(n: int) -> Callable[..., bytes]:
+    return struct.Struct(f"<{n}d").pack
 
-    __slots__ = ("point", "centre", "half", "lower", "upper", "x_next")
+
+class _Floats:
+    """Centre, half-width, bounds and sample of one verdict, normalised, n each; where the sample is inside."""
+
+    __slots__ = ("point", "centre", "half", "low", "high", "x_next", "inside", "contained")
+
+    def __init__(self, point: list[tuple[float, float]], x_next: list[float]) -> None:
+        self.point, self.x_next = point, x_next
+        self.centre, self.half, self.low, self.high = list[float](), list[float](), list[float](), list[float]()
+        self.inside: list[bool] = []
+        self.contained = True
+
+    def contained_or(self, uncounted: NDArray[np.bool_]) -> bool:
+        return all(map(operator.or_, self.inside, uncounted.tolist()))
+
+    def flags(self) -> list[float]:
+        return [0.0 if inside else 1.0 for inside in self.inside]
+
+    def lower(self) -> list[float]:
+        return [steady + scale * value for (steady, scale), value in zip(self.point, self.low, strict=True)]
+
+    def upper(self) -> list[float]:
+        return [steady + scale * value for (steady, scale), value in zip(self.point, self.high, strict=True)]
+
+    def utilisation(self) -> list[float]:
+        return [_ratio(x - c, half) for x, c, half in zip(self.x_next, self.centre, self.half, strict=True)]
+
+
+class _Arrays:
+    """The same as arrays (n,)."""
+
+    __slots__ = ("point", "centre", "half", "low", "high", "x_next", "inside", "contained")
 
     def __init__(
-        self, point: OperatingPoint, centre: Array, half: Array, lower: Array, upper: Array, x_next: Array
+        self, point: OperatingPoint, centre: Array, half: Array, low: Array, high: Array, x_next: Array
     ) -> None:
         self.point, self.centre, self.half = point, centre, half
-        self.lower, self.upper, self.x_next = lower, upper, x_next
+        self.low, self.high, self.x_next = low, high, x_next
+        self.inside = (low <= x_next) & (x_next <= high)
+        self.contained = bool(self.inside.all())
 
-    def recorded(self, x: Array) -> Array:
-        return self.point.recorded_x(x)
+    def contained_or(self, uncounted: NDArray[np.bool_]) -> bool:
+        return bool((self.inside | uncounted).all())
+
+    def flags(self) -> Array:
+        return np.subtract(1.0, self.inside, dtype=np.float64)
+
+    def lower(self) -> Array:
+        return self.point.recorded_x(self.low)
+
+    def upper(self) -> Array:
+        return self.point.recorded_x(self.high)
 
     def utilisation(self) -> Array:
         return _utilisation(self.x_next - self.centre, self.half)
@@ -147,11 +233,22 @@ class EnvelopeMonitor:
         self._counted = np.array([name not in masked for name in names])
         self._uncounted, self._all_count = ~self._counted, not self.masked
         point, domain = model.operating_point, model.domain
-        self._steady, self._scale = np.concatenate((point.x_s, point.u_s)), np.concatenate((point.X, point.U))
+        # z(t_k) = [x; u] and x_next beside each other, as both are normalised alike
+        self._steady = np.concatenate((point.x_s, point.u_s, point.x_s))
+        self._scale = np.concatenate((point.X, point.U, point.X))
         self._least = np.concatenate((domain.x_min, domain.u_min))
         self._greatest = np.concatenate((domain.x_max, domain.u_max))
         self._limited = bool(np.isfinite(self._least).any() or np.isfinite(self._greatest).any())
-        self._no_flags = np.full(model.n, np.nan)
+        size = model.n + model.m
+        self._small = model.n * size <= _SMALL
+        self._point = list(zip(self._steady[:size].tolist(), self._scale[:size].tolist(), strict=True))
+        self._point_x = self._point[: model.n]
+        self._limits = list(zip(self._least.tolist(), self._greatest.tolist(), strict=True))
+        nominal, spread = np.hstack([model.A, model.B]).tolist(), np.hstack([model.dA, model.dB]).tolist()
+        self._rows = [
+            (a[0], d[0], list(zip(a[1:], d[1:], strict=True)), float(c), float(dc), float(v))
+            for a, d, c, dc, v in zip(nominal, spread, model.c, model.dc, model.v, strict=True)
+        ]
         self.alarm = False
         self._recent: deque[bool] = deque()
         self._violations = 0  # among the recent verdicts
@@ -162,11 +259,17 @@ class EnvelopeMonitor:
         self._violations = 0
         self.alarm = False
 
-    def predict(self, x: Array, u: Array, dt: float) -> tuple[Array, Array]:
+    def predict(self, x: ArrayLike, u: ArrayLike, dt: float) -> tuple[Array, Array]:
         """Bounds (lower, upper), each (n,), one step of dt s after x (n,), u (m,); all in recorded units."""
-        point = self.model.operating_point
-        lower, upper = self.model.bounds(point.normalise_x(x), point.normalise_u(u), dt, margin=self.rule.margin)
-        return point.recorded_x(lower), point.recorded_x(upper)
+        z = np.concatenate((np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)))
+        verdict = self.expect(0, z.tolist(), dt)
+        return verdict.lower, verdict.upper
+
+    def expect(self, t_ns: int, z: Sequence[float], dt: float) -> Verdict:
+        """`predict` for the instant t_ns after z = [x; u]: lower and upper of a verdict that counts nowhere."""
+        step = Step(Status.OK, t_ns, 0, dt, z, z[: self.model.n])
+        judgement, outside = self._by_floats(step) if self._small else self._by_arrays(step)
+        return Verdict(step, outside, self.alarm, judgement)
 
     def judge(self, step: Step, armed: bool = True) -> Verdict:
         """Verdict on one step of the sampler.
@@ -176,20 +279,49 @@ class EnvelopeMonitor:
         if step.status is Status.RESET or not armed:
             self.reset()
         if step.status is not Status.OK:
-            return Verdict(step, self._no_flags.copy(), False, self.alarm, None)
-        point = self.model.operating_point
-        z = (np.concatenate((step.x, step.u)) - self._steady) / self._scale
-        x_next = (step.x_next - point.x_s) / point.X
-        centre, half = self.model.one_centre_and_half(z, step.dt)
-        judged_half = half if self.rule.margin == 1.0 else half * self.rule.margin
-        lower, upper = centre - judged_half, centre + judged_half
-        inside = (lower <= x_next) & (x_next <= upper)
-        outside = self._limited and bool(((z < self._least) | (z > self._greatest)).any())
+            return Verdict(step, False, self.alarm, None)
+        judgement, outside = self._by_floats(step) if self._small else self._by_arrays(step)
         if armed:
-            counted = inside if self._all_count else inside | self._uncounted
-            self._count(not counted.all())
-        flags = np.subtract(1.0, inside, dtype=np.float64)
-        return Verdict(step, flags, outside, self.alarm, _Judgement(point, centre, half, lower, upper, x_next))
+            self._count(not (judgement.contained if self._all_count else judgement.contained_or(self._uncounted)))
+        return Verdict(step, outside, self.alarm, judgement)
+
+    # The two below, and `_judge`, do the same operations on each element in the same order, for the same bits.
+
+    def _by_arrays(self, step: Step) -> tuple[_Arrays, bool]:
+        n, margin = self.model.n, self.rule.margin
+        normalised = (np.array([*step.before, *step.after], dtype=np.float64) - self._steady) / self._scale
+        z = normalised[:-n]
+        centre, half = self.model.one_centre_and_half(z, step.dt)
+        judged = half if margin == 1.0 else half * margin
+        outside = self._limited and bool(((z < self._least) | (z > self._greatest)).any())
+        point = self.model.operating_point
+        return _Arrays(point, centre, half, centre - judged, centre + judged, normalised[-n:]), outside
+
+    def _by_floats(self, step: Step) -> tuple[_Floats, bool]:
+        margin, dt, point = self.rule.margin, step.dt, self._point
+        z = [(value - steady) / scale for value, (steady, scale) in zip(step.before, point, strict=True)]
+        x_next = [(value - steady) / scale for value, (steady, scale) in zip(step.after, point, strict=False)]
+        size = [abs(value) for value in z]
+        (z0, *z_others), (s0, *s_others) = z, size
+        found = _Floats(self._point_x, x_next)
+        for x, after, (a0, d0, others, c, dc, v) in zip(z, x_next, self._rows, strict=False):
+            rate, spread = a0 * z0, d0 * s0
+            for (a, d), zj, sj in zip(others, z_others, s_others, strict=True):
+                rate += a * zj
+                spread += d * sj
+            centre, half = (rate + c) * dt + x, (spread + dc) * dt + v
+            judged = half if margin == 1.0 else half * margin
+            low, high = centre - judged, centre + judged
+            inside = low <= after <= high
+            found.contained &= inside
+            found.centre.append(centre)
+            found.half.append(half)
+            found.low.append(low)
+            found.high.append(high)
+            found.inside.append(inside)
+        return found, self._limited and any(
+            value < least or value > most for value, (least, most) in zip(z, self._limits, strict=True)
+        )
 
     def _count(self, violated: bool) -> None:
         recent = self._recent
@@ -248,6 +380,14 @@ class EnvelopeMonitor:
         raised = np.concatenate([[False], recent >= self.rule.violations])
         held: NDArray[np.bool_] = raised[np.cumsum(judged)]  # without a verdict the last one stands
         return held
+
+
+def _ratio(difference: float, half: float) -> float:
+    if difference == 0.0:
+        return 0.0
+    if half == 0.0:
+        return math.copysign(math.inf, difference) if difference == difference else difference
+    return difference / half
 
 
 def _utilisation(difference: Array, half: Array) -> Array:

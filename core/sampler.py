@@ -52,22 +52,36 @@ class Status(StrEnum):
         return self in (Status.FIRST, Status.RESET, Status.GAP)
 
 
-@dataclass(frozen=True, slots=True)
 class Step:
     """One decided clock message: the sample k+1 at t_ns and the transition that ends in it.
 
-    x (n,), u (m,) belong to sample k, x_next (n,) to sample k+1, all in recorded units, with NaN for what is
-    missing. dt is Δt_k in s. Without a sample k (first, reset) x and u are all NaN and dt is NaN; for a dropped
-    message x_next is NaN as well.
+    before (n + m) holds x and u of sample k, after (n) holds x of sample k+1, all in recorded units, with NaN for
+    what is missing; x (n,), u (m,) and x_next (n,) are the same as arrays. dt is Δt_k in s. Without a sample k
+    (first, reset) x and u are all NaN and dt is NaN; for a dropped message x_next is NaN as well.
     """
 
-    status: Status
-    t_ns: int
-    arrival_ns: int
-    dt: float
-    x: NDArray[np.float64]
-    u: NDArray[np.float64]
-    x_next: NDArray[np.float64]
+    __slots__ = ("status", "t_ns", "arrival_ns", "dt", "before", "after")
+
+    def __init__(
+        self, status: Status, t_ns: int, arrival_ns: int, dt: float, before: Sequence[float], after: Sequence[float]
+    ) -> None:
+        self.status, self.t_ns, self.arrival_ns, self.dt = status, t_ns, arrival_ns, dt
+        self.before, self.after = before, after
+
+    @property
+    def x(self) -> NDArray[np.float64]:
+        """State at t_k (n,)."""
+        return np.array(self.before[: len(self.after)], dtype=np.float64)
+
+    @property
+    def u(self) -> NDArray[np.float64]:
+        """Controls at t_k (m,)."""
+        return np.array(self.before[len(self.after) :], dtype=np.float64)
+
+    @property
+    def x_next(self) -> NDArray[np.float64]:
+        """State at t_{k+1} (n,)."""
+        return np.array(self.after, dtype=np.float64)
 
 
 @dataclass(slots=True)
@@ -213,7 +227,7 @@ class Sampler:
         self._open: _Message | None = None  # sample k: the clock message that opened it
         self._open_status = Status.FIRST
         self._open_dt = math.nan
-        self._before: NDArray[np.float64] | None = None  # z of sample k-1, fixed when it closed
+        self._before: list[float] | None = None  # z of sample k-1, fixed when it closed
         self._history: dict[int, deque[float]] = {}
 
     def push(self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]) -> list[Step]:
@@ -233,6 +247,8 @@ class Sampler:
         state = self._topics[topic]
         stamp = stamp_ns if state.header and stamp_ns is not None and stamp_ns > 0 else None
         message = _Message(arrival_ns, stamp, list(values))
+        if len(message.values) != len(self._where[topic]):
+            raise ValueError(f"{topic}: {len(message.values)} values for {len(self._where[topic])} signals")
         if topic == self.clock:
             return self._push_clock(state, message)
         if state.steps_back(message, self.max_gap_ns):  # a looped bag: what was kept belongs to the last pass
@@ -242,7 +258,8 @@ class Sampler:
             state.previous = list(state.steady)
         elif state.came_late(message):
             self.counters[f"late {topic}"] += 1
-        state.unwrapped(message.values)
+        if state.unwrap:
+            state.unwrapped(message.values)
         state.kept.append(message)
         return []
 
@@ -262,22 +279,23 @@ class Sampler:
                 return [self._dropped(Status.LATE, instant, message)]
             status = Status.OK if 0 < step <= self.max_gap_ns else Status.GAP if step > 0 else Status.RESET
             dt = step * 1e-9 if step > 0 else math.nan
-        if status.opens_segment:
+        opens = status is not Status.OK  # a segment
+        if opens:
             state.previous = list(state.steady)
-        state.unwrapped(message.values)
-        if self._open is not None:
-            closing = self._open
+        if state.unwrap:
+            state.unwrapped(message.values)
+        if (closing := self._open) is not None:
             z = self._fix(closing, final=True, reset=status is Status.RESET)
             if not self._one_topic:
                 steps.append(self._step(self._open_status, closing, self._open_dt, self._before, z[: self._n]))
             self._before = z
-        if status.opens_segment:
+        if opens:
             self._history = {}
         if self._one_topic:
             if self._clock_is_x:
-                x_next = np.array(message.values, dtype=np.float64)
+                x_next = message.values
             else:
-                x_next = np.full(self._n, math.nan)
+                x_next = [math.nan] * self._n
                 for i, value in zip(self._where[self.clock], message.values, strict=True):
                     if i < self._n:
                         x_next[i] = value
@@ -295,25 +313,24 @@ class Sampler:
 
     def _dropped(self, status: Status, instant: int, message: _Message) -> Step:
         self.counters[status.value] += 1
-        nothing = np.full(self._n, math.nan)
-        return Step(status, instant, message.arrival, math.nan, nothing, np.full(self._nm - self._n, math.nan), nothing)
+        return Step(status, instant, message.arrival, math.nan, self._unknown, self._unknown[: self._n])
 
     def _step(
         self,
         status: Status,
         message: _Message,
         dt: float,
-        before: NDArray[np.float64] | None,
-        x_next: NDArray[np.float64],
+        before: list[float] | None,
+        x_next: list[float],
     ) -> Step:
-        if before is None or status in (Status.FIRST, Status.RESET):
-            before = np.full(self._nm, math.nan)
-        if status is Status.OK and not (_all_finite(before) and _all_finite(x_next)):
+        if before is None or status is Status.FIRST or status is Status.RESET:
+            before = self._unknown
+        if status is Status.OK and not (all_finite(before) and all_finite(x_next)):
             status = Status.MISSING
             self.counters["missing"] += 1
-        return Step(status, self._instant(message), message.arrival, dt, before[: self._n], before[self._n :], x_next)
+        return Step(status, self._instant(message), message.arrival, dt, before, x_next)
 
-    def _fix(self, sample: _Message, final: bool, reset: bool = False) -> NDArray[np.float64]:
+    def _fix(self, sample: _Message, final: bool, reset: bool = False) -> list[float]:
         """z = [x; u] of the open sample from what has arrived; final: the sample closes now; reset: by a step back."""
         z = self._unknown.copy()
         for topic, where in self._where.items():
@@ -341,23 +358,21 @@ class Sampler:
             line = line if final else line.copy()
             line.append(z[i])
             z[i] = line[0] if len(line) > delay else math.nan
-        if final and not _all_finite(z):
+        if final and not all_finite(z):
             for signal, value in zip(self.signals.signals, z, strict=True):
                 if not math.isfinite(value):
                     self.counters[f"missing {signal.name}"] += 1
-        return np.array(z, dtype=np.float64)
+        return z
 
-    def latest(self) -> tuple[int, NDArray[np.float64], NDArray[np.float64]] | None:
-        """(t_ns, x (n,), u (m,)) of the open sample with what is known so far; None before the first sample."""
+    def latest(self) -> tuple[int, list[float]] | None:
+        """(t_ns, [x; u] (n + m)) of the open sample with what is known so far; None before the first sample."""
         if self._open is None:
             return None
-        z = self._fix(self._open, final=False)
-        return self._instant(self._open), z[: self._n], z[self._n :]
+        return self._instant(self._open), self._fix(self._open, final=False)
 
 
-def _all_finite(values: Sequence[float] | NDArray[np.float64]) -> bool:
-    if isinstance(values, np.ndarray):
-        return bool(np.isfinite(values).all())
+def all_finite(values: Sequence[float]) -> bool:
+    """Whether all are finite."""
     return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum of finite numbers may overflow
 
 

@@ -71,17 +71,20 @@ class NamedVector:
         self.velocity = _numbers(body, len(names) if velocities else 0)
         _numbers(body, 0)
         self.template = bytes((0, 1, 0, 0)) + bytes(body)
-        self._width = 8 * len(names)
+        width = 8 * len(names)
+        # What stands before, between and after stamp, position and velocity.
+        self._start = self.template[:_ENCAPSULATION]
+        self._names = self.template[_ENCAPSULATION + _STAMP.size : self.position]
+        self._between = self.template[self.position + width : self.velocity]
+        self._end = self.template[self.velocity + width * velocities :]
+        self._t_ns, self._stamp = 0, _STAMP.pack(0, 0)
 
     def __call__(self, t_ns: int, position: bytes, velocity: bytes = b"") -> bytes:
-        """The message; position and velocity as little-endian doubles."""
-        buffer = bytearray(self.template)
-        seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
-        _STAMP.pack_into(buffer, _ENCAPSULATION, min(seconds, _LAST_S), nanoseconds)
-        buffer[self.position : self.position + self._width] = position
-        if velocity:
-            buffer[self.velocity : self.velocity + self._width] = velocity
-        return bytes(buffer)
+        """The message; position, and velocity where there is one, as little-endian doubles, all of them."""
+        if t_ns != self._t_ns:
+            seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
+            self._t_ns, self._stamp = t_ns, _STAMP.pack(max(_FIRST_S, min(seconds, _LAST_S)), nanoseconds)
+        return b"".join((self._start, self._stamp, self._names, position, self._between, velocity, self._end))
 
 
 class VerdictRecords:

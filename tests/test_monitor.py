@@ -35,7 +35,8 @@ def judge(monitor: EnvelopeMonitor, transient: Transient, **options: Any) -> lis
     for k in range(1, len(transient)):
         dt = int(transient.t_ns[k] - transient.t_ns[k - 1]) * 1e-9
         step = Step(
-            Status.OK, int(transient.t_ns[k]), 0, dt, transient.x[k - 1], transient.u[k - 1], transient.x[k]
+            Status.OK, int(transient.t_ns[k]), 0, dt, [*transient.x[k - 1].tolist(), *transient.u[k - 1].tolist()],
+            transient.x[k].tolist(),
         )  # fmt: skip
         verdicts.append(monitor.judge(step, **options))
     return verdicts
@@ -205,7 +206,7 @@ def test_verdicts_are_those_of_the_rules_worked_out_naively(case: tuple[Uncertai
 
 
 def a_step(x: float, x_next: float, status: Status = Status.OK, dt: float = 1.0) -> Step:
-    return Step(status, 0, 0, dt, np.array([x]), np.empty(0), np.array([x_next]))
+    return Step(status, 0, 0, dt, [x], [x_next])
 
 
 def scalar(dA: float = 0.0, v: float = 0.0, **options: Any) -> UncertainLTI:
@@ -273,7 +274,7 @@ def test_predicted_bounds_are_those_that_will_be_judged(seed: int, n: int, m: in
     x, u, after, dt = rng.normal(size=n), rng.normal(size=m), rng.normal(size=n), 0.02
     monitor = EnvelopeMonitor(model, margin=margin)
     lower, upper = monitor.predict(x, u, dt)
-    verdict = monitor.judge(Step(Status.OK, 0, 0, dt, x, u, after))
+    verdict = monitor.judge(Step(Status.OK, 0, 0, dt, [*x.tolist(), *u.tolist()], after.tolist()))
     assert lower.tobytes() == verdict.lower.tobytes() and upper.tobytes() == verdict.upper.tobytes()
 
 

@@ -360,33 +360,41 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = time.monotonic()
         alarms, alarm = watch.alarms, watch.alarm
         verdicts, opened = watch.take(topic, arrival, data, now)
-        beat = watch.alarm != alarm
-        for verdict in verdicts:
-            beat |= verdict.judged
-            self._publish(verdict)
-        if beat:
-            self._beat()
-        outputs = self._outputs
-        if opened and (outputs["predicted_lower"].listeners or outputs["predicted_upper"].listeners):
-            if (prediction := watch.predict()) is not None:
-                t_ns, lower, upper = prediction
-                outputs["predicted_lower"].send(self._plain(t_ns, lower.tobytes()))
-                outputs["predicted_upper"].send(self._plain(t_ns, upper.tobytes()))
+        if verdicts or opened:
+            self._publish(watch, verdicts, opened, now, watch.alarm != alarm)
         if self._recent is not None:
             self._recent.add(Entry(now, arrival, topic, data, verdicts, watch.alarm))
             if watch.alarms > alarms and self._snapshot_due is None:
                 self._snapshot_due = now + self._real("snapshot.after")
 
-    def _publish(self, verdict: Verdict) -> None:
-        outputs, judged = self._outputs, verdict.judged
-        if outputs["flags"].listeners:
-            mark = self._marks[verdict.outside_domain] if judged else self._no_mark
-            outputs["flags"].send(self._marked(verdict.t_ns, verdict.flags.tobytes(), mark))
-        if judged:
+    def _publish(self, watch: Watch, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
+        """Publish what is listened to; turned: the alarm did, which is said in any case.
+
+        First everything is laid out, then all of it is sent in one go: threads of the middleware that are woken by
+        one message then find the others as well, and need not be woken again.
+        """
+        outputs = self._outputs
+        messages = []
+        for verdict in verdicts:
+            t_ns, judged = verdict.t_ns, verdict.judged
+            if outputs["flags"].listeners:
+                mark = self._marks[verdict.outside_domain] if judged else self._no_mark
+                messages.append((outputs["flags"].send, self._marked(t_ns, verdict.packed("flags"), mark)))
+            if not judged:
+                continue
+            turned |= outputs["violation"].listeners > 0
             for name in JUDGED:
-                output = outputs[name]
-                if output.listeners:
-                    output.send(self._plain(verdict.t_ns, getattr(verdict, name).tobytes()))
+                if outputs[name].listeners:
+                    messages.append((outputs[name].send, self._plain(t_ns, verdict.packed(name))))
+        if opened and (outputs["predicted_lower"].listeners or outputs["predicted_upper"].listeners):
+            if (expected := watch.predict()) is not None:
+                for name, output in ((n, outputs[f"predicted_{n}"]) for n in ("lower", "upper")):
+                    messages.append((output.send, self._plain(expected.t_ns, expected.packed(name))))
+        if turned:
+            self._published = now
+            messages.append((outputs["violation"].send, TRUE if watch.alarm else FALSE))
+        for send, message in messages:
+            send(message)
 
     def _beat(self) -> None:
         assert self.watch is not None

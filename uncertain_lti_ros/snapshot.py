@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,8 @@ from uncertain_lti.monitor import Verdict
 from uncertain_lti.verdict_messages import FALSE, JUDGED, TOPICS, TRUE, NamedVector
 from uncertain_lti_ros.messages import definition
 
-_OVERHEAD = 500  # bytes that one kept message takes beside its data, a verdict on it included
+_OVERHEAD = 800  # bytes that one kept message takes beside its data, a verdict on it included
+_PER_STATE = 200  # and for each state of a verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +47,11 @@ class Recent:
         """Keep one more."""
         entries = self._entries
         entries.append(entry)
-        self._bytes += len(entry.data) + _OVERHEAD + sum(6 * v.flags.nbytes for v in entry.verdicts)
+        self._bytes += len(entry.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in entry.verdicts)
         oldest = entry.now - self._seconds
         while entries and (entries[0].now < oldest or self._bytes > self._limit):
             gone = entries.popleft()
-            self._bytes -= len(gone.data) + _OVERHEAD + sum(6 * v.flags.nbytes for v in gone.verdicts)
+            self._bytes -= len(gone.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in gone.verdicts)
 
     def entries(self) -> list[Entry]:
         """All, in order of arrival."""
@@ -91,15 +93,15 @@ class Scene:
                 writer.message(inputs[entry.topic], log_time, entry.data)
                 count += 1
                 for verdict in entry.verdicts:
-                    if len(verdict.flags) != len(self.names):
+                    if verdict.n != len(self.names):
                         continue
                     outside = float(verdict.outside_domain) if verdict.judged else float("nan")
-                    velocity = (0.0 * verdict.flags + outside).tobytes()
-                    writer.message(outputs["flags"], log_time, marked(verdict.t_ns, verdict.flags.tobytes(), velocity))
+                    velocity = struct.pack("<d", outside) * verdict.n
+                    writer.message(outputs["flags"], log_time, marked(verdict.t_ns, verdict.packed("flags"), velocity))
                     writer.message(outputs["violation"], log_time, TRUE if entry.alarm else FALSE)
                     count += 2
                     for name in JUDGED if verdict.judged else ():
-                        data = plain(verdict.t_ns, getattr(verdict, name).tobytes())
+                        data = plain(verdict.t_ns, verdict.packed(name))
                         writer.message(outputs[name], log_time, data)
                         count += 1
             writer.finish()

@@ -7,18 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
 from uncertain_lti.errors import ModelError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import EnvelopeMonitor, Verdict
-from uncertain_lti.sampler import Sampler, Status, to_ns
+from uncertain_lti.sampler import Sampler, Status, all_finite, to_ns
 from uncertain_lti.signals import FieldPath, TypeFields
 from uncertain_lti_ros.arming import Arming, Condition
 from uncertain_lti_ros.layout import MessageReader, UnreadableError
-
-Array = NDArray[np.float64]
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of diagnostic_msgs/DiagnosticStatus."""
@@ -26,6 +21,7 @@ FUTURE = 1.0
 """s that a stamp may be ahead of the clock before it is reported."""
 
 _FUTURE_NS = to_ns(FUTURE)
+_NOTHING: tuple[Verdict, ...] = ()
 
 MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
 """Type name and paths -> reader."""
@@ -125,6 +121,8 @@ class Watch:
     ----------
     latched : bool
         An alarm has been raised that stands until `reset`.
+    enable_topic : str
+        Topic of the enable condition; empty without one.
 
     Raises
     ------
@@ -190,6 +188,7 @@ class Watch:
         self.enable_type, self._reads_condition = enable_type, reader
         known = self.arming.on if self.arming.condition == condition else None
         self.arming = Arming(condition, to_ns(rule.grace), known)
+        self.enable_topic = condition.topic if condition else ""
         self.latched = False
 
     def check(self, rule: Rule) -> None:
@@ -222,11 +221,6 @@ class Watch:
         self.enable_type = type_name
 
     @property
-    def enable_topic(self) -> str:
-        """Topic of the enable condition; empty without one."""
-        return self.arming.condition.topic if self.arming.condition else ""
-
-    @property
     def types(self) -> dict[str, str]:
         """Topics to listen to with their types, as far as these are known."""
         types = dict(self._model_types)
@@ -256,14 +250,14 @@ class Watch:
         self.latched, self.sampler.counters = latched, counters
         self.failures += 1
 
-    def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[list[Verdict], bool]:
+    def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[Sequence[Verdict], bool]:
         """Take one serialised message; return the clock messages it decided, and whether it opened a sample."""
         self.received[topic] += 1
         self._heard[topic] = now
         if topic == self.enable_topic and self._reads_condition is not None:
             self._learn_condition(topic, data)
         if topic not in self._readers:
-            return [], False
+            return _NOTHING, False
         try:
             stamp_ns, values = self._readers[topic].read(data)
         except UnreadableError as error:
@@ -271,17 +265,23 @@ class Watch:
             stamp_ns, values = None, self._unknown[topic]
         if stamp_ns is not None and stamp_ns > arrival_ns + _FUTURE_NS:
             self.future[topic] += 1
-        samples = self.sampler.counters["samples"]
+        sampler = self.sampler
+        if topic != sampler.clock:
+            sampler.push(topic, arrival_ns, stamp_ns, values)  # decides nothing
+            return _NOTHING, False
+        samples = sampler.counters["samples"]
         verdicts = []
-        for step in self.sampler.push(topic, arrival_ns, stamp_ns, values):
+        for step in sampler.push(topic, arrival_ns, stamp_ns, values):
             before = self.alarm
             if step.status is Status.RESET:
                 self.arming.restart()
-            verdict = self.monitor.judge(step, step.status.dropped or self.arming.at(step.t_ns))
+            # a dropped message is no sample and changes nothing; asking every status for that would cost more
+            armed = (step.status is not Status.OK and step.status.dropped) or self.arming.at(step.t_ns)
+            verdict = self.monitor.judge(step, armed)
             self.latched = self.latched or (self.rule.latch and verdict.alarm)
             verdicts.append(verdict)
             self._count(verdict, before, now)
-        return verdicts, self.sampler.counters["samples"] > samples
+        return verdicts, sampler.counters["samples"] > samples
 
     def _learn_condition(self, topic: str, data: bytes) -> None:
         assert self._reads_condition is not None
@@ -301,7 +301,8 @@ class Watch:
 
     def _count(self, verdict: Verdict, alarm_before: bool, now: float) -> None:
         period = self._period
-        period.statuses[verdict.status] += 1
+        if verdict.status is not Status.OK:  # looking up one of these is slow
+            period.statuses[verdict.status] += 1
         alarm = self.alarm
         self.alarms += alarm and not alarm_before
         period.alarm |= alarm
@@ -311,26 +312,22 @@ class Watch:
         self.verdicts += 1
         period.verdicts += 1
         period.outside += verdict.outside_domain
-        flags = verdict.flags.tolist()
-        if 1.0 in flags:
-            for i, flag in enumerate(flags):
+        if verdict.violated:
+            for i, flag in enumerate(verdict.numbers("flags")):
                 if flag == 1.0:
                     self.violations[i] += 1
                     period.violations[i] += 1
 
-    def predict(self) -> tuple[int, Array, Array] | None:
-        """(t_ns, lower (n,), upper (n,)) for one median step after the open sample, in recorded units.
+    def predict(self) -> Verdict | None:
+        """Bounds for one median step after the open sample, as `EnvelopeMonitor.expect` gives them.
 
         None where a signal is missing, or the model does not know its median step.
         """
         dt, latest = self.model.sampling.dt_median, self.sampler.latest()
         if dt is None or latest is None:
             return None
-        t_ns, x, u = latest
-        if not (np.isfinite(x).all() and np.isfinite(u).all()):
-            return None
-        lower, upper = self.monitor.predict(x, u, dt)
-        return t_ns + round(dt * 1e9), lower, upper
+        t_ns, z = latest
+        return self.monitor.expect(t_ns + round(dt * 1e9), z, dt) if all_finite(z) else None
 
     @property
     def late(self) -> int:
@@ -414,9 +411,9 @@ class Watch:
         violated = period.violations[i]
         if self.last is not None:
             for key in ("state", "lower", "upper", "utilisation"):
-                values[key] = repr(float(getattr(self.last, key)[i]))
+                values[key] = repr(self.last.numbers(key)[i])
             if not period.verdicts:  # the clock is slower than the reports
-                violated = int(self.last.flags[i] == 1.0)
+                violated = int(self.last.numbers("flags")[i] == 1.0)
         age = f"last verdict {without:.1f} s ago: "
         if without > timeout:
             level, message = STALE, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet"
