@@ -29,8 +29,16 @@ extras = {
     "plots": ["matplotlib"],
     # Real rclpy where no ROS 2 is installed: wheels for x86_64 Linux.
     "ros": ["ros-jazzy-common-interfaces==5.3.6", "ros-rclpy[fastrtps]==7.1.6"],
-    # colcon test looks for pytest here; setuptools lets the tests read this file.
-    "test": ["hypothesis", "packaging", "pytest", "pytest-timeout", "setuptools"],
+    # colcon test looks for pytest here; setuptools lets the tests read this file; cyclonedds hears the node from
+    # another vendor's DDS.
+    "test": [
+        "cyclonedds; platform_machine == 'x86_64'",
+        "hypothesis",
+        "packaging",
+        "pytest",
+        "pytest-timeout",
+        "setuptools",
+    ],  # fmt: skip
     "dev": ["mypy", "ruff", "types-PyYAML"],
 }
 

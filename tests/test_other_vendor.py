@@ -1,0 +1,107 @@
+"""A subscriber of another DDS vendor gets every flag with the right content: the wire seen from outside rclpy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+pytest.importorskip("cyclonedds", reason="the cyclonedds wheel, which subscribes here, is not installed")
+
+from ros_processes import World, open_world
+from test_live import by_hand, header_bag, offline, saved
+
+from uncertain_lti.model import Alarm
+from uncertain_lti.sampler import Status
+
+# Cyclone DDS on loopback, where multicast may be missing: the peer is named.
+_CONFIGURATION = """<CycloneDDS><Domain><General>
+<Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast>
+</General><Discovery><Peers><Peer address="127.0.0.1"/></Peers><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>60</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>"""
+
+_SUBSCRIBER = """
+import json, sys, time
+from dataclasses import dataclass
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import float64, int32, sequence, uint32
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
+    sec: int32
+    nanosec: uint32
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
+    stamp: Time
+    frame_id: str
+
+@dataclass
+class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
+    header: Header
+    name: sequence[str]
+    position: sequence[float64]
+    velocity: sequence[float64]
+    effort: sequence[float64]
+
+@dataclass
+class Bool(IdlStruct, typename="std_msgs::msg::dds_::Bool_"):
+    data: bool
+
+wanted, domain = int(sys.argv[1]), int(sys.argv[2])
+participant = DomainParticipant(domain)
+qos = Qos(Policy.Reliability.Reliable(duration(seconds=1)), Policy.History.KeepAll)
+flags = DataReader(participant, Topic(participant, "rt/envelope_monitor/flags", JointState), qos=qos)
+violation = DataReader(participant, Topic(participant, "rt/envelope_monitor/violation", Bool), qos=qos)
+while not (flags.get_matched_publications() and violation.get_matched_publications()):
+    time.sleep(0.05)
+time.sleep(0.5)
+print("matched", flush=True)
+got, beats, end = [], [], time.monotonic() + 60
+while len(got) < wanted and time.monotonic() < end:
+    got += [[m.header.stamp.sec, m.header.stamp.nanosec, list(m.name), list(m.position), list(m.velocity)]
+            for m in flags.take(1000)]
+    beats += [m.data for m in violation.take(1000)]
+    time.sleep(0.01)
+time.sleep(0.3)
+beats += [m.data for m in violation.take(1000)]
+print(json.dumps([got, beats]), flush=True)
+"""
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+def test_another_vendor_hears_every_flag(world: World, tmp_path: Path) -> None:
+    model = by_hand(alarm=Alarm(2, 5))
+    path = saved(model, tmp_path)
+    bag = header_bag(model, tmp_path / "run.mcap", 300)
+    verdicts = offline(path, bag)
+    world.monitor(path)
+    world.env["CYCLONEDDS_URI"] = _CONFIGURATION
+    subscriber = world.start("subscriber", "-c", _SUBSCRIBER, str(len(verdicts)), world.env["ROS_DOMAIN_ID"])
+    subscriber.says("matched")
+    world.command("play", bag, "--rate", 2).succeed(60)
+    said = subscriber.succeed(60).splitlines()[-1]
+    got, beats = json.loads(said)
+    assert len(got) == len(verdicts)
+    for verdict, (seconds, nanoseconds, names, position, velocity) in zip(verdicts, got, strict=True):
+        np.testing.assert_array_equal(position, verdict.flags)
+        outside = float(verdict.outside_domain) if verdict.judged else np.nan
+        np.testing.assert_array_equal(velocity, [outside] * 2)
+        assert names == ["a", "b"]
+        if verdict.status is not Status.UNSTAMPED:  # without a stamp, the time of receipt stands in
+            assert seconds * 10**9 + nanoseconds == verdict.t_ns
+    assert len(beats) >= sum(v.judged for v in verdicts) and beats[-1] == verdicts[-1].alarm and True in beats
