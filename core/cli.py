@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import json
 import os
+import shlex
 import signal
 import sys
 import time
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti import __version__
-from uncertain_lti.errors import BagError, FitError, UncertainLTIError
+from uncertain_lti.errors import BagError, FitError, SignalError, UncertainLTIError
 from uncertain_lti.progress import Progress
 
 if TYPE_CHECKING:
@@ -92,6 +93,15 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     )
     topics.add_argument("bag", metavar="BAG", help="MCAP file, or folder of a recording")
     topics.add_argument("--json", action="store_true", help="print JSON")
+
+    init = command(
+        "init",
+        _init,
+        "propose a signals file for a recording, with reasons, for you to edit",
+        "print errors only (and without --output the file): no summary, no notes, no progress",
+    )
+    init.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders of the same machine")
+    init.add_argument("--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)")
 
     fit = command(
         "fit", _fit, "fit a model to recordings", silent, "say every pass over the data, and what took how long"
@@ -240,9 +250,35 @@ def _topics(options: argparse.Namespace) -> int:
     return DONE
 
 
+def _init(options: argparse.Namespace) -> int:
+    from uncertain_lti.files import whole_file
+    from uncertain_lti.proposal import propose
+
+    output = options.output
+    if output is not None and os.path.exists(output):
+        raise SignalError(f"{output}: is there already; choose another output, or move it away")
+    proposal = propose(options.bags, options.progress.iterate("reading"))
+    _say(options, proposal.warnings)
+    if output is None:
+        print(proposal.text, end="")
+        return DONE
+    try:
+        with whole_file(output) as stream:
+            stream.write(proposal.text.encode())
+    except OSError as error:
+        raise SignalError(f"{output}: cannot be written: {error.strerror}; choose another place") from None
+    options.progress.say(
+        f"states: {', '.join(c.name for c in proposal.states)}\n"
+        f"controls: {', '.join(c.name for c in proposal.controls) or 'none found'}\n"
+        f"signals file written to {output}: read it and edit it, it says why; then\n"
+        f"  uncertain-lti fit {shlex.join(options.bags)} --signals {shlex.quote(output)} --output machine.model.json"
+    )
+    return DONE
+
+
 def _fit(options: argparse.Namespace) -> int:
     from uncertain_lti import fit, read_transients
-    from uncertain_lti.report import fit_text, left_out_text, recording_text
+    from uncertain_lti.report import fit_text, left_out_text, next_text, recording_text
     from uncertain_lti.validation import leave_out_cheaply
 
     output = Path(options.output)
@@ -280,6 +316,7 @@ def _fit(options: argparse.Namespace) -> int:
         if left_out is not None:
             _tell(options, left_out_text(left_out))
         _tell(options, f"model written to {output}")
+        _tell(options, next_text(model, shlex.quote(str(output)), left_out))
     return DONE
 
 

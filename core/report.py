@@ -105,6 +105,52 @@ def _eigenvalues(model: UncertainLTI) -> str:
     )
 
 
+WIDE = 0.3
+"""Mean width, as a share of the state's range, from which on an envelope says little."""
+
+
+def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -> str:
+    """What to look at after a fit: the worry that weighs most, and the commands that tell more.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+    file : str
+        Its file, as it would be typed.
+    left_out : dict, optional
+        What `leave_out_cheaply` found.
+    """
+    facts = model.fit
+    span = model.domain.x_max - model.domain.x_min
+    share = np.asarray(facts["mean_width"]) / np.where(span > 0, span, np.inf)
+    widest = int(np.argmax(share))
+    inside = None if left_out is None else left_out["inside"]
+    if share[widest] > WIDE:
+        worry = (
+            f"the bounds of '{model.state_names[widest]}' are {share[widest]:.0%} as wide as its range, so only gross "
+            f"faults would be seen: more excitation, another additive term, a delay, or faster samples"
+        )
+    elif inside is not None and inside < 0.99:
+        worry = (
+            f"{1 - inside:.1%} of what was left out falls outside, so expect false alarms; record more of what the "
+            f"machine will do, or let validate --false-alarms find an alarm rule that stays quiet"
+        )
+    elif facts["messages"]:
+        worry = facts["messages"][0]
+    elif facts["transients"] == 1:
+        worry = "one recording says nothing of another day; check the model on one that was not fitted"
+    else:
+        worry = ""
+    lines = [f"look first at: {worry}"] if worry else []
+    rows = [
+        (f"uncertain-lti check {file} BAG", "is a recording that was not fitted inside?"),
+        (f"uncertain-lti validate {file}", "how far to trust it; an alarm rule for a rate of false alarms"),
+        (f"uncertain-lti report {file} BAG", "the same, with figures, as one page"),
+    ]
+    width = max(len(command) for command, _ in rows)
+    return "\n".join([*lines, "next:", *(f"  {command.ljust(width)}  {text}" for command, text in rows)])
+
+
 def model_text(model: UncertainLTI) -> str:
     """Summary of a model file."""
     s, facts = model.sampling, model.fit

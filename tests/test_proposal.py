@@ -1,0 +1,359 @@
+"""`init`: what it proposes can be fitted as it is, holds the signals that matter, and odd recordings get a sentence."""
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+from bag_writer import Message, Topic, cdr, header, message, write
+from engine_bag import engine_bag
+
+from uncertain_lti import SignalMap, fit, read_transients
+from uncertain_lti.cli import main
+from uncertain_lti.errors import BagError
+from uncertain_lti.proposal import LONGEST_ARRAY, _role, propose
+
+FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
+MS = 10**6
+
+
+def f64(topic, t_ns, value):
+    return Message(topic, t_ns, cdr(FLOAT64, data=float(value)), t_ns)
+
+
+def quaternion(roll=0.0, yaw=0.0):
+    a, b = roll / 2, yaw / 2
+    return message(
+        "geometry_msgs/msg/Quaternion",
+        x=math.sin(a) * math.cos(b),
+        y=math.sin(a) * math.sin(b),
+        z=math.cos(a) * math.sin(b),
+        w=math.cos(a) * math.cos(b),
+    )
+
+
+def pose(topic, t_ns, roll=0.0, yaw=0.0, x=0.0):
+    point = message("geometry_msgs/msg/Point", x=x, y=1.0, z=0.0)
+    body = message("geometry_msgs/msg/Pose", position=point, orientation=quaternion(roll, yaw))
+    return Message(topic, t_ns, cdr(POSE, header=header(t_ns), pose=body), t_ns)
+
+
+def driven(names=("/plant/state", "/plant/cmd"), count=400, seed=0, extra=lambda k, x, u: []):
+    """First-order lag with a stepping command, 50 Hz."""
+    rng = np.random.default_rng(seed)
+    x, u, messages = 0.0, 0.0, []
+    for k in range(count):
+        if k % 37 == 0:
+            u = float(rng.normal())
+        t = 10**18 + k * 20 * MS
+        messages += [f64(names[0], t, x + 1e-3 * rng.normal()), f64(names[1], t, u), *extra(k, x, u)]
+        x += 0.02 * (-2.0 * x + 3.0 * u)
+    return messages
+
+
+def save(path, messages, types):
+    topics = [Topic(name, types.get(name, FLOAT64)) for name in dict.fromkeys(m.topic for m in messages)]
+    topics += [Topic(name, kind) for name, kind in types.items() if name not in {m.topic for m in messages}]
+    return write(topics, messages).save(path)
+
+
+def fitted(paths, proposal):
+    """The proposal, unedited, through its own file format and a fit."""
+    signals = SignalMap.from_dict(yaml.safe_load(proposal.text), source="proposal")
+    runs = read_transients(paths, signals)
+    return fit(runs)
+
+
+def signals_of(proposal):
+    return [(c.topic, c.path) for c in proposal.states], [(c.topic, c.path) for c in proposal.controls]
+
+
+# --- real machines ----------------------------------------------------------------------------------------------
+
+REAL = {
+    "micro_gas_turbine/ex_1": ({"data"}, {"data"}),
+    "micro_gas_turbine/ex_24": ({"data"}, {"data"}),
+    "hunter_se/straight_odd_t_0_5_run_01": ({"twist.linear.x"}, {"vector.x"}),
+    "neato/person_follower": ({"twist.twist.linear.x", "twist.twist.angular.z"}, {"linear.x", "angular.z"}),
+    "neato/draw_square": ({"twist.twist.linear.x", "twist.twist.angular.z"}, {"linear.x", "angular.z"}),
+    "crazyflie/rollbag_0": ({"unwrap(roll(pose.orientation))"}, {"position.x"}),
+    "crazyflie/yx3bag_0": (set(), set()),
+    "crazyflie/yx4bag_0": (set(), set()),
+    "cougars_auv/SO_bag_0": ({"fluid_pressure"}, {"fin[0]"}),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_recordings_fit_unedited(recordings, name):
+    """What `config/signals` names is there, what stands still is not, and the fit takes it as it is."""
+    path = recordings / f"{name}.mcap"
+    proposal = propose([path])
+    states, controls = ({c.path for c in group} for group in (proposal.states, proposal.controls))
+    wanted_states, wanted_controls = REAL[name]
+    assert wanted_states <= states and wanted_controls <= controls, proposal.text
+    model = fitted([path], proposal)
+    assert model.fit["violations"] == 0
+    assert "vector.y" not in controls and "twist.angular.z" not in states - wanted_states
+
+
+def test_of_many_joints_one_with_its_command(recordings):
+    proposal = propose([recordings / "go2/test_3.mcap"])
+    states, controls = signals_of(proposal)
+    joint = proposal.controls[0].element
+    assert states == [("/go2/joint_states", f"position[{joint}]"), ("/go2/joint_states", f"velocity[{joint}]")]
+    assert controls == [("/go2/joint_command", f"position[{joint}]")]
+    signals = yaml.safe_load(proposal.text)
+    assert signals["controls"][0]["max_hold"] < 0.1, "the commands end long before the states do"
+    assert len(propose([recordings / "go2/test_3.mcap"]).text) == len(proposal.text)
+
+
+def test_a_delay_is_seen(recordings):
+    """The fit of config/signals/neato.yaml says that the states follow one sample later; so does the proposal."""
+    signals = yaml.safe_load(propose([recordings / "neato/person_follower.mcap"]).text)
+    assert {c["delay"] for c in signals["controls"]} == {1}
+
+
+def test_the_shipped_engine(tmp_path):
+    path = engine_bag(tmp_path / "run.mcap", steps=1500)
+    proposal = propose([path])
+    assert len(proposal.states) == 5 and len(proposal.controls) == 4
+    assert {c.name for c in proposal.controls} >= {"main_fuel_flow"}
+    assert fitted([path], proposal).fit["violations"] == 0
+
+
+def test_several_recordings_of_one_machine(tmp_path):
+    paths = [save(tmp_path / f"{i}.mcap", driven(seed=i), {}) for i in range(3)]
+    proposal = propose(paths)
+    assert signals_of(proposal) == ([("/plant/state", "data")], [("/plant/cmd", "data")])
+    assert fitted(paths, proposal).fit["transients"] == 3
+
+
+def test_every_odd_recording_gets_a_file_or_a_sentence(recordings, tmp_path, capsys):
+    for path in [*sorted((recordings / "odd").glob("*.mcap")), recordings / "neato/db3"]:
+        target = tmp_path / f"{path.stem}.yaml"
+        status = main(["init", str(path), "--output", str(target)])
+        said = capsys.readouterr()
+        assert "Traceback" not in said.err
+        if status == 0:
+            SignalMap.load(target)
+        else:
+            assert status == 2 and not target.exists() and said.err.count("\n") == 1
+
+
+# --- made up ones -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "topic, kind, role",
+    [
+        ("/cmd_vel", "geometry_msgs/msg/Twist", "control"),
+        ("/robot/vel", "geometry_msgs/msg/Twist", "control"),
+        ("/odom", "nav_msgs/msg/Odometry", "state"),
+        ("/arm_controller/state", "control_msgs/msg/JointTrajectoryControllerState", "state"),
+        ("/joint_states", "sensor_msgs/msg/JointState", "state"),
+        ("/joint_command", "sensor_msgs/msg/JointState", "control"),
+        ("/motor/cmd/feedback", FLOAT64, "state"),
+        ("/desired_speed", FLOAT64, "wish"),
+        ("/drive", "ackermann_msgs/msg/AckermannDriveStamped", "control"),
+        ("/imu", "sensor_msgs/msg/Imu", "state"),
+        ("/rosout", "rcl_interfaces/msg/Log", "apart"),
+        ("/camera/image", "sensor_msgs/msg/Image", "apart"),
+        ("/foo", FLOAT64, ""),
+    ],
+)
+def test_roles_by_name_and_type(topic, kind, role):
+    assert _role(topic, kind) == role
+
+
+def test_a_command_is_found_by_its_effect_where_names_say_nothing(tmp_path):
+    path = save(tmp_path / "a.mcap", driven(("/b/state", "/a")), {})
+    proposal = propose([path])
+    assert signals_of(proposal) == ([("/b/state", "data")], [("/a", "data")])
+    assert "by correlation alone" in proposal.text
+
+
+def test_a_cascade_keeps_every_tank(tmp_path):
+    """The command shows in the first tank only; the others follow."""
+    rng = np.random.default_rng(3)
+    x, u, messages = np.zeros(3), 0.0, []
+    for k in range(600):
+        u = float(rng.normal()) if k % 40 == 0 else u
+        t = 10**18 + k * 100 * MS
+        level = list(x + 1e-4 * rng.normal(size=3))
+        layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+        messages += [Message("/tanks/level", t, cdr(ARRAY, layout=layout, data=np.array(level)), t)]
+        messages += [f64("/tanks/pump_cmd", t, u)]
+        x = x + 0.1 * np.array([u - x[0], x[0] - x[1], x[1] - 0.8 * x[2]])
+    proposal = propose([save(tmp_path / "a.mcap", messages, {"/tanks/level": ARRAY})])
+    assert [c.path for c in proposal.states] == ["data[0]", "data[1]", "data[2]"], proposal.text
+
+
+def test_angles_of_quaternions_are_unwrapped(tmp_path):
+    """A yaw that turns round and round follows its rate; x, y, z, w are not offered beside it."""
+    rng = np.random.default_rng(1)
+    yaw, rate, messages = 0.0, 1.0, []
+    for k in range(800):
+        rate = float(rng.uniform(0.2, 3.0)) if k % 50 == 0 else rate
+        t = 10**18 + k * 20 * MS
+        messages += [pose("/body/pose", t, yaw=yaw), f64("/body/rate_cmd", t, rate)]
+        yaw += 0.02 * rate
+    path = save(tmp_path / "a.mcap", messages, {"/body/pose": POSE})
+    proposal = propose([path])
+    assert [c.path for c in proposal.states] == ["unwrap(yaw(pose.orientation))"]
+    assert "orientation.w" not in proposal.text
+    model = fitted([path], proposal)
+    assert model.fit["mean_width_recorded"][0] < 0.1, "no jump by a turn inside the envelope"
+
+
+def test_a_quaternion_that_is_none_is_read_as_four_numbers(tmp_path):
+    rng = np.random.default_rng(2)
+    messages = driven()
+    for k in range(400):
+        body = message("geometry_msgs/msg/Quaternion", x=float(rng.normal()), y=0.0, z=3.0, w=0.0)
+        kind = "geometry_msgs/msg/QuaternionStamped"
+        t = 10**18 + k * 20 * MS
+        messages.append(Message("/four/state", t, cdr(kind, header=header(t), quaternion=body), t))
+    text = propose([save(tmp_path / "a.mcap", messages, {"/four/state": "geometry_msgs/msg/QuaternionStamped"})]).text
+    assert "quaternion.x" in text and "roll(" not in text
+
+
+def test_a_wrapped_angle_by_name_is_unwrapped(tmp_path):
+    heading, messages = 0.0, []
+    rng = np.random.default_rng(1)
+    rate = 1.0
+    for k in range(800):
+        rate = float(rng.uniform(-1.0, 3.0)) if k % 50 == 0 else rate
+        t = 10**18 + k * 20 * MS
+        kind = "geometry_msgs/msg/Pose2D"
+        messages += [Message("/base/state", t, cdr(kind, x=0.0, y=0.0, theta=math.remainder(heading, math.tau)), t)]
+        messages += [f64("/base/turn_cmd", t, rate)]
+        heading += 0.02 * rate
+    proposal = propose([save(tmp_path / "a.mcap", messages, {"/base/state": "geometry_msgs/msg/Pose2D"})])
+    assert [c.path for c in proposal.states] == ["unwrap(theta)"]
+
+
+def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
+    def extra(k, x, u):
+        t = 10**18 + k * 20 * MS
+        layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+        values = np.array([x, 7.0, math.nan, float(k), math.inf if k < 390 else x, x])
+        return [
+            Message("/plant/all_state", t, cdr(ARRAY, layout=layout, data=values), t),
+            Message("/plant/big_state", t, cdr(ARRAY, layout=layout, data=np.full(LONGEST_ARRAY + 1, x)), t),
+            Message("/plant/talk", t, cdr("std_msgs/msg/String", data="x"), t),
+        ]
+
+    types = {"/plant/all_state": ARRAY, "/plant/big_state": ARRAY, "/plant/talk": "std_msgs/msg/String"}
+    types |= {"/plant/silent_state": FLOAT64}
+    path = save(tmp_path / "a.mcap", driven(("/plant/x_state", "/plant/cmd"), extra=extra), types)
+    proposal = propose([path])
+    comments = [line for line in proposal.text.splitlines() if line.lstrip().startswith("#")]
+
+    def said(words):
+        return [line for line in comments if words in line]
+
+    assert (
+        said("data[1]: always 7")
+        and said("data[2]: never a number")
+        and said("data[3]: grows as a clock or a counter does")
+    )
+    assert said("data[4]: a number in 10 of 400 messages only") and said("data[5]: moves with data[0]")
+    assert said(f"an array of {LONGEST_ARRAY + 1} numbers")
+    assert said("/plant/talk: no number in it") and said("/plant/silent_state: 0 messages only")
+    assert fitted([path], proposal).fit["violations"] == 0
+
+
+def test_pictures_and_scans_are_not_opened(tmp_path):
+    def extra(k, x, u):
+        t = 10**18 + k * 20 * MS
+        layout = {"height": 64, "width": 64, "encoding": "mono8", "is_bigendian": 0, "step": 64}
+        data = cdr("sensor_msgs/msg/Image", header=header(t), data=np.zeros(64 * 64, dtype=np.uint8), **layout)
+        return [Message("/eye", t, data, t)]
+
+    path = save(tmp_path / "a.mcap", driven(extra=extra, count=300), {"/eye": "sensor_msgs/msg/Image"})
+    assert "/eye: no signal of a machine" in propose([path]).text
+
+
+def test_no_command_leaves_the_controls_empty(tmp_path):
+    path = save(tmp_path / "a.mcap", [m for m in driven() if m.topic == "/plant/state"], {})
+    proposal = propose([path])
+    assert not proposal.controls and "controls: []" in proposal.text
+    assert fitted([path], proposal).m == 0
+
+
+def test_commands_that_come_now_and_then(tmp_path):
+    """Five commands in the run: held until the next one."""
+    messages, last = [], None
+    for m in driven(count=600):
+        if m.topic == "/plant/cmd":
+            if m.data == last:
+                continue
+            last = m.data
+        messages.append(m)
+    path = save(tmp_path / "a.mcap", messages, {})
+    proposal = propose([path])
+    assert [c.topic for c in proposal.controls] == ["/plant/cmd"]
+    assert "max_hold" not in yaml.safe_load(proposal.text)["controls"][0]
+    assert fitted([path], proposal).fit["transitions"] > 500
+
+
+def test_clocks_that_disagree_are_not_mixed(tmp_path):
+    """The state's stamps are a day behind the log, and the command has none."""
+    day, messages = 86_400 * 10**9, []
+    for m in driven(("/odd", "/plant/cmd")):
+        if m.topic == "/odd":
+            value = float(np.frombuffer(m.data[-8:])[0])
+            point = message("geometry_msgs/msg/Point", x=value, y=0.0, z=0.0)
+            kind = "geometry_msgs/msg/PointStamped"
+            m = Message("/plant/state", m.log_time, cdr(kind, header=header(m.log_time - day), point=point), m.log_time)
+        messages.append(m)
+    path = save(tmp_path / "a.mcap", messages, {"/plant/state": "geometry_msgs/msg/PointStamped"})
+    proposal = propose([path])
+    topics = yaml.safe_load(proposal.text)["topics"]
+    assert topics == {"/plant/state": {"time": "log"}, "/plant/cmd": {"time": "log"}}
+    assert fitted([path], proposal).fit["transitions"] > 300
+
+
+def test_topics_and_names_that_yaml_would_misread(tmp_path):
+    names = ["yes", "12", "a b", "fan:speed"]
+    rng = np.random.default_rng(0)
+    x, messages = np.zeros(4), []
+    for k in range(400):
+        t = 10**18 + k * 20 * MS
+        u = rng.normal()
+        empty = np.empty(0)
+        state = cdr(
+            "sensor_msgs/msg/JointState", header=header(t), name=names, position=x.copy(), velocity=empty, effort=empty
+        )
+        messages += [Message("/j/states", t, state, t), f64("/j/cmd", t, u)]
+        x = x + 0.02 * (-np.arange(1, 5) * x + u) + 1e-3 * rng.normal(size=4)
+    path = save(tmp_path / "a.mcap", messages, {"/j/states": "sensor_msgs/msg/JointState"})
+    proposal = propose([path])
+    assert len(proposal.states) == 4
+    assert fitted([path], proposal).n == 4
+
+
+def test_nothing_to_propose_is_said(tmp_path):
+    messages = [Message("/talk", k, cdr("std_msgs/msg/String", data="x"), k) for k in range(50)]
+    path = save(tmp_path / "a.mcap", messages, {"/talk": "std_msgs/msg/String"})
+    with pytest.raises(BagError, match="nothing in it looks like the state of a machine"):
+        propose([path])
+
+
+# --- the command ------------------------------------------------------------------------------------------------
+
+
+def test_init_then_fit_then_what_is_next(tmp_path, capsys):
+    """The two lines it prints are the ones to type."""
+    path = save(tmp_path / "run one.mcap", driven(), {})
+    target = tmp_path / "signals.yaml"
+    assert main(["init", str(path), "--output", str(target)]) == 0
+    said = capsys.readouterr().out
+    assert "states: state" in said and "--signals" in said
+    assert main(["init", str(path), "--output", str(target)]) == 2, "it never writes over an edited file"
+    assert "is there already" in capsys.readouterr().err
+    model = tmp_path / "machine.model.json"
+    assert main(["fit", str(path), "--signals", str(target), "--output", str(model)]) == 0
+    assert "next" in capsys.readouterr().out
+    assert main(["init", str(path)]) == 0
+    assert capsys.readouterr().out == target.read_text()
