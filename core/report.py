@@ -145,7 +145,6 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
     rows = [
         (f"uncertain-lti check {file} BAG", "is a recording that was not fitted inside?"),
         (f"uncertain-lti validate {file}", "how far to trust it; an alarm rule for a rate of false alarms"),
-        (f"uncertain-lti report {file} BAG", "the same, with figures, as one page"),
     ]
     width = max(len(command) for command, _ in rows)
     return "\n".join([*lines, "next:", *(f"  {command.ljust(width)}  {text}" for command, text in rows)])
