@@ -20,6 +20,7 @@ from uncertain_lti.message_types import header_stamp_ns
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.sampler import Sampler, Status, resolve
+from uncertain_lti.sampler_arrays import Samples, sample_arrays
 from uncertain_lti.signals import FieldPath, SignalMap
 from uncertain_lti.transient import Transient
 
@@ -129,7 +130,30 @@ def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, 
 
 
 def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Transient:
-    """One recording through the `Sampler`; signals must be resolved."""
+    """One recording through the rules of the `Sampler`; signals must be resolved.
+
+    In columns (`sampler_arrays`), and message after message where that is not possible; the same to the last bit.
+    """
+    samples = sample_arrays(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
+    if samples is None:
+        samples = sample_by_message(stream, signals, progress)
+    assert signals.max_gap is not None
+    return Transient(
+        samples.t_ns,
+        samples.x,
+        samples.u,
+        name=os.fspath(stream.bag.path),
+        signals=signals,
+        max_gap=signals.max_gap,
+        min_step=signals.min_step,
+        counters=samples.counters,
+        sources=stream.bag.parts,
+        notes=stream.bag.warnings,
+    )
+
+
+def sample_by_message(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Samples:
+    """The same through the `Sampler` itself, message after message."""
     sampler = Sampler(signals)
     topics = signals.topics
     rows = [iter(v.tolist()) for v in stream.values]
@@ -149,18 +173,11 @@ def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None)
             t.append(step.t_ns)
             x.append(step.x_next)
             u.append(np.full(m, math.nan))
-    assert signals.max_gap is not None
-    return Transient(
+    return Samples(
         np.array(t, dtype=np.int64),
         np.array(x).reshape(len(t), len(signals.states)),
         np.array(u).reshape(len(t), m),
-        name=os.fspath(stream.bag.path),
-        signals=signals,
-        max_gap=signals.max_gap,
-        min_step=signals.min_step,
-        counters=sampler.counters,
-        sources=stream.bag.parts,
-        notes=stream.bag.warnings,
+        sampler.counters,
     )
 
 

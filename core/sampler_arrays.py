@@ -1,0 +1,275 @@
+"""The rules of `Sampler` on a whole recording at once, where its topics only ever go forward.
+
+What a sample is fixed to depends on what had arrived when the next one came. In a recording all of that is there
+at once, so the message with the greatest stamp at or before a sample is found by bisection among those that had
+arrived. Left to the `Sampler`: time that steps back by more than max_gap, a topic that has some messages with a
+stamp and some without beside a clock that goes by stamps, and messages that wait longer than it remembers them.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES, Status, to_ns
+from uncertain_lti.signals import FieldPath, SignalMap
+
+Integers = NDArray[np.int64]
+Values = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_TWO_PI = 2.0 * math.pi
+_FAR = 2**62  # ns, longer than any recording
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of one recording: t_ns (N,), x (N, n), u (N, m) with NaN for what is missing; counters of the Sampler.
+
+    u[k] acts from t[k] on; it is NaN where nothing follows that it leads to.
+    """
+
+    t_ns: Integers
+    x: Values
+    u: Values
+    counters: Counter[str]
+
+
+class _BackwardError(Exception):
+    """This recording is left to the Sampler."""
+
+
+def sample_arrays(
+    signals: SignalMap, topic: Integers, arrival: Integers, stamp: Integers, values: Sequence[Values]
+) -> Samples | None:
+    """Samples as the `Sampler` gives them, to the last bit and count; None where it has to be asked.
+
+    Parameters
+    ----------
+    signals : SignalMap
+        Resolved as the Sampler wants it.
+    topic, arrival, stamp : arrays (messages,)
+        Of each message in order of arrival: position in `signals.topics`, log time and header stamp in ns, the
+        latter zero or less where there is none.
+    values : sequence of arrays
+        Per topic (messages, signals on it).
+    """
+    if (arrival[1:] < arrival[:-1]).any():
+        return None
+    try:
+        return _Sampling(signals, topic, arrival, stamp, values).run()
+    except _BackwardError:
+        return None
+
+
+@dataclass(frozen=True)
+class _Messages:
+    """Messages of one topic; order is their place among all, stamp 0 or less where none counts."""
+
+    order: Integers
+    arrival: Integers
+    stamp: Integers
+    values: Values
+
+    def take(self, which: Mask | Integers) -> _Messages:
+        return _Messages(self.order[which], self.arrival[which], self.stamp[which], self.values[which])
+
+
+class _Sampling:
+    def __init__(
+        self, signals: SignalMap, topic: Integers, arrival: Integers, stamp: Integers, values: Sequence[Values]
+    ) -> None:
+        assert signals.max_gap is not None and signals.clock is not None
+        self.signals = signals
+        self.n = len(signals.states)
+        self.max_gap, self.min_step = to_ns(signals.max_gap), to_ns(signals.min_step)
+        skew = self.max_gap if signals.max_skew is None else to_ns(signals.max_skew)
+        self.max_age = [skew] * self.n + [_FAR if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls]
+        self.counters: Counter[str] = Counter()
+        self.topics: dict[str, _Messages] = {}
+        for position, name in enumerate(signals.topics):
+            order = np.flatnonzero(topic == position)
+            usable = stamp[order] if signals.time[name] == "header" else np.zeros_like(order)
+            self.topics[name] = _Messages(order, arrival[order], usable, values[position])
+
+    def run(self) -> Samples:
+        """All samples; raises _BackwardError."""
+        signals = self.signals
+        assert signals.clock is not None
+        by_header = signals.time[signals.clock] == "header"
+        messages = self.topics.pop(signals.clock)
+        if by_header:
+            usable = messages.stamp > 0
+            self._count(Status.UNSTAMPED.value, ~usable)
+            messages = messages.take(usable)
+        kept, opens, back = self._accepted(messages.stamp if by_header else messages.arrival)
+        if back.any() and self.topics:
+            raise _BackwardError
+        samples = messages.take(kept)
+        self._count("samples", np.ones(len(kept), dtype=bool))
+        self._count("gaps", opens[1:] & ~back[1:])
+        self._count("resets", back)
+        own = self._unwrapped(signals.clock, samples.values, opens)
+
+        closed = max(len(kept) - 1, 0)
+        z = np.full((closed, len(signals.signals)), math.nan)
+        z[:, signals.on(signals.clock)] = own[:closed]
+        for name, others in self.topics.items():
+            self._fix(name, others, samples, z)
+        self._delay(z, opens)
+        for signal, column in zip(signals.signals, z.T, strict=True):
+            self._count(f"missing {signal.name}", ~np.isfinite(column))
+        return self._samples(samples.stamp if by_header else samples.arrival, z, own, opens, back)
+
+    def _count(self, what: str, which: Mask) -> None:
+        if number := int(np.count_nonzero(which)):
+            self.counters[what] += number
+
+    def _accepted(self, instants: Integers) -> tuple[Integers, Mask, Mask]:
+        """Clock messages that make samples; which of these open a segment, and which step back to do so."""
+        steps = np.diff(instants)
+        if (steps >= max(self.min_step, 1)).all():
+            kept = np.arange(len(instants))
+        else:  # dropping one changes the step of the next, so one after the other
+            positions: list[int] = []
+            last = 0
+            for position, instant in enumerate(instants.tolist()):
+                step = instant - last
+                if not positions or step < -self.max_gap or step >= max(self.min_step, 1):
+                    positions.append(position)
+                    last = instant
+                else:
+                    self.counters[(Status.SHORT if step > 0 else Status.LATE if step else Status.EQUAL).value] += 1
+            kept = np.array(positions, dtype=np.int64)
+            steps = np.diff(instants[kept])
+        opens, back = np.ones(len(kept), dtype=bool), np.zeros(len(kept), dtype=bool)
+        opens[1:] = (steps > self.max_gap) | (steps < 0)
+        back[1:] = steps < 0
+        return kept, opens, back
+
+    def _unwrapped(self, topic: str, values: Values, opens: Mask) -> Values:
+        """Values with angles on the branch nearest to the one before, or to steady where `opens`."""
+        result = values
+        for column, position in enumerate(self.signals.on(topic)):
+            signal = self.signals.signals[position]
+            if FieldPath(signal.field).unwrap:
+                result = result.copy() if result is values else result
+                steady = 0.0 if signal.steady == "auto" else signal.steady
+                result[:, column] = _unwrap(values[:, column], steady, opens)
+        return result
+
+    def _fix(self, name: str, others: _Messages, samples: _Messages, z: Values) -> None:
+        """Fill in what the samples take from another topic than the clock."""
+        stamped = others.stamp > 0
+        for instants in (others.stamp[stamped], others.arrival[~stamped]):
+            if (np.diff(instants) < -self.max_gap).any():
+                raise _BackwardError
+        if self.signals.time[self.signals.clock or ""] == "log" or not stamped.any():
+            time, at = others.arrival, samples.arrival
+        elif stamped.all():
+            time, at = others.stamp, samples.stamp
+        else:
+            raise _BackwardError
+        arrived = np.searchsorted(others.order, samples.order[1:])  # how many had, when each sample closed
+        chosen = _latest(time, at[:-1], arrived)
+        if (arrived - chosen > BUFFERED_MESSAGES)[chosen >= 0].any():
+            raise _BackwardError  # the Sampler may have forgotten it
+        self._count(f"late {name}", self._late(others, samples, time, at[:-1], chosen))
+
+        values = self._unwrapped(name, others.values, np.zeros(len(others.order), dtype=bool))
+        there = chosen >= 0
+        which = chosen[there]
+        age = at[:-1][there] - time[which]
+        for column, position in enumerate(self.signals.on(name)):
+            fresh = age <= self.max_age[position]
+            self._count(f"stale {self.signals.signals[position].name}", ~fresh)
+            z[there, position] = np.where(fresh, values[which, column], math.nan)
+
+    def _late(self, others: _Messages, samples: _Messages, time: Integers, at: Integers, chosen: Integers) -> Mask:
+        """Messages that a closed sample would have chosen: if any, the first of those after them does."""
+        closed = np.searchsorted(samples.order, others.order) - 1  # samples closed when each message arrived
+        first = np.maximum(np.searchsorted(at, time), closed - REMEMBERED_SAMPLES)
+        after = np.flatnonzero(first < closed)
+        before = chosen[first[after]]
+        late = np.zeros(len(time), dtype=bool)
+        late[after] = (before < 0) | (time[before] <= time[after])
+        return late
+
+    def _delay(self, z: Values, opens: Mask) -> None:
+        """Shift controls by samples within a segment."""
+        place = np.arange(len(z))
+        segment_begin = np.maximum.accumulate(np.where(opens[: len(z)], place, 0)) if len(z) else place
+        for position, control in enumerate(self.signals.controls, start=self.n):
+            if control.delay:
+                source = place - control.delay
+                z[:, position] = np.where(source >= segment_begin, z[np.maximum(source, 0), position], math.nan)
+
+    def _samples(self, instants: Integers, z: Values, own: Values, opens: Mask, back: Mask) -> Samples:
+        clock, m = self.signals.clock, len(self.signals.controls)
+        finite: Mask = np.asarray(np.isfinite(z).all(axis=1))
+        if all(s.topic == clock for s in self.signals.states):  # decided when the sample opens
+            count = len(instants)
+            x = np.full((count, self.n), math.nan)
+            for column, position in enumerate(self.signals.on(clock or "")):
+                if position < self.n:
+                    x[:, position] = own[:, column]
+        else:
+            count = len(z)
+            x = z[:, : self.n].copy()
+        judged = ~opens[1:count]
+        self._count("missing", judged & ~(finite[: count - 1] & np.isfinite(x[1:]).all(axis=1)))
+        u = np.full((count, m), math.nan)
+        u[:-1] = z[: max(count - 1, 0), self.n :]
+        u[:-1][back[1:count]] = math.nan
+        return Samples(instants[:count].copy(), x, u, self.counters)
+
+
+def _latest(time: Integers, at: Integers, arrived: Integers) -> Integers:
+    """For each of `at` the message with the greatest time until then, ties to the last, among the first `arrived`.
+
+    -1 where there is none.
+    """
+    if (time[1:] >= time[:-1]).all():
+        return np.minimum(np.searchsorted(time, at, side="right"), arrived) - 1
+    waiting: list[tuple[int, int]] = []
+    every = time.tolist()
+    chosen = []
+    for until, count in zip(at.tolist(), arrived.tolist(), strict=True):
+        for number in range(len(waiting), count):
+            bisect.insort(waiting, (every[number], number))
+        place = bisect.bisect_right(waiting, (until, count)) - 1
+        chosen.append(waiting[place][1] if place >= 0 else -1)
+    return np.array(chosen, dtype=np.int64)
+
+
+def _unwrap(values: Values, steady: float, opens: Mask) -> Values:
+    """Each angle on the branch nearest to the last finite one, or to steady where there is none since `opens`."""
+    result = values + 0.0
+    finite = np.flatnonzero(np.isfinite(values))
+    if not len(finite):
+        return result
+    segment = np.cumsum(opens)[finite]
+    last = np.concatenate([[steady], result[finite[:-1]]])
+    last[1:][segment[1:] != segment[:-1]] = steady
+    with np.errstate(over="ignore", invalid="ignore"):
+        turns = np.rint((last - values[finite]) / _TWO_PI)
+    if not turns.any():
+        return np.where(np.isfinite(values), result, values)
+    previous = steady
+    begins = opens.tolist()
+    unwrapped = values.tolist()
+    for i, value in enumerate(unwrapped):
+        if begins[i]:
+            previous = steady
+        if math.isfinite(value):
+            try:
+                unwrapped[i] = previous = value + _TWO_PI * round((previous - value) / _TWO_PI)
+            except OverflowError:
+                raise _BackwardError from None
+    return np.array(unwrapped)
