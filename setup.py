@@ -27,6 +27,10 @@ extras = {
     "cluster": ["distributed"],
     "frames": ["pandas"],
     "plots": ["matplotlib"],
+    # To and from python-control; MATLAB files take scipy alone.
+    "control": ["control", "scipy"],
+    # The pages in docs/, built by `./run docs`.
+    "docs": ["furo", "latex2mathml", "myst-parser", "sphinx"],
     # Real rclpy where no ROS 2 is installed: wheels for x86_64 Linux.
     "ros": ["ros-jazzy-common-interfaces==5.3.6", "ros-rclpy[fastrtps]==7.1.6"],
     # colcon test looks for pytest here; setuptools lets the tests read this file; cyclonedds hears the node from

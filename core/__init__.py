@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from uncertain_lti.reading import read_transients as read_transients
     from uncertain_lti.signals import SignalMap as SignalMap
     from uncertain_lti.transient import Transient as Transient
+    from uncertain_lti.validation import validate as validate
 
 __version__ = "0.1.0"
 
@@ -26,6 +27,7 @@ _HOME = {
     "UncertainLTI": "model",
     "fit": "identification",
     "read_transients": "reading",
+    "validate": "validation",
 }
 
 __all__ = sorted(_HOME)

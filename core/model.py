@@ -205,6 +205,11 @@ class UncertainLTI:
             text += f"; fitted by {self.fit['criterion']} to {self.fit.get('transitions')} transitions"
         return text + ")"
 
+    def _repr_html_(self) -> str:
+        from uncertain_lti.tables import model_html
+
+        return model_html(self)
+
     # --- one-step bounds ---
 
     def centre_and_half(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike) -> tuple[Array, Array]:
@@ -378,6 +383,34 @@ class UncertainLTI:
             )
         }  # fmt: skip
         return UncertainLTI(**{**arguments, **changes})
+
+    # --- other tools ---
+
+    def to_control(self, dt: float | None = None, recorded: bool = False) -> Any:
+        """The nominal model as a `control.StateSpace`; see `interchange.to_control`."""
+        from uncertain_lti.interchange import to_control
+
+        return to_control(self, dt, recorded)
+
+    @staticmethod
+    def from_control(system: Any, **options: Any) -> UncertainLTI:
+        """From a `control.StateSpace` and half-widths; see `interchange.from_control`."""
+        from uncertain_lti.interchange import from_control
+
+        return from_control(system, **options)
+
+    def save_mat(self, path: str | os.PathLike[str]) -> None:
+        """Write a MATLAB file; see `interchange.save_mat`."""
+        from uncertain_lti.interchange import save_mat
+
+        save_mat(self, path)
+
+    @staticmethod
+    def load_mat(path: str | os.PathLike[str]) -> UncertainLTI:
+        """Read a MATLAB file; see `interchange.load_mat`."""
+        from uncertain_lti.interchange import load_mat
+
+        return load_mat(path)
 
     # --- the file ---
 

@@ -46,6 +46,13 @@ class Verdict:
         self.outside_domain, self.alarm = outside_domain, alarm
         self._judgement = judgement
 
+    def __repr__(self) -> str:
+        if not self.judged:
+            return f"Verdict({self.status.value}: no verdict)"
+        left = int((self.flags == 1.0).sum())
+        said = f"{left} of {len(self.flags)} states violated" if left else "contained"
+        return f"Verdict({said}{', outside the fitted domain' * self.outside_domain}{', ALARM' * self.alarm})"
+
     @property
     def judged(self) -> bool:
         """There is a verdict: the message is neither dropped nor without a complete transition."""
@@ -164,7 +171,7 @@ class _Arrays:
         return _utilisation(self.x_next - self.centre, self.half)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Verdicts:
     """Verdicts over one transient, one row per sample k = 0..N; row k judges the arrival at t_k.
 
@@ -179,6 +186,18 @@ class Verdicts:
     judged: NDArray[np.bool_]
     outside_domain: NDArray[np.bool_]
     alarm: NDArray[np.bool_]
+
+    def __repr__(self) -> str:
+        judged, left = int(self.judged.sum()), int(self.violated.sum())
+        raised = int(np.count_nonzero(np.diff(np.concatenate([[False], self.alarm]).astype(np.int8)) == 1))
+        said = f"{1 - left / judged:.3%} inside all bounds" if judged else "none possible"
+        alarm = f"alarm raised {raised} times" if raised else "no alarm"
+        return f"Verdicts({self.transient.name!r}: {judged} verdicts, {said}, {alarm})"
+
+    def _repr_html_(self) -> str:
+        from uncertain_lti.tables import verdicts_html
+
+        return verdicts_html(self)
 
     @property
     def violated(self) -> NDArray[np.bool_]:
@@ -252,6 +271,13 @@ class EnvelopeMonitor:
         self.alarm = False
         self._recent: deque[bool] = deque()
         self._violations = 0  # among the recent verdicts
+
+    def __repr__(self) -> str:
+        rule = self.rule
+        masked = f", {', '.join(self.masked)} masked" if self.masked else ""
+        return (
+            f"EnvelopeMonitor({self.model!r}; alarm {rule.violations} of {rule.window}, margin {rule.margin:g}{masked})"
+        )
 
     def reset(self) -> None:
         """Forget the recent verdicts and the alarm."""

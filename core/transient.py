@@ -177,6 +177,11 @@ class Transient:
             f"{usable} usable transitions in {self.segments} segments)"
         )
 
+    def _repr_html_(self) -> str:
+        from uncertain_lti.tables import transient_html
+
+        return transient_html(self)
+
     @classmethod
     def from_dataframe(
         cls, frame: Any, *, time: str | None = None, states: Sequence[str], controls: Sequence[str], **options: Any

@@ -37,7 +37,7 @@ REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
 """Alarm rules whose false alarms are counted beside the model's own."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Part:
     """A recording, or a block of one, judged by the model that was fitted without it.
 
@@ -61,6 +61,9 @@ class Part:
     mean_width: Array
     max_width: Array
     relative_width: Array
+
+    def __repr__(self) -> str:
+        return f"Part({self.name!r}: {self.judged} verdicts, {self.violated} violated)"
 
     @property
     def judged(self) -> int:
@@ -100,7 +103,7 @@ def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:
     return int(np.count_nonzero(raised & ~before))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Validation:
     """What `validate` found. `kind` is "transients" or "blocks"; gap, s, is left between a block and its training."""
 
@@ -109,6 +112,17 @@ class Validation:
     kind: str
     gap: float
     confidence: float
+
+    def __repr__(self) -> str:
+        judged, violated = sum(p.judged for p in self.parts), sum(p.violated for p in self.parts)
+        inside = f"{1 - violated / judged:.3%} of {judged} verdicts inside" if judged else "no verdict"
+        whole = sum(p.violated == 0 for p in self.parts)
+        return f"Validation(left out one of {len(self.parts)} {self.kind}: {inside}, {whole} whole)"
+
+    def _repr_html_(self) -> str:
+        from uncertain_lti.tables import validation_html
+
+        return validation_html(self.to_dict(), repr(self))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data: coverage beside widths, false alarms per hour with intervals, scenario bound in words."""

@@ -36,7 +36,7 @@ ROSDEP_KEY = {
     "yaml": "python3-yaml",
     "zstandard": "mcap-ros2-support",
 }
-WITHOUT_ROSDEP_KEY = {"daqp", "distributed", "piqp"}
+WITHOUT_ROSDEP_KEY = {"control", "daqp", "distributed", "piqp"}
 
 
 @pytest.fixture(scope="module")

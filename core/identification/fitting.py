@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import FitError
+from uncertain_lti.errors import FitError, SignalError
 from uncertain_lti.identification import formulation
 from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import choose_discards
@@ -23,7 +23,7 @@ from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError, Solution, WorkingSet
 from uncertain_lti.model import Alarm, Domain, Sampling, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
-from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.signals import FieldPath, Signal, SignalMap
 from uncertain_lti.transient import Transient
 
 Array = NDArray[np.float64]
@@ -316,12 +316,21 @@ def _common_signals(transients: Sequence[Transient]) -> SignalMap:
     if first.signals is not None:
         return first.signals
     return SignalMap(
-        tuple(Signal(name, "", name) for name in first.state_names),
-        tuple(Signal(name, "", name) for name in first.control_names),
+        tuple(Signal(name, "", _field(name, f"x{i + 1}")) for i, name in enumerate(first.state_names)),
+        tuple(Signal(name, "", _field(name, f"u{j + 1}")) for j, name in enumerate(first.control_names)),
         max_gap=None if np.isinf(first.max_gap) else first.max_gap,
         min_step=first.min_step,
         source="arrays",
     )
+
+
+def _field(name: str, otherwise: str) -> str:
+    """The name of a column where it reads as a field path."""
+    try:
+        FieldPath(name)
+    except SignalError:
+        return otherwise
+    return name
 
 
 def _at(signals: SignalMap, point: OperatingPoint) -> SignalMap:

@@ -1,0 +1,243 @@
+"""Models to and from python-control and MATLAB files: what comes back is what went, and means the same."""
+
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, validate
+from uncertain_lti.errors import ModelError
+from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.tables import MOST
+
+control = pytest.importorskip("control", reason="python-control is not installed")
+scipy_io = pytest.importorskip("scipy.io", reason="scipy is not installed")
+
+
+def some_model(n=2, m=1, seed=0, drift=True, names=None):
+    rng = np.random.default_rng(seed)
+    states = tuple(Signal(f"x {i}" if names is None else names[i], "", "x", i + 1.0, 2.0 + i, "rpm") for i in range(n))
+    controls = tuple(Signal(f"u{j}", "", "u", -1.0, 0.5 + j, "") for j in range(m))
+    return UncertainLTI(
+        rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.random((n, n)), rng.random((n, m)),
+        rng.normal(size=n) if drift else None, rng.random(n), rng.random(n), signals=SignalMap(states, controls),
+    )  # fmt: skip
+
+
+def same(a, b, exactly=True):
+    for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+        left, right = getattr(a, name), getattr(b, name)
+        assert np.array_equal(left, right) if exactly else np.allclose(left, right, rtol=1e-12, atol=1e-12), name
+
+
+# --- python-control ---------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40)
+@given(st.integers(1, 5), st.integers(0, 3), st.integers(0, 9), st.booleans(), st.booleans())
+def test_there_and_back(n, m, seed, drift, recorded):
+    model = some_model(n, m, seed, drift or not m)  # a system without any input is none to python-control
+    for dt in (None, 0.025):
+        system = model.to_control(dt, recorded)
+        assert list(system.state_labels) == list(model.state_names) and system.dt == (dt or 0)
+        again = UncertainLTI.from_control(
+            system, dA=model.dA, dB=model.dB, dc=model.dc, v=model.v, signals=model.signals, recorded=recorded
+        )
+        same(model, again, exactly=dt is None and not recorded)
+        assert again.signals == model.signals
+
+
+def test_its_simulation_is_eq_3():
+    """`control.forced_response` of the discrete system is the free run of the nominal model."""
+    model = some_model(3, 2, 5)
+    A = model.A - 3 * np.eye(3)
+    model = model.with_(A=A)
+    rng, dt = np.random.default_rng(1), 0.02
+    u = rng.normal(size=(50, 2))
+    system = model.to_control(dt)
+    drift = np.ones((1, 50))
+    response = control.forced_response(system, np.arange(50) * dt, np.vstack([u.T, drift]), [0.1, 0.2, 0.3])
+    assert np.allclose(response.states.T, model.simulate([0.1, 0.2, 0.3], u, dt)[:-1])
+    # in recorded units the same run, scaled
+    recorded = model.to_control(dt, recorded=True)
+    X, U = model.operating_point.X, model.operating_point.U
+    scaled = control.forced_response(
+        recorded, np.arange(50) * dt, np.vstack([(u * U).T, drift]), X * np.array([0.1, 0.2, 0.3])
+    )
+    assert np.allclose(scaled.states.T, response.states.T * X)
+
+
+def test_what_is_no_model_is_refused():
+    model = some_model()
+    with pytest.raises(ModelError, match="positive number of seconds"):
+        model.to_control(dt=0.0)
+    ss = control.ss([[0.5]], [[1.0]], [[2.0]], [[0.0]])
+    with pytest.raises(ModelError, match="outputs are not its states"):
+        UncertainLTI.from_control(ss)
+    with pytest.raises(ModelError, match="does not say its step"):
+        UncertainLTI.from_control(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], True))
+    with pytest.raises(ModelError, match="need the scales"):
+        UncertainLTI.from_control(model.to_control(recorded=True), recorded=True)
+    with pytest.raises(ModelError, match="dA"):
+        UncertainLTI.from_control(model.to_control(), dA=[[1.0]])
+    with pytest.raises(ModelError, match="called 'drift'"):
+        UncertainLTI(
+            [[1.0]], [[1.0]], [[0.0]], [[0.0]], [1.0],
+            signals=SignalMap((Signal("x", "", "x"),), (Signal("drift", "", "u"),)),
+        ).to_control()  # fmt: skip
+
+
+# --- MATLAB -----------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=30)
+@given(st.integers(1, 4), st.integers(0, 3), st.integers(0, 9))
+def test_a_mat_file_gives_back_the_whole_model(tmp_path_factory, n, m, seed):
+    model = some_model(n, m, seed, names=["Δp", "n 1", "T4", "x"])
+    path = tmp_path_factory.mktemp("mat") / "model.mat"
+    model.save_mat(path)
+    again = UncertainLTI.load_mat(path)
+    assert again.to_dict() == model.to_dict()
+    seen = scipy_io.loadmat(path)
+    assert seen["A"].shape == (n, n) and seen["B"].shape == (n, m) and seen["v"].shape == (n, 1)
+    assert [str(name[0][0]) for name in seen["state_names"]] == list(model.state_names)
+    assert seen["x_scale"].ravel().tolist() == model.operating_point.X.tolist()
+
+
+def test_what_was_changed_in_matlab_counts(tmp_path):
+    model, path = some_model(3, 2), tmp_path / "m.mat"
+    model.save_mat(path)
+    data = {k: v for k, v in scipy_io.loadmat(path).items() if not k.startswith("__")}
+    data["dA"] = data["dA"] * 2
+    scipy_io.savemat(path, data)
+    again = UncertainLTI.load_mat(path)
+    assert np.array_equal(again.dA, 2 * model.dA) and again.to_dict()["states"] == model.to_dict()["states"]
+
+
+def test_a_file_written_by_hand(tmp_path):
+    """A, B, dA, dB alone, names as a char matrix padded with blanks, B sparse."""
+    from scipy.sparse import csc_matrix
+
+    path = tmp_path / "m.mat"
+    scipy_io.savemat(
+        path,
+        {
+            "A": [[-1.0, 0.5], [0.0, -2.0]], "B": csc_matrix([[0.0], [3.0]]), "dA": np.eye(2), "dB": [[0], [1]],
+            "state_names": np.array(["speed", "p   "]), "x_scale": [100.0, 2.0],
+        },
+    )  # fmt: skip
+    model = UncertainLTI.load_mat(path)
+    assert model.state_names == ("speed", "p") and model.control_names == ("u1",)
+    assert model.B.tolist() == [[0.0], [3.0]] and model.operating_point.X.tolist() == [100.0, 2.0]
+    assert not model.v.any()
+
+
+def test_mat_files_that_are_none(tmp_path):
+    path = tmp_path / "m.mat"
+    with pytest.raises(ModelError, match="no such file"):
+        UncertainLTI.load_mat(path)
+    for data in (b"", b"MATLAB 5.0", bytes(200), b"\x00" * 127 + b"\x02IM" + bytes(64)):
+        path.write_bytes(data)
+        with pytest.raises(ModelError, match=r"m\.mat"):
+            UncertainLTI.load_mat(path)
+    model = some_model(2, 1)
+    model.save_mat(path)
+    whole = path.read_bytes()
+    for cut in range(0, len(whole), max(1, len(whole) // 60)):
+        path.write_bytes(whole[:cut])
+        try:
+            assert UncertainLTI.load_mat(path).to_dict() == model.to_dict()
+        except ModelError as error:
+            assert "m.mat" in str(error)
+    for change, words in (
+        ({"A": None}, "no variable 'A'"),
+        ({"A": np.eye(3)}, "A"),
+        ({"dB": [[-1.0], [0.0]]}, "negative"),
+        ({"B": np.array([["a"], ["b"]])}, "not a real matrix"),
+        ({"v": [np.nan, 0.0]}, "finite"),
+        ({"model_json": "{"}, "model_json"),
+        ({"model_json": "[]"}, "model"),
+        ({"model_json": None, "state_names": np.array(["one"])}, "1 entries for 2 states"),
+        ({"model_json": None, "x_scale": [0.0, 1.0]}, "scale"),
+    ):
+        model.save_mat(path)
+        data = {k: v for k, v in scipy_io.loadmat(path).items() if not k.startswith("__")} | change
+        scipy_io.savemat(path, {k: v for k, v in data.items() if v is not None})
+        with pytest.raises(ModelError, match=words):
+            UncertainLTI.load_mat(path)
+    with pytest.raises(ModelError, match="cannot be written"):
+        model.save_mat(tmp_path / "no folder" / "m.mat")
+
+
+def test_neither_is_needed_by_who_does_not_use_it():
+    code = "import sys, uncertain_lti.model; assert not {'control', 'scipy', 'matplotlib'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- how results print ------------------------------------------------------------------------------------------
+
+
+class Reader(HTMLParser):
+    """Rows of cells, and whether every tag is closed."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.rows = [], []
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+
+
+def run(n=2, steps=200, seed=0):
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.normal(size=(steps // 10 + 1, 1)), 10, axis=0)[:steps]
+    x = np.zeros((steps, n))
+    for k in range(steps - 1):
+        x[k + 1] = x[k] + 0.1 * (-x[k] + u[k]) + 1e-3 * rng.normal(size=n)
+    return Transient(np.arange(steps) * 0.1, x, u, state_names=[f"<x{i}>" for i in range(n)], name="a & b")
+
+
+def test_results_print_on_one_line_and_as_a_table():
+    runs = [run(seed=s) for s in (0, 1)]
+    model = fit(runs, additive="noise")
+    verdicts = EnvelopeMonitor(model).check(runs[0])
+    validation = validate(runs, additive="noise")
+    for thing in (model, runs[0], verdicts, validation, EnvelopeMonitor(model), validation.parts[0]):
+        assert "\n" not in repr(thing) and len(repr(thing)) < 300, repr(thing)
+    for thing in (model, runs[0], verdicts, validation):
+        rows = Reader(thing._repr_html_()).rows
+        assert len({len(row) for row in rows}) == 1 and len(rows) > 2
+        assert any("<x0>" in cell for row in rows for cell in row), "names are escaped, and come back"
+    first = Reader(model._repr_html_()).rows[1]
+    assert first[1] == f"{model.A[0, 0]:.4g} ± {model.dA[0, 0]:.3g}"
+    assert "100.000% inside" in repr(verdicts) and "no alarm" in repr(verdicts)
+
+
+def test_tables_of_large_and_of_empty_things():
+    n = 50
+    model = UncertainLTI(np.eye(n), np.zeros((n, 0)), np.eye(n), np.zeros((n, 0)))
+    rows = Reader(model._repr_html_()).rows
+    assert len(rows) == MOST + 2 and len(rows[0]) == MOST + 2
+    empty = Transient([], np.empty((0, 2)), np.empty((0, 1)))
+    Reader(empty._repr_html_())
+    still = Transient([0.0, 1.0], [[np.nan], [np.nan]], [[0.0], [0.0]])
+    verdicts = EnvelopeMonitor(UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]])).check(still)
+    assert "none possible" in repr(verdicts)
+    Reader(verdicts._repr_html_())
