@@ -1,0 +1,367 @@
+"""Damaged recordings and messages, seeded: each must give a clear error or a correct reading, soon and in bounds.
+
+    python tests/fuzz.py --count 10000              # as many files, and as many serialised messages
+    python tests/fuzz.py --count 1 --seed 4711      # one case again
+
+A case fails when anything but an error meant for a person comes out of it, when it takes over 5 s, when it asks for
+over 1 GiB of memory, or when its reading is wrong. A reading is wrong when the readers disagree (by message and by
+arrays, or layout and middleware), or when a chunk whose checksum holds gives a message that was never written. Cases
+run in processes of their own, in batches, so that what kills a process or hangs in C is noticed as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import faulthandler
+import io
+import os
+import random
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bag_writer import Layout, Message, Topic, cdr, float64, header, message, places, write
+
+LIMIT_S = 5.0
+LIMIT_MEMORY = 1 << 30
+BATCH = 250
+JOINT_STATE, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
+STATE, POSE, COMMAND = "/state", "/pose", "/command"
+LAYOUTS = (
+    Layout("zstd"),
+    Layout("lz4"),
+    Layout("none"),
+    Layout("none", chunked=False),
+    Layout("zstd", summary=False, indexes=False),
+    Layout("lz4", chunk_size=1 << 16, indexes=False),
+    Layout("zstd", chunk_size=1 << 16),
+    Layout("none", checksums=False),
+)
+SIGNALS = f"""
+clock: {STATE}
+max_gap: 1.0
+states:
+  - {{name: a, topic: {STATE}, field: "position[a]", steady: 0, scale: 1}}
+  - {{name: b, topic: {STATE}, field: "velocity[1]", steady: 0, scale: 1}}
+  - {{name: yaw, topic: {POSE}, field: "yaw(pose.pose.orientation)", steady: 0, scale: 1}}
+controls:
+  - {{name: c, topic: {COMMAND}, field: data, steady: 0, scale: 1}}
+"""
+
+
+class WrongError(Exception):
+    """What was read is not what is there."""
+
+
+# --- what is damaged ----------------------------------------------------------------------------------------
+
+
+def joint_state(t_ns: int, k: int) -> bytes:
+    return cdr(
+        JOINT_STATE, header=header(t_ns, "base"), name=["a", "b", "longer name"], position=np.array([k, 1.0, 2.0]),
+        velocity=np.array([0.5, k, 1.5]), effort=np.empty(0),
+    )  # fmt: skip
+
+
+def odometry(t_ns: int, k: int) -> bytes:
+    vector = {name: message("geometry_msgs/msg/Vector3", x=0.1 * k, y=0.0, z=0.0) for name in ("linear", "angular")}
+    pose = message(
+        "geometry_msgs/msg/Pose",
+        position=message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0),
+        orientation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(0.01 * k), w=np.cos(0.01 * k)),
+    )
+    return cdr(
+        ODOMETRY, header=header(t_ns, "odom"), child_frame_id="base",
+        pose=message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+        twist=message(
+            "geometry_msgs/msg/TwistWithCovariance", twist=message("geometry_msgs/msg/Twist", **vector),
+            covariance=np.zeros(36),
+        ),
+    )  # fmt: skip
+
+
+@cache
+def messages_of_a_run() -> tuple[Message, ...]:
+    found, t = [], 1_700_000_000_000_000_000
+    for k in range(40):
+        found += [
+            Message(COMMAND, t, float64(0.1 * k)),
+            Message(POSE, t + 1_000_000, odometry(t, k)),
+            Message(STATE, t + 2_000_000, joint_state(t, k)),
+        ]
+        t += 20_000_000
+    return tuple(found)
+
+
+TOPICS = (Topic(STATE, JOINT_STATE), Topic(POSE, ODOMETRY), Topic(COMMAND))
+
+
+@cache
+def whole(layout: Layout) -> bytes:
+    return write(TOPICS, messages_of_a_run(), layout).data
+
+
+LIES = tuple(
+    value.to_bytes(size, "little")
+    for size, values in (
+        (4, (0, 1, 3, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**30)),
+        (8, (0, 1, 2**32, 2**40, 2**63 - 1, 2**63, 2**64 - 1)),
+    )
+    for value in values
+)
+
+
+def damaged(rng: random.Random, data: bytes, first: int = 0, aligned: int = 1) -> bytes:
+    """A few bytes changed, lengths made to lie, stretches cut out, repeated, moved or zeroed, or the end cut off."""
+    body = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        if len(body) <= first + 8:
+            break
+        at = rng.randrange(first, len(body)) // aligned * aligned
+        kind = rng.random()
+        if kind < 0.25:
+            body[at] = rng.randrange(256)
+        elif kind < 0.55:
+            lie = rng.choice(LIES)
+            body[at : at + len(lie)] = lie
+        elif kind < 0.65:
+            del body[at:]
+        elif kind < 0.75:
+            del body[at : at + rng.randrange(1, 200)]
+        elif kind < 0.85:
+            body[at:at] = body[at : at + rng.randrange(1, 200)]
+        elif kind < 0.93:
+            to = rng.randrange(first, len(body))
+            part = body[at : at + rng.randrange(1, 100)]
+            body[to : to + len(part)] = part
+        else:
+            body[at : at + 50] = bytes(len(body[at : at + 50]))
+    return bytes(body)
+
+
+def damaged_file(rng: random.Random) -> tuple[bytes, bool]:
+    """A file, and whether every message in it that has a checksum which holds was written like that."""
+    layout = rng.choice(LAYOUTS)
+    kind = rng.random()
+    if kind < 0.35:  # the messages themselves; the file around them is whole
+        changed = []
+        for m in messages_of_a_run():
+            body = damaged(rng, m.data, first=rng.choice((0, 4))) if rng.random() < 0.2 else m.data
+            changed.append(Message(m.topic, m.log_time, body))
+        return write(TOPICS, changed, layout).data, False
+    data = whole(layout)
+    checked = layout.checksums and layout.chunked
+    if kind < 0.7:
+        return damaged(rng, data), checked
+    body = bytearray(data)  # the head of some record: its opcode, length, and the numbers after them
+    record = rng.choice(places(data))
+    for _ in range(rng.choice((1, 1, 2))):
+        lie = rng.choice(LIES)
+        at = record.begin + rng.choice((0, 1, 1, 9, 17, 25, 29, 33, 37, 41))
+        if at + len(lie) < len(body):
+            body[at : at + len(lie)] = lie
+    return bytes(body), checked
+
+
+# --- one case -----------------------------------------------------------------------------------------------
+
+
+def read_file(rng: random.Random, folder: Path) -> str:
+    """Every way in which a recording is read; returns what became of it."""
+    from uncertain_lti import SignalMap
+    from uncertain_lti.bag import Bag, describe
+    from uncertain_lti.cli import main
+    from uncertain_lti.errors import UncertainLTIError
+    from uncertain_lti.reading import read_stream, read_stream_by_message
+
+    path = folder / "damaged.mcap"
+    data, checked = damaged_file(rng)
+    path.write_bytes(data)
+    signals = SignalMap.load(folder / "signals.yaml")
+    outcome = "read"
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        status = main(["topics", str(path)])
+    if status not in (0, 2) or "Traceback" in said.getvalue():
+        raise WrongError(f"topics ended with {status}: {said.getvalue()[-500:]}")
+    try:
+        bag = Bag(path)
+        describe(bag)
+        written = {(m.log_time, m.data) for m in messages_of_a_run()}
+        if checked and any((m.log_time_ns, m.data) not in written for m in bag.raw_messages()):
+            raise WrongError("a message that was never written")
+    except UncertainLTIError:
+        outcome = "refused"
+    readings: list[Any] = []
+    for read in (read_stream, read_stream_by_message):
+        try:
+            stream = read(Bag(path), signals)
+            readings.append([stream.topic, stream.arrival, stream.stamp, *stream.values])
+        except UncertainLTIError as error:
+            if "\n" in str(error) or len(str(error)) > 2000:
+                raise WrongError(f"no sentence: {error}") from None
+            readings.append(None)
+    if (readings[0] is None) != (readings[1] is None):
+        raise WrongError("one way to read it refuses it, the other does not")
+    if readings[0] is None:
+        return "refused" if outcome == "refused" else "read, no signals"
+    for arrays, one_by_one in zip(*readings, strict=True):
+        if np.asarray(arrays).tobytes() != np.asarray(one_by_one).tobytes():
+            raise WrongError("read by arrays and by message it says different things")
+    return outcome
+
+
+@cache
+def middleware() -> tuple[Any, Any, Any]:
+    from rclpy.serialization import deserialize_message
+
+    from uncertain_lti_ros.layout import MessageReader
+    from uncertain_lti_ros.messages import live_fields, message_class
+
+    return MessageReader, cache(live_fields), lambda kind: lambda data: deserialize_message(data, message_class(kind))
+
+
+def read_messages(rng: random.Random, _: Path) -> str:
+    """One damaged message after a few whole ones, by the layouts of the live node and by the middleware alone."""
+    from uncertain_lti.signals import FieldPath
+    from uncertain_lti_ros.layout import UnreadableError
+
+    make_reader, fields, decoder = middleware()
+    kind, paths, make = rng.choice(
+        (
+            (JOINT_STATE, ("position[a]", "velocity[1]", "position[longer name]"), joint_state),
+            (ODOMETRY, ("yaw(pose.pose.orientation)", "twist.twist.linear.x", "pose.covariance[7]"), odometry),
+        )
+    )
+    taken = [FieldPath(text) for text in paths]
+    reader = make_reader(kind, taken, fields, decoder(kind))
+    for k in range(3):
+        reader.read(make(10**18 + k, k))
+    data = damaged(rng, make(10**18 + 9, 9), first=rng.choice((0, 4)), aligned=rng.choice((1, 4)))
+    try:
+        decoded = decoder(kind)(data)
+    except Exception:  # whatever the middleware raises
+        decoded = None
+    try:
+        found = reader.read(data)
+    except UnreadableError:
+        return "refused"
+    if decoded is None:
+        # The middleware refuses what stands in fields that nobody wants; what was wanted is where it belongs.
+        return "read past"
+    stamp = decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec or None
+    values = [path.read(decoded) for path in taken]
+    if found[0] != stamp or np.array(found[1]).tobytes() != np.array(values).tobytes():
+        raise WrongError(f"{found} where the middleware says {(stamp, values)}; {data.hex()}")
+    return "read"
+
+
+KINDS: dict[str, Callable[[random.Random, Path], str]] = {"files": read_file, "messages": read_messages}
+
+
+# --- many cases ---------------------------------------------------------------------------------------------
+
+
+def work(kind: str, first: int, count: int) -> None:
+    """Print `begin SEED`, then `end SEED OUTCOME` or `fail SEED WHY`, of each case."""
+    warnings.simplefilter("error", RuntimeWarning)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "signals.yaml").write_text(SIGNALS)
+        case = KINDS[kind]
+        with contextlib.suppress(Exception):
+            case(random.Random(0), folder)  # imports what is imported late
+        size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        resource.setrlimit(resource.RLIMIT_AS, (size + LIMIT_MEMORY, resource.RLIM_INFINITY))
+        for seed in range(first, first + count):
+            print("begin", seed, flush=True)
+            faulthandler.dump_traceback_later(LIMIT_S, exit=True)
+            try:
+                print("end", seed, case(random.Random(seed), folder), flush=True)
+            except BaseException as error:
+                why = "".join(traceback.format_exception(error)).replace("\n", " | ")
+                print("fail", seed, why[-1500:], flush=True)
+            faulthandler.cancel_dump_traceback_later()
+
+
+@dataclass
+class Outcome:
+    """What became of the cases: how many ended how, and which failed."""
+
+    counts: dict[str, int]
+    failures: list[str]
+    slowest: float
+
+
+def run(kind: str, first: int, count: int, program: str = __file__) -> Outcome:
+    """Cases of seeds first, first + 1, ... in processes of their own, which run this program."""
+    outcome = Outcome({}, [], 0.0)
+    while count > 0:
+        done = 0
+        for seed, said, seconds in _batch(program, kind, first, min(BATCH, count)):
+            done += 1
+            outcome.slowest = max(outcome.slowest, seconds)
+            if said.startswith("end "):
+                key = said.removeprefix("end ")
+                outcome.counts[key] = outcome.counts.get(key, 0) + 1
+            else:
+                outcome.failures.append(f"{kind} --seed {seed}: {said.removeprefix('fail ')}")
+        first, count = first + max(done, 1), count - max(done, 1)
+    return outcome
+
+
+def _batch(program: str, kind: str, first: int, count: int) -> Iterator[tuple[int, str, float]]:
+    """(seed, what was said of it, s) of each case until the process ends, as it does after one that kills it."""
+    command = [sys.executable, program, "--work", kind, "--seed", str(first), "--count", str(count)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
+    assert process.stdout is not None
+    open_seed, began, other = first, time.perf_counter(), ""
+    is_open = False
+    for line in process.stdout:
+        word, _, rest = line.strip().partition(" ")
+        seed, _, what = rest.partition(" ")
+        if word == "begin":
+            open_seed, began, is_open = int(seed), time.perf_counter(), True
+        elif word in ("end", "fail") and seed == str(open_seed):
+            is_open = False
+            yield open_seed, f"{word} {what}", time.perf_counter() - began
+        else:
+            other = f"{other} | {line.strip()}"[-1500:]
+    if process.wait() != 0 or is_open:  # `other` holds where it hung
+        yield open_seed, f"fail the process ended with {process.returncode}: {other}", time.perf_counter() - began
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--count", type=int, default=10_000, help="cases of each kind")
+    parser.add_argument("--seed", type=int, default=1, help="of the first case")
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
+    parser.add_argument("--work", choices=list(KINDS), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.work:
+        work(options.work, options.seed, options.count)
+        return 0
+    failed = 0
+    for kind in options.kinds:
+        outcome = run(kind, options.seed, options.count)
+        counts = ", ".join(f"{count} {name}" for name, count in sorted(outcome.counts.items()))
+        print(f"{kind}: {counts}; {len(outcome.failures)} failed; the slowest took {outcome.slowest:.2f} s")
+        for failure in outcome.failures[:20]:
+            print(f"  {failure}")
+        failed += len(outcome.failures)
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
