@@ -648,3 +648,19 @@ def test_discards_out_of_range_are_refused():
     for budget in (-1, 1.5, np.nan, True):
         with pytest.raises(FitError, match="discard is"):
             fit(transient, additive="noise", discard=budget)
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize("seed", range(6))
+def test_controls_that_move_together_cost_no_optimality(criterion, seed):
+    """Columns that cannot be told apart, and scales far apart: the answer is still proved, and is cvxpy's."""
+    rng = np.random.default_rng(seed)
+    transient = drawn(small_plant(seed, 3, 3), 40, seed, 1e-6, jitter=0.3, rest=0)
+    scale = 10.0 ** rng.uniform(-3, 3, 3)
+    transient = Transient(transient.t_ns, transient.x * scale, transient.u)
+    model = fit(transient, criterion, additive="disturbance")
+    assert count_outside(model, [transient]) == 0
+    assert model.fit["gap"] < 1e-6
+    problem = assemble([transient], OperatingPoint.identity(3, 3), None, "disturbance")
+    _, _, objective = formulation.solve(problem, criterion, cp.CLARABEL)
+    np.testing.assert_allclose(model.fit["objective"], objective, rtol=1e-5)

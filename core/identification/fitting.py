@@ -238,7 +238,9 @@ def fit_fleet(
     else:
         assert solution.delta is not None
         objective, reference = judged.weighted, solution.delta
-    gap = float(np.max((objective - reference) / np.maximum(np.abs(objective), 1e-300), initial=0.0))
+    # an envelope narrower than a millionth of the steps themselves is rounding, and so is its distance from 0
+    least = 1e-300 if criterion == "qp" else 1e-6 * sums.rate_scale * judged.weighted / np.maximum(max_width, 1e-300)
+    gap = float(np.max((objective - reference) / np.maximum(np.abs(objective), least), initial=0.0))
     X = model.operating_point.X
     facts: dict[str, Any] = {
         "criterion": criterion,

@@ -58,6 +58,7 @@ def solve_qp(
     """
     # a diagonal scaling makes a badly scaled Hessian harmless to every solver
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
+    rows, limits = G, h
     H, f, G, lower, upper = H * np.outer(s, s), f * s, G * s, lower / s, upper / s
     norm = np.maximum(np.abs(G).max(axis=1, initial=0.0), 1e-300)
     G, h = G / norm[:, None], h / norm
@@ -66,10 +67,10 @@ def solve_qp(
         answer, found = solver(H, f, G, h, lower, upper, active)
         if answer is None or not np.isfinite(answer).all():
             continue
-        answer = np.clip(answer, lower, upper)
-        violation = float(np.max(h - G @ answer, initial=0.0))
+        answer = np.clip(answer, lower, upper) * s
+        violation = float(np.max(limits - rows @ answer, initial=0.0))  # not that of what was scaled for the solver
         if best is None or violation < best[0]:
-            best = (violation, Answer(answer * s, name, found))
+            best = (violation, Answer(answer, name, found))
         if violation <= FEASIBLE:
             return best[1]
     if best is not None and best[0] <= 1e-4:  # the repair makes it contained; the gap reported says how good it is
@@ -139,22 +140,34 @@ _SOLVERS = (("DAQP", _daqp), ("PIQP", _piqp), ("OSQP", _osqp))
 def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array) -> float:
     """A lower bound of the optimum of `solve_qp`, whoever found ξ: the dual objective at multipliers made for ξ.
 
-    Any non-negative multipliers give a bound; those that balance the gradient with what is active at ξ, by least
-    squares, give a tight one where ξ is optimal. -inf where there are none.
+    Any non-negative multipliers λ give a bound, -½ |L⁻¹(Cᵀλ - f)|² + lᵀλ with H = L Lᵀ and C ξ >= l what is active at
+    ξ; those that balance the gradient there, Cᵀλ = f + Hξ, give a tight one where ξ is optimal. They are found by
+    least squares, in the units of the gradient and in those of L, of which either can be the better. -inf where
+    there are none.
     """
+    from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
 
-    rows = np.vstack([np.eye(len(f)), -np.eye(len(f)), G])
-    limits = np.concatenate([lower, -upper, h])
+    s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))  # as in `solve_qp`
+    rows, limits = np.vstack([np.eye(len(f)), -np.eye(len(f)), G]), np.concatenate([lower, -upper, h])
     near = np.flatnonzero(rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0))
-    C = rows[near]
-    gradient = H @ xi + f
+    C, limits = rows[near].T, limits[near]
+    best = -np.inf
     try:
-        multiplier = nnls(C.T, gradient)[0] if len(near) else np.empty(0)
-        left = C.T @ multiplier - f
-        return float(limits[near] @ multiplier - 0.5 * left @ np.linalg.solve(H, left))
-    except (RuntimeError, np.linalg.LinAlgError):  # too many iterations; singular
-        return -np.inf
+        L = np.linalg.cholesky(H * np.outer(s, s))
+        whitened, linear = (solve_triangular(L, (v.T * s).T, lower=True) for v in (C, f))
+        attempts = ((C, f + H @ xi), (whitened, linear + L.T @ (xi / s)))
+    except np.linalg.LinAlgError:  # not definite, to rounding
+        return best
+    for columns, gradient in attempts:
+        unit = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        try:
+            multiplier = nnls(columns / unit, gradient)[0] / unit if len(near) else np.empty(0)
+        except RuntimeError:  # too many iterations
+            continue
+        left = whitened @ multiplier - linear
+        best = max(best, float(limits @ multiplier - 0.5 * left @ left))
+    return best
 
 
 class Simplex:

@@ -39,6 +39,7 @@ With a weight that is small enough, and a small one is, the minimum of the sum i
 the optimum of δ alone, at the end.
 """
 MAX_ROUNDS = 200
+_ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
 _JOIN = 48  # samples that join a working set per round, at least; more where there are many unknowns
 
 
@@ -100,6 +101,7 @@ class Row:
         self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
         self.limit: float | None = None  # δ of (11) in units of scale
         self.exact = False  # (11) by the simplex method
+        self.attempt = _ATTEMPTS[0]
         self._active: dict[str, Sense] = {}  # what was active in the last programme of a kind
         self._simplex: Simplex | None = None
         self._known: Index = np.empty(0, dtype=np.intp)
@@ -190,12 +192,12 @@ class Row:
         y, half = self.y[pool], self.half[pool]
         return np.vstack([np.hstack([phi, psi]), np.hstack([-phi, psi])]), np.concatenate([y - half, -y - half])
 
-    def hessian(self, gram: Array, linear: Array, tie_break: float) -> tuple[Array, Array]:
-        """Squared widths, plus the tie-break on the centre."""
+    def hessian(self, gram: Array, linear: Array, tie_break: float, ridge: float = 1e-10) -> tuple[Array, Array]:
+        """Squared widths, plus the tie-break on the centre, with a ridge for what moves together in every sample."""
         H = np.zeros((self.r + self.q, self.r + self.q))
         diagonal = np.diagonal(gram)
         weight = tie_break * float(diagonal.min(initial=1.0))
-        H[: self.r, : self.r] = weight * (self.centre + 1e-10 * np.eye(self.r))
+        H[: self.r, : self.r] = weight * (self.centre + ridge * np.eye(self.r))
         H[self.r :, self.r :] = gram + 1e-13 * np.diag(diagonal)
         return H, np.concatenate([-weight * self.target, linear])
 
@@ -204,16 +206,18 @@ class Row:
     def _solve(
         self,
         kind: str,
-        H: Array,
-        f: Array,
+        objective: Callable[[float, float], tuple[Array, Array]],
         G: Array,
         h: Array,
         lower: Array,
         upper: Array,
-        any_solver: bool = True,
+        any_solver: bool = False,
     ) -> tuple[Array, str]:
-        """Solve a programme whose rows are some for each sample of the pool, from what was active last time."""
-        fixed, per_sample = len(f), len(h) // max(len(self.pool), 1)
+        """Solve a programme whose rows are some for each sample of the pool, from what was active last time.
+
+        objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
+        """
+        fixed, per_sample = len(lower), len(h) // max(len(self.pool), 1)
         start = None
         if kind in self._active:
             known = self._active[kind][fixed:].reshape(per_sample, -1)
@@ -221,39 +225,54 @@ class Row:
             start = np.zeros(fixed + len(h), dtype=np.int32)
             start[:fixed] = self._active[kind][:fixed]
             start[fixed:].reshape(per_sample, -1)[:, : known.shape[1]] = known
-        answer = solve_qp(H, f, G, h, lower, upper, start, any_solver)
+        for attempt in _ATTEMPTS:
+            try:
+                answer = solve_qp(*objective(*attempt), G, h, lower, upper, start, any_solver=False)
+                break
+            except FitError:
+                continue
+        else:
+            if not any_solver:
+                raise FitError("DAQP could not solve the quadratic programme")
+            answer = solve_qp(*objective(*attempt), G, h, lower, upper)
+        self.attempt = attempt
         if answer.active is not None:
             self._active[kind] = answer.active
         return answer.xi, answer.solver
 
     def solve_quadratic(self) -> str:
         """(10)."""
-        H, f = self.hessian(self.gram, self.linear, TIE_BREAK)
-        answer, solver = self._solve("quadratic", H, f, *self.containment(self.pool), self.lower, self.upper)
+        answer, solver = self._solve(
+            "quadratic",
+            lambda factor, ridge: self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge),
+            *self.containment(self.pool),
+            self.lower,
+            self.upper,
+            any_solver=True,
+        )
         self.store(answer)
         return solver
 
     def solve_regularised(self) -> str:
         """(11) with a little of the squared widths."""
-        H, f = self.hessian(self.plain, self.plain_linear, BOUNDED_TIE_BREAK)
-        G, h = self._rows(self.pool)
-        size = len(f)
-        whole = np.zeros((size + 1, size + 1))
-        whole[:size, :size] = REGULARISATION * H
-        whole[size, size] = REGULARISATION
+        size = self.r + self.q
+
+        def objective(factor: float, ridge: float) -> tuple[Array, Array]:
+            H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
+            whole = REGULARISATION * np.eye(size + 1)
+            whole[:size, :size] = REGULARISATION * H
+            return whole, np.append(REGULARISATION * f, 1.0)
+
         answer, solver = self._solve(
             "regularised",
-            whole,
-            np.append(REGULARISATION * f, 1.0),
-            G,
-            h,
+            objective,
+            *self._rows(self.pool),
             np.append(self.lower, 0.0),
             np.append(self.upper, np.inf),
         )
         self.store(answer[:-1])
         self.limit = max(float(answer[-1]), 0.0)
-        if (found := self._active.get("regularised")) is not None:
-            self._active["bounded"] = np.delete(found, size)  # all but δ
+        self._active["bounded"] = np.delete(self._active["regularised"], size)  # all but δ
         return solver
 
     def solve_linear(self) -> str:
@@ -300,11 +319,12 @@ class Row:
         """
         theta = self.theta[self.free_phi] / (self.unit_phi * self.scale)
         d = self.d[self.free_psi] / (self.unit_psi * self.scale)
-        H, f = self.hessian(self.gram, self.linear, TIE_BREAK)
+        factor, ridge = self.attempt
+        H, f = self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge)
         xi = np.concatenate([theta, d])
         bound = dual_bound(H, f, *self.containment(self.pool), self.lower, self.upper, xi)
         value = float(0.5 * d @ self.gram @ d + self.linear @ d) + self.known
-        return _relative_gap(float(0.5 * xi @ H @ xi + f @ xi) - bound, value)
+        return _relative_gap(float(0.5 * xi @ H @ xi + f @ xi) - bound, value, factor)
 
     def _rows(self, pool: Index) -> tuple[Array, Array]:
         """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
@@ -326,21 +346,27 @@ class Row:
             width, limit = width / limit, 1.0
         G = np.vstack([G, np.hstack([np.zeros((len(width), self.r)), -width[:, None] * self.psi[self.pool]])])
         h = np.concatenate([h, width * self.half[self.pool] - limit])
-        for weight in (1.0, 10.0, 100.0):
-            H, f = self.hessian(self.plain, self.plain_linear, weight * BOUNDED_TIE_BREAK)
+        try:
+            answer, solver = self._solve(
+                "bounded",
+                lambda factor, ridge: self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge),
+                G,
+                h,
+                self.lower,
+                self.upper,
+                any_solver=self.exact,
+            )
+            self.store(answer)
+            return solver
+        except FitError:  # rounding has closed the room of WIDTH_SLACK: as near to the ties as it goes
+            before = self.limit
             try:
-                answer, solver = self._solve(
-                    "bounded", H, f, G, h, self.lower, self.upper, any_solver=self.exact and weight == 100.0
-                )
-                self.store(answer)
-                return solver
+                solver = self.solve_linear() if self.exact else self.solve_regularised()
             except FitError:
-                if self.exact and weight == 100.0:
-                    raise
-        before = self.limit  # rounding has closed the room that WIDTH_SLACK leaves: as near to the ties' rule
-        solver = self.solve_regularised()
-        self.limit = max(before, self.limit * (1.0 + WIDTH_SLACK))
-        return solver
+                self.exact = True
+                solver = self.solve_linear()
+            self.limit = max(before, self.limit * (1.0 + WIDTH_SLACK))
+            return solver
 
     def contradiction(self) -> tuple[int, float] | None:
         """(index of a sample, distance) that no elements within the structure can contain; None where there is none."""
@@ -356,8 +382,9 @@ class Row:
         return int(self.samples.index[worst]), float(answer[-1] * size * self.scale)
 
 
-def _relative_gap(above: float, value: float) -> float:
-    return (max(above, 0.0) / value if value > 0 else 0.0) + TIE_BREAK / 4
+def _relative_gap(above: float, value: float, factor: float = 1.0) -> float:
+    """Of squared widths in scaled units; widths below a millionth of the steps themselves are rounding."""
+    return max(above, 0.0) / max(value, 1e-12) + factor * TIE_BREAK / 4
 
 
 class InfeasibleError(FitError):
@@ -441,12 +468,13 @@ class WorkingSet:
         self._prove(settle)
         again = []
         for row in self.rows:
-            if row.unknown and not row.exact:
+            if row.unknown:
                 least = row.least_width() * row.scale
                 self.solvers.add("HiGHS simplex")
-                row.exact = deltas[row.i] > (1.0 + WIDTH_SLACK) * least + 1e-13 * row.scale
+                above = deltas[row.i] > (1.0 + WIDTH_SLACK) * least + 1e-13 * row.scale
                 deltas[row.i] = min(deltas[row.i], least)
-                if row.exact:
+                if above and not row.exact:
+                    row.exact = True
                     again.append(row)
         if again:  # the weight beside δ was too large for these rows
             settle(again)
