@@ -1,0 +1,69 @@
+"""The policy for SROS2 against the graph: it allows what the node has there, and nothing that it has not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from conftest import ROOT
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from ros_processes import World, open_world, until
+from test_live import by_hand, saved
+
+NODE = "envelope_monitor"
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+def allowed(kind: str, qualifier: str) -> set[str]:
+    """Names of topics or services that the policy allows in this way, in full."""
+    (profile,) = ElementTree.parse(ROOT / "config" / "sros2_policy.xml").iter("profile")
+    assert (profile.get("ns"), profile.get("node")) == ("/", NODE)
+    found: list[str] = []
+    for group in profile.iter(f"{kind}s"):
+        assert set(group.attrib) <= {"publish", "subscribe", "reply", "request"} and {*group.attrib.values()} == {
+            "ALLOW"
+        }
+        if qualifier in group.attrib:
+            found += [str(entry.text).replace("~", f"/{NODE}") for entry in group.iter(kind)]
+    assert len(set(found)) == len(found), "something is allowed twice"
+    return set(found)
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_the_policy_allows_what_the_node_does_and_nothing_else(world: World, tmp_path: Path, simulated: bool) -> None:
+    model = by_hand()
+    topics = {"/plant/state": "/engine/state", "/plant/control": "/engine/control"}
+    signals = replace(
+        model.signals,
+        states=tuple(replace(s, topic=topics[s.topic]) for s in model.signals.states),
+        controls=tuple(replace(s, topic=topics[s.topic]) for s in model.signals.controls),
+        clock=topics[str(model.signals.clock)],
+        time={topics[t]: source for t, source in model.signals.time.items()},
+    )
+    sampling = replace(model.sampling, clock=signals.clock, time=dict(signals.time))
+    model = type(model)(model.A, model.B, model.dA, model.dB, signals=signals, sampling=sampling)
+    world.monitor(saved(model, tmp_path), use_sim_time=simulated)
+    node = world.node
+
+    def names(found: list[tuple[str, list[str]]]) -> set[str]:
+        return {name for name, _ in found}
+
+    def subscribed() -> set[str]:
+        return names(node.get_subscriber_names_and_types_by_node(NODE, "/"))
+
+    until(lambda: subscribed() >= {"/engine/state", "/engine/control"}, "the subscriptions in the graph")
+    until(lambda: allowed("service", "reply") <= names(node.get_service_names_and_types_by_node(NODE, "/")), "services")
+    assert subscribed() == allowed("topic", "subscribe") - (set() if simulated else {"/clock"})
+    assert names(node.get_publisher_names_and_types_by_node(NODE, "/")) == allowed("topic", "publish")
+    assert names(node.get_service_names_and_types_by_node(NODE, "/")) == allowed("service", "reply")
+    assert names(node.get_client_names_and_types_by_node(NODE, "/")) == allowed("service", "request") == set()
