@@ -135,8 +135,6 @@ class _Reading:
         number = len(topic)
         if self.filled + number > self.total:
             raise IndexMismatchError  # more than it states
-        if number:
-            in_reach(self.bag, int(batch.log_time.max()))
         stamp = np.empty(number, dtype=np.int64)
         keep: NDArray[np.bool_] | None = None
         for where in range(len(self.topics)):
@@ -151,8 +149,11 @@ class _Reading:
         kept: NDArray[np.bool_] | slice = slice(None) if keep is None else keep
         number = number if keep is None else int(np.count_nonzero(keep))
         where_to = slice(self.filled, self.filled + number)
+        log_time = batch.log_time[kept]
+        if number:
+            in_reach(self.bag, int(log_time.max()))
         self.topic[where_to] = topic[kept]
-        self.arrival[where_to] = batch.log_time[kept]
+        self.arrival[where_to] = log_time
         self.stamp[where_to] = stamp[kept]
         self.filled += number
 

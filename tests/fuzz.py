@@ -199,6 +199,7 @@ def read_file(rng: random.Random, folder: Path) -> str:
         bag = Bag(path)
         describe(bag)
         written = {(m.log_time, m.data) for m in messages_of_a_run()}
+        checked &= not any("cut after" in warning for warning in bag.warnings)  # nothing vouches for the last chunk
         if checked and any((m.log_time_ns, m.data) not in written for m in bag.raw_messages()):
             raise WrongError("a message that was never written")
     except UncertainLTIError:

@@ -1,0 +1,260 @@
+"""What ROS 2 people expect of a node: parameters that describe themselves, QoS that is followed, executors, clocks."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from conftest import ROOT
+
+from uncertain_lti.model import Alarm
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from lifecycle_msgs.msg import TransitionEvent
+from rcl_interfaces.srv import DescribeParameters
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_processes import Diagnostics, World, open_world, until
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
+from test_live import ERROR, STATE, STEP_NS, Outputs, Plant, by_hand, header_bag, offline, saved
+
+from uncertain_lti_ros.parameters import PARAMETERS
+
+NODE = "/envelope_monitor"
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+# --- parameters ---------------------------------------------------------------------------------------------
+
+
+def test_every_parameter_tells_its_meaning_range_and_whether_it_can_be_set(world: World) -> None:
+    world.run_node("envelope_monitor", {"autostart": False})
+    names = [p.name for p in PARAMETERS]
+    described = world.call(
+        DescribeParameters, f"{NODE}/describe_parameters", DescribeParameters.Request(names=names)
+    ).descriptors
+    assert [d.name for d in described] == names
+    for parameter, descriptor in zip(PARAMETERS, described, strict=True):
+        assert descriptor.description == parameter.text and len(parameter.text) > 20
+        assert descriptor.read_only == parameter.fixed
+        ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
+        if type(parameter.default) in (int, float):
+            (limits,) = ranges
+            assert limits.from_value <= parameter.default <= limits.to_value
+        else:
+            assert not ranges
+        if parameter.fixed:
+            accepted, reason = world.set(**{parameter.name: parameter.default})
+            assert not accepted and "read-only" in reason
+        elif ranges:
+            for value in (limits.from_value - 1, 2 * limits.to_value):
+                accepted, reason = world.set(**{parameter.name: value})
+                assert not accepted and "out of range" in reason, (parameter.name, value)
+        wrong = 3 if isinstance(parameter.default, str | bool) else "three"
+        accepted, reason = world.set(**{parameter.name: wrong})
+        assert not accepted and reason
+
+
+def test_the_parameter_file_gives_every_parameter_with_its_default() -> None:
+    text = (ROOT / "config" / "envelope_monitor.yaml").read_text()
+    (given,) = (section["ros__parameters"] for section in yaml.safe_load(text).values())
+    flat = {}
+    for key, value in given.items():
+        flat |= {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value}
+    assert flat == {p.name: p.default for p in PARAMETERS}
+    assert {k: type(v) for k, v in flat.items()} == {p.name: type(p.default) for p in PARAMETERS}
+    assert all(line.lstrip().startswith("#") or ":" in line for line in text.splitlines() if line.strip())
+
+
+def test_the_node_starts_from_the_parameter_file(world: World, tmp_path: Path) -> None:
+    path = saved(by_hand(), tmp_path)
+    file = str(ROOT / "config" / "envelope_monitor.yaml")
+    process = world.start(
+        "monitor", "-c", "import sys; from uncertain_lti_ros.envelope_monitor import main; sys.exit(main())",
+        "--ros-args", "--params-file", file, "-p", f"model:={json.dumps(str(path))}",
+    )  # fmt: skip
+    until(lambda: world.status().get("state") == "active" or not process.running, "an active monitor")
+    assert process.running, process.output
+
+
+# --- lifecycle ----------------------------------------------------------------------------------------------
+
+
+def test_an_error_in_a_transition_leaves_a_node_that_can_be_configured(world: World, tmp_path: Path) -> None:
+    code = """
+import sys
+from uncertain_lti_ros import envelope_monitor
+subscribe, count = envelope_monitor.EnvelopeMonitorNode._subscribe, [0]
+def subscribing(node):
+    count[0] += 1
+    if count[0] == 1:
+        raise OSError("the first time")
+    return subscribe(node)
+envelope_monitor.EnvelopeMonitorNode._subscribe = subscribing
+sys.exit(envelope_monitor.main())
+"""
+    diagnostics = world.diagnostics()
+    process = world.start(
+        "monitor", "-c", code, "--ros-args", "-p", f"model:={json.dumps(str(saved(by_hand(), tmp_path)))}",
+        "-p", "diagnostics_period:=0.1", "-p", "autostart:=false",
+    )  # fmt: skip
+    assert world.change("configure")
+    events = world.listen(TransitionEvent, f"{NODE}/transition_event").connected()
+    assert not world.change("activate")
+    diagnostics.reaches(ERROR, saying="a transition failed unexpectedly; see the log")
+    assert world.state() == "unconfigured" and process.running
+    until(lambda: "errorprocessing" in {m.goal_state.label for m in events.messages}, "the event")
+    assert world.change("configure") and world.change("activate") and world.state() == "active"
+    plant = Plant(world, by_hand()).subscribed()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant.send(3)
+    assert flags.count(3)[2].position[0] == 0.0
+    diagnostics.reaches(0)
+
+
+# --- executors ----------------------------------------------------------------------------------------------
+
+
+def test_without_the_events_executor_the_default_one_does_the_same(world: World, tmp_path: Path) -> None:
+    model = by_hand(alarm=Alarm(2, 5))
+    path = saved(model, tmp_path)
+    bag = header_bag(model, tmp_path / "run.mcap", 200)
+    code = """
+import sys
+sys.modules["rclpy.experimental"] = None
+from uncertain_lti_ros.envelope_monitor import main
+sys.exit(main())
+"""
+    process = world.start("monitor", "-c", code, "--ros-args", "-p", f"model:={json.dumps(str(path))}")
+    until(lambda: world.status().get("state") == "active" or not process.running, "an active monitor")
+    assert "runs on the default executor" in process.output
+    outputs = Outputs.of(world)
+    world.command("play", bag).succeed(60)
+    outputs.hold_against(offline(path, bag), ("a", "b"))
+
+
+# --- publishers that come and go ----------------------------------------------------------------------------
+
+
+def test_publishers_that_return_under_another_quality_of_service_are_followed(world: World, tmp_path: Path) -> None:
+    """Twelve times over, with messages flowing: subscriptions with event callbacks are made and destroyed."""
+    model = by_hand()
+    process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model)
+    offers = [
+        QoSProfile(depth=10, reliability=reliability, durability=durability)
+        for reliability in (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE)
+        for durability in (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL)
+    ]
+    for turn in range(12):
+        world.node.destroy_publisher(plant.state)
+        plant.state = world.publisher(JointState, STATE, offers[turn % 4])
+        before, end = len(flags.messages), time.monotonic() + 20
+        while len(flags.messages) < before + 3 and time.monotonic() < end:
+            plant.send(1)
+            time.sleep(0.02)
+        assert len(flags.messages) >= before + 3, f"not heard on turn {turn}: {process.output}"
+    assert process.running and world.status()["unexpected_errors"] == 0
+    assert all(not m.position[0] == 1.0 for m in flags.messages), "a gap in what was heard was judged"
+
+
+def test_a_publisher_of_another_type_beside_the_right_one_does_no_harm(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=30.0)
+    diagnostics = world.diagnostics()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(5)
+    stranger = world.start(
+        "stranger", "-c",
+        f"""
+import rclpy, time
+from geometry_msgs.msg import TwistStamped
+rclpy.init()
+node = rclpy.create_node("stranger")
+publisher = node.create_publisher(TwistStamped, "{STATE}", 10)
+while True:
+    publisher.publish(TwistStamped())
+    time.sleep(0.01)
+""",
+    )  # fmt: skip
+    diagnostics.reaches(1, saying=f"{STATE}: a publisher sends geometry_msgs/msg/TwistStamped, and sensor_msgs")
+    plant.send(5)
+    assert [m.position[0] for m in flags.count(10)[1:]] == [0.0] * 9
+    assert world.status()["received"][STATE] == 10 and process.running
+    stranger.kill()
+    until(lambda: not world.status()["problems"], "the stranger to be gone", 30)
+    plant.send(3)
+    assert flags.count(13)[12].position[0] == 0.0
+
+
+# --- simulated time -----------------------------------------------------------------------------------------
+
+
+def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_path: Path) -> None:
+    """By log time: a jump forward is a gap, one back a reset, neither is judged; a paused clock repeats itself."""
+    model = by_hand("log")
+    world.monitor(saved(model, tmp_path), use_sim_time=True, heartbeat=0.2)
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    clock = world.publisher(Clock, "/clock")
+    power, voltage = world.publisher(Float64, "/power"), world.publisher(Float64, "/voltage")
+    world.subscribed(clock, power, voltage)
+    point = model.operating_point
+    now = 10**12
+    got: list[float] = []
+    for step in (
+        [STEP_NS] * 5 + [100 * STEP_NS] + [STEP_NS] * 3 + [-1000 * STEP_NS] + [STEP_NS] * 3 + [0, 0] + [STEP_NS]
+    ):
+        now += step
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
+        clock.publish(message)
+        until(lambda t=now: world.status()["now_ns"] == t, "the clock")
+        received = world.status()["received"]["/voltage"]
+        voltage.publish(Float64(data=float(point.u_s[0])))
+        until(lambda r=received: world.status()["received"]["/voltage"] == r + 1, "the control")
+        power.publish(Float64(data=float(point.x_s[0])))
+        got.append(flags.count(len(got) + 1)[-1].position[0])
+    nan = float("nan")
+    np.testing.assert_array_equal(got, [nan, 0, 0, 0, 0, nan, 0, 0, 0, nan, 0, 0, 0, nan, nan, 0])
+    counters = world.status()["counters"]
+    assert (counters["gaps"], counters["resets"], counters["equal stamp"]) == (1, 1, 2)
+    world.set(use_sim_time=False)
+    until(lambda: abs(world.status()["now_ns"] - time.time_ns()) < 10**10, "wall time")
+
+
+# --- diagnostics --------------------------------------------------------------------------------------------
+
+
+def test_statuses_group_by_node_and_hardware(world: World, tmp_path: Path) -> None:
+    """Names `node: part`, as the aggregator's analyzers split them; the keys stay the same from report to report."""
+    model = by_hand()
+    world.monitor(
+        saved(model, tmp_path), "-r", "__ns:=/rig", name=f"/rig{NODE}", diagnostics_period=0.1, hardware_id="rig 7"
+    )
+    diagnostics = world.diagnostics()
+    plant = Plant(world, model).subscribed()
+    plant.send(30)
+    until(lambda: len(diagnostics.topic.messages) > 12, "reports")
+    for array in diagnostics.topic.messages:
+        assert array.header.stamp.sec > 0
+        assert [s.name for s in array.status] == [f"rig{NODE}: {part}" for part in ("monitor", "a", "b")]
+        assert {s.hardware_id for s in array.status} == {"rig 7"}
+        for status in array.status:
+            keys = [v.key for v in status.values]
+            assert len(set(keys)) == len(keys) and status.message
+    values = Diagnostics.values(diagnostics.latest(f"rig{NODE}: monitor"))
+    assert values["verdicts"] == "29"
