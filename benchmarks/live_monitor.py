@@ -434,8 +434,8 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int) 
     print(table(["n", "Hz", "", "at most", "measured", "held", "publishing only"], held))
 
 
-def soak(seconds: float, rate: float, n: int) -> dict[str, float]:
-    """Memory after warm-up and at the end, MiB, and how many samples got no verdict; printed as they come."""
+def soak(seconds: float, rate: float, n: int) -> dict[str, Any]:
+    """Growth of memory after warm-up, MiB, and whether every counter accounts for every sample; prints both."""
     run = Run(n, rate, seconds)
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -455,10 +455,24 @@ def soak(seconds: float, rate: float, n: int) -> dict[str, float]:
             sent = int(publisher.line())
             time.sleep(0.7)
             said = status(run.domain)
+            counters = said["counters"]
             growth = memory[-1] - memory[0]
+            accounted = {
+                "state messages": said["received"][STATE],
+                "control messages": said["received"][CONTROL],
+                "samples": counters.get("samples", 0),
+                "flags heard": len(hearer.ask()["delays"]),
+                # the first sample has no verdict; a pause of the publisher over max_gap is a gap
+                "verdicts + gaps + missing + first": said["verdicts"]
+                + counters.get("gaps", 0)
+                + counters.get("missing", 0)
+                + 1,
+            }
+            exact = set(accounted.values()) == {sent} and not any(said["lost"].values())
             print(f"{sent} samples sent, {said['verdicts']} verdicts, {growth:+.2f} MiB from {memory[0]:.1f} MiB")
-            flags = len(hearer.ask()["delays"])
-            return {"sent": sent, "verdicts": said["verdicts"], "flags": flags, "growth": growth}
+            print(", ".join(f"{value} {name}" for name, value in accounted.items()))
+            print(f"counters {'exact' if exact else 'not exact'}: {counters}, lost {said['lost']}")
+            return {"exact": exact, "growth": growth, "verdicts": said["verdicts"], "sent": sent}
     finally:
         for child in run.children:
             child.end()
@@ -484,7 +498,9 @@ def main() -> None:
         else:
             {"take": take, "delay": bare_delay}[kind](rest[0])
     elif args.soak:
-        soak(args.soak, 1000.0, args.sizes[0])
+        found = soak(args.soak, 1000.0, args.sizes[0])
+        if not (found["exact"] and found["growth"] < 1.0):
+            raise SystemExit(1)
     else:
         compare(args.rates, args.sizes, args.seconds, args.repeats)
 

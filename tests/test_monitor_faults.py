@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import random
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_writer import Layout, Message, Topic, write
+from conftest import ROOT
 
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model import Alarm
@@ -356,6 +359,14 @@ sys.exit(envelope_monitor.main())
     assert "ZeroDivisionError: every tenth" in process.output
     assert process.output.count("Traceback") < 6, "a log must not be flooded"
     assert process.running
+
+
+@pytest.mark.slow
+def test_memory_stays_flat_and_every_sample_is_accounted_for() -> None:
+    """The ten minutes of `benchmarks/live_monitor.py --soak 600` in short."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "live_monitor.py"), "--soak", "45"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "counters exact" in done.stdout, done.stdout + done.stderr
 
 
 # --- the alarm ----------------------------------------------------------------------------------------------
