@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import ModelError
+from uncertain_lti.errors import ModelError, SignalError
 from uncertain_lti.files import whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.signals import Signal, SignalMap
@@ -207,7 +207,7 @@ def load_mat(path: str | os.PathLike[str]) -> UncertainLTI:
         return UncertainLTI(*(matrices[name] for name in ("A", "B", "dA", "dB")), *given, signals=signals)
     except (ValueError, LookupError) as error:
         raise ModelError(f"{path}: 'model_json' or the names are damaged ({error}); write the file anew") from None
-    except ModelError as error:
+    except (ModelError, SignalError) as error:
         raise ModelError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
 
 
