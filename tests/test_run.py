@@ -67,7 +67,7 @@ def refusal(result: subprocess.CompletedProcess) -> str:
 def test_help_lists_the_commands(run, argument):
     result = run(*argument)
     assert result.returncode == 0
-    for command in ("demo", "test", "lint", "setup"):
+    for command in ("demo", "test", "docs", "lint", "setup"):
         assert f"\n  {command}" in result.stdout
 
 

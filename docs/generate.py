@@ -1,0 +1,71 @@
+"""Parts of the reference that come from the program itself: every command, and every parameter of the node."""
+
+import argparse
+import os
+import re
+from pathlib import Path
+
+COMMANDS, PARAMETERS = "commands.generated.md", "parameters.generated.md"
+
+
+def write(folder: Path) -> None:
+    """Write both parts to a folder, where they differ from what is there."""
+    for name, text in ((COMMANDS, commands()), (PARAMETERS, parameters())):
+        path = folder / name
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
+
+
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """Name -> arguments of every command."""
+    from uncertain_lti.cli import _parser
+
+    def subparsers(chosen: str) -> dict[str, argparse.ArgumentParser]:
+        actions = _parser(chosen)._subparsers._group_actions  # argparse has no public way
+        return dict(actions[0].choices)
+
+    return {name: subparsers(name)[name] for name in subparsers("")}
+
+
+def commands() -> str:
+    """Markdown with a section for each command."""
+    os.environ["COLUMNS"] = "96"
+    parts = []
+    for name, parser in parsers().items():
+        usage = re.sub(r"\n +", "\n    ", parser.format_usage().removeprefix("usage: ").strip())
+        lines = [f"## {name}", "", _escape(parser.description or ""), "", "```text", usage, "```", ""]
+        rows = []
+        for action in parser._actions:
+            if isinstance(action, argparse._HelpAction):
+                continue
+            rows.append((_called(action), _escape(action.help or "")))
+        if rows:
+            lines += ["| argument | meaning |", "|---|---|", *(f"| `{a}` | {b} |" for a, b in rows), ""]
+        parts.append("\n".join(lines))
+    return "\n".join(parts)
+
+
+def _called(action: argparse.Action) -> str:
+    metavar = action.metavar or (
+        "{" + ",".join(map(str, action.choices)) + "}" if action.choices else action.dest.upper()
+    )
+    if not action.option_strings:
+        return str(metavar)
+    value = "" if action.nargs == 0 else f" {metavar}"
+    return ", ".join(action.option_strings) + value
+
+
+def _escape(text: str) -> str:
+    return re.sub(r"([|*<>\[\]])", r"\\\1", text.replace("%%", "%"))
+
+
+def parameters() -> str:
+    """Markdown table of the parameters of envelope_monitor."""
+    from uncertain_lti_ros.parameters import PARAMETERS as DECLARED
+
+    rows = ["| parameter | default | range | at run time | meaning |", "|---|---|---|---|---|"]
+    for p in DECLARED:
+        default = '""' if p.default == "" else str(p.default).lower() if isinstance(p.default, bool) else str(p.default)
+        limits = "" if p.low is None else f"{p.low:g} to {p.high:g}"
+        rows.append(f"| `{p.name}` | `{default}` | {limits} | {'no' if p.fixed else 'yes'} | {_escape(p.text)} |")
+    return "\n".join(rows) + "\n"

@@ -1,0 +1,299 @@
+"""Every code block of the README and of docs/ runs, as a reader would run it, and says what the page says.
+
+A block is run by its language. Comments above it say more:
+
+    <!-- not run: REASON -->        it cannot be run here
+    <!-- needs: FILE ... -->        files that an earlier page made
+    <!-- status N -->               the exit status of a shell block
+    <!-- background -->             it runs until the end of the page; `background: TEXT`: and then has said TEXT
+    <!-- output -->                 a text block whose lines the block before printed, but for digits
+    <!-- file: NAME -->             a Python block that is saved
+    <!-- loads: KIND -->            a YAML or JSON block that the loader of signals, model or parameters takes
+    <!-- merges: NAME -->           a YAML block that belongs into the signals file config/signals/NAME
+"""
+
+import contextlib
+import importlib
+import io
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import yaml
+
+from uncertain_lti import SignalMap, UncertainLTI
+from uncertain_lti.identification.structure import Structure
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "generated" not in p.name)]
+LANGUAGES = {"sh", "python", "yaml", "json", "text", "matlab", "{toctree}", "{include}", "{eval-rst}"}
+NOT_RUN = 14
+"""Blocks that may stay unrun, all pages together."""
+PROGRAMS = {"uncertain-lti": "uncertain_lti.cli", "envelope_monitor": "uncertain_lti_ros.envelope_monitor"}
+
+
+@dataclass
+class Block:
+    language: str
+    text: str
+    line: int
+    marks: dict[str, str] = field(default_factory=dict)
+
+
+def blocks(page: Path) -> list[Block]:
+    """Fenced blocks with the marks that stand right above them."""
+    found, marks, lines = [], {}, page.read_text().splitlines()
+    position = 0
+    while position < len(lines):
+        line = lines[position]
+        if mark := re.fullmatch(r"<!-- (not run|needs|status|background|output|file|loads|merges):? ?(.*?) -->", line):
+            marks[mark[1]] = mark[2]
+        elif fence := re.fullmatch(r"( *)```(\S+)(.*)", line):
+            end = next(i for i in range(position + 1, len(lines)) if lines[i].strip() == "```")
+            text = "\n".join(entry.removeprefix(fence[1]) for entry in lines[position + 1 : end])
+            found.append(Block(fence[2], text + "\n", position + 1, marks))
+            position, marks = end, {}
+        elif line.strip():
+            assert not marks, f"{page.name}:{position + 1}: a mark without a block"
+        position += 1
+    return found
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+class Reader:
+    """A folder like a checkout, in which a page is followed from top to bottom."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder = folder
+        bin = folder / ".bin"
+        bin.mkdir(parents=True)
+        for program, module in PROGRAMS.items():
+            self._script(bin / program, f'exec "{sys.executable}" -m {module} "$@"')
+        self._script(bin / "python", f'exec "{sys.executable}" "$@"')
+        self._script(folder / "run", 'exec "$@"')
+        for shared in ("bags", "config"):
+            (folder / shared).symlink_to(ROOT / shared)
+        self.env = os.environ | {
+            "PATH": f"{bin}{os.pathsep}{os.environ['PATH']}",
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_LOG_DIR": str(folder / ".log"),
+            "PYTHONUNBUFFERED": "1",
+        }
+        self.said = ""
+        self.names: dict[str, object] = {"__name__": "page"}
+        self.background: list[tuple[subprocess.Popen, Path, str]] = []
+
+    @staticmethod
+    def _script(path: Path, text: str) -> None:
+        path.write_text(f"#!/bin/bash\n{text}\n")
+        path.chmod(0o755)
+
+    def follow(self, block: Block) -> None:
+        if "not run" in block.marks:
+            assert len(block.marks["not run"]) > 10, "say why"
+            return
+        if block.language == "sh":
+            self._shell(block)
+        elif block.language == "python":
+            self._python(block)
+        elif block.language in ("yaml", "json"):
+            self._load(block)
+        elif block.language == "text" and "output" in block.marks:
+            said = {plain(line) for line in self.said.splitlines()}
+            missing = [line for line in block.text.splitlines() if plain(line) not in said]
+            assert not missing, f"not said: {missing}; said:\n{self.said}"
+        else:
+            assert block.language in LANGUAGES - {"matlab"}, "say why it is not run"
+
+    def _shell(self, block: Block) -> None:
+        command = ["bash", "-euo", "pipefail", "-c", block.text]
+        if "background" in block.marks:
+            log = self.folder / f".{len(self.background)}.log"
+            with log.open("wb") as stream:
+                process = subprocess.Popen(
+                    command, cwd=self.folder, env=self.env, stdout=stream, stderr=stream, start_new_session=True
+                )
+            self.background.append((process, log, block.marks["background"]))
+            time.sleep(3.0)  # a reader needs longer to get to the next shell
+            assert process.poll() is None, log.read_text()
+            return
+        done = subprocess.run(command, cwd=self.folder, env=self.env, capture_output=True, text=True, timeout=300)
+        assert done.returncode == int(block.marks.get("status", 0)), done.stdout + done.stderr
+        self.said = done.stdout
+
+    def _python(self, block: Block) -> None:
+        code = compile(block.text, f"line {block.line}", "exec")
+        if "file" in block.marks:
+            (self.folder / block.marks["file"]).write_text(block.text)
+            return
+        spoken = io.StringIO()
+        with contextlib.chdir(self.folder), contextlib.redirect_stdout(spoken):
+            exec(code, self.names)
+        self.said = spoken.getvalue()
+
+    def _load(self, block: Block) -> None:
+        kind = block.marks.get("loads")
+        path = self.folder / f".block.{block.language}"
+        path.write_text(block.text)
+        if kind == "signals":
+            signals = SignalMap.load(path)
+        elif kind == "model":
+            UncertainLTI.load(path)
+            return
+        elif kind == "parameters":
+            declared = pytest.importorskip("uncertain_lti_ros.parameters", reason="rclpy is not here").PARAMETERS
+            (top,) = yaml.safe_load(block.text).values()
+            assert set(flat(top["ros__parameters"])) <= {p.name for p in declared}
+            return
+        else:
+            base = yaml.safe_load((ROOT / "config/signals" / block.marks["merges"]).read_text())
+            signals = SignalMap.from_dict(base | yaml.safe_load(block.text))
+        if signals.structure:
+            names = [s.name for s in signals.states], [s.name for s in signals.controls]
+            Structure.from_rules(signals.structure, *names)
+
+    def close(self) -> None:
+        unsaid = []
+        for process, log, words in self.background:
+            end = time.monotonic() + 10
+            while words not in log.read_text() and time.monotonic() < end:
+                time.sleep(0.1)
+            if words not in log.read_text():
+                unsaid.append((words, log.read_text()))
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGINT)
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        assert not unsaid
+
+
+def plain(line: str) -> str:
+    """Without digits, and with single blanks."""
+    return " ".join(re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", line).split())
+
+
+def flat(tree: dict, before: str = "") -> list[str]:
+    return [
+        leaf
+        for key, value in tree.items()
+        for leaf in (flat(value, f"{before}{key}.") if isinstance(value, dict) else [before + key])
+    ]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """signals.yaml and engine.model.json, made by the commands of the tutorial."""
+    folder = tmp_path_factory.mktemp("made")
+    reader = Reader(folder / "checkout", 1)
+    tutorial = [b for b in blocks(ROOT / "docs/tutorial.md") if b.language == "sh" and "not run" not in b.marks]
+    for block in tutorial:
+        if "init" in block.text or "max_hold" in block.text or "uncertain-lti fit" in block.text:
+            reader.follow(block)
+    return reader.folder
+
+
+ROS = re.compile(r"envelope_monitor --ros|uncertain-lti (play|record|demo)")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+@pytest.mark.slow
+def test_every_block_runs(page, made, tmp_path):
+    every = blocks(page)
+    if any(ROS.search(b.text) and "not run" not in b.marks for b in every):
+        pytest.importorskip("rclpy", reason="neither a ROS 2 installation nor the rclpy wheels are here")
+    pytest.importorskip("cvxpy", reason="the extra fit is not installed")
+    if "control" in page.read_text():
+        pytest.importorskip("control", reason="the extra control is not installed")
+    reader = Reader(tmp_path / "checkout", 50 + PAGES.index(page))
+    try:
+        for block in every:
+            for needed in block.marks.get("needs", "").split():
+                if not (reader.folder / needed).exists():
+                    shutil.copy(made / needed, reader.folder)
+            try:
+                reader.follow(block)
+            except Exception as error:
+                raise AssertionError(f"{name(page)}:{block.line}: {error}") from error
+    finally:
+        reader.close()
+
+
+def test_every_block_says_what_it_is():
+    """A known language, no code by indentation, and few that are not run."""
+    unrun = 0
+    for page in PAGES:
+        for block in blocks(page):
+            assert block.language in LANGUAGES, f"{name(page)}:{block.line}: {block.language}"
+            unrun += "not run" in block.marks
+    assert unrun <= NOT_RUN
+    markdown = pytest.importorskip("markdown_it", reason="the extra docs is not installed")
+    for page in PAGES:
+        found = markdown.MarkdownIt().parse(page.read_text())
+        assert not [t.map for t in found if t.type == "code_block"], f"{name(page)}: code by indentation; fence it"
+        assert not [t.map for t in found if t.type == "fence" and not t.info], f"{name(page)}: a fence without language"
+
+
+def test_the_theory_names_functions_that_are_there():
+    """Each dotted name of the page is one, and every equation has its place."""
+    text = (ROOT / "docs/theory.md").read_text()
+    public = {
+        n: getattr(importlib.import_module("uncertain_lti"), n)
+        for n in importlib.import_module("uncertain_lti").__all__
+    }
+    names = set(re.findall(r"`([A-Za-z_]+(?:\.[A-Za-z_]+)+)`", text))
+    assert len(names) > 10
+    for dotted in names:
+        first, *rest = dotted.split(".")
+        if first in public:
+            thing = public[first]
+            for part in rest:
+                thing = getattr(thing, part)
+            continue
+        try:
+            importlib.import_module(f"uncertain_lti.{dotted}")
+        except ModuleNotFoundError:
+            module = importlib.import_module(f"uncertain_lti.{dotted.rpartition('.')[0]}")
+            assert hasattr(module, rest[-1]), dotted
+    for number in ("1, 2", "3", "4", "5", "6", "7", "8, 9", "10", "11"):
+        assert f"\\tag{{{number}}}" in text
+
+
+def test_the_reference_is_that_of_the_program(monkeypatch):
+    """Every option of every command, and every parameter of the node, is in the generated parts."""
+    pytest.importorskip("rclpy", reason="neither a ROS 2 installation nor the rclpy wheels are here")
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    generate = importlib.import_module("generate")
+    text = generate.commands()
+    for command, parser in generate.parsers().items():
+        assert f"## {command}\n" in text
+        for action in parser._actions:
+            assert all(option in text for option in action.option_strings if option not in ("-h", "--help"))
+    from uncertain_lti_ros.parameters import PARAMETERS
+
+    table = generate.parameters()
+    assert all(f"| `{p.name}` |" in table for p in PARAMETERS)
+
+
+@pytest.mark.slow
+def test_the_pages_build_without_a_warning(tmp_path):
+    for package in ("sphinx", "myst_parser", "furo", "latex2mathml", "rclpy"):
+        pytest.importorskip(package, reason=f"{package} is not installed")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "-d", str(tmp_path / "trees")]
+    done = subprocess.run([*command, str(ROOT / "docs"), str(tmp_path / "html")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    theory = (tmp_path / "html" / "theory.html").read_text()
+    assert theory.count("<math") > 20 and "cdn" not in theory.lower()
