@@ -145,6 +145,12 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     check.add_argument("--window", type=int, help="alarm: among so many last verdicts (default: the model's)")
     check.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
     check.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
+    check.add_argument(
+        "--write",
+        metavar="OUT.mcap",
+        help="write a copy of the recording with bounds, utilisation and flags on topics of their own; "
+        "for several recordings a folder",
+    )
 
     validate = command(
         "validate",
@@ -380,18 +386,31 @@ def _sha256(path: str) -> str:
 def _check(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.bag import group_recordings
-    from uncertain_lti.reading import read_for_model
+    from uncertain_lti.reading import read_with_decisions
     from uncertain_lti.report import check_data, check_text
 
     model = _named(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
+    bags = group_recordings(options.bags)
+    copies: Sequence[Path | None] = [None] * len(bags)
+    if options.write is not None:
+        from uncertain_lti.annotate import annotate, targets
+
+        copies = targets(options.write, bags)
     results = []
-    for bag in group_recordings(options.bags):
-        transient = read_for_model(bag, model, options.progress.iterate("reading"))
+    for bag, copy in zip(bags, copies, strict=True):
+        transient, decisions = read_with_decisions(bag, model, options.progress.iterate("reading"))
         _say(options, transient.notes)
-        data = check_data(model, monitor.check(transient), samples=options.json)
+        verdicts = monitor.check(transient)
+        data = check_data(model, verdicts, samples=options.json)
         results.append(data)
         _tell(options, check_text(data))
+        if copy is not None:
+            writing = options.progress.iterate("writing")
+            made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, monitor.rule, writing)
+            _say(options, made.notes)
+            data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
+            _tell(options, f"{made.messages} messages and the verdicts below {made.topics} written to {made.path}")
     if options.json:
         _print_json({"model": options.model, "alarm": any(r["alarm"] for r in results), "recordings": results})
     return ALARM if any(r["alarm"] for r in results) else DONE

@@ -179,6 +179,11 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
     return Definition(type_name, types, store, reason, note)
 
 
+def jazzy_text(type_name: str) -> str:
+    """Definition of a type of ROS 2 Jazzy and of all it uses, as in .msg files."""
+    return str(_jazzy().generate_msgdef(type_name, ros_version=2)[0])
+
+
 def undefined(type_name: str, reason: str) -> Definition:
     """Definition of something that is not decoded, for the reason given."""
     return Definition(type_name, {}, get_typestore(Stores.EMPTY), reason)

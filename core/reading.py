@@ -20,7 +20,7 @@ from uncertain_lti.message_types import header_stamp_ns
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.sampler import Sampler, Status, resolve
-from uncertain_lti.sampler_arrays import Samples, sample_arrays
+from uncertain_lti.sampler_arrays import Decisions, Samples, decided, sample_arrays
 from uncertain_lti.signals import FieldPath, SignalMap
 from uncertain_lti.transient import Transient
 
@@ -259,6 +259,22 @@ def read_for_model(
         The model names no topics (it was fitted to arrays) or does not say how they are sampled, or goes by stamps
         that the recording lacks.
     """
+    stream, signals = _stream_for_model(recording, model, progress)
+    return sample(stream, signals, progress)
+
+
+def read_with_decisions(
+    recording: Bag | str | os.PathLike[str], model: UncertainLTI, progress: Progress | None = None
+) -> tuple[Transient, Decisions]:
+    """`read_for_model`, and which message decided each clock message; raises as that does."""
+    stream, signals = _stream_for_model(recording, model, progress)
+    decisions = decided(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
+    return sample(stream, signals, progress), decisions
+
+
+def _stream_for_model(
+    recording: Bag | str | os.PathLike[str], model: UncertainLTI, progress: Progress | None = None
+) -> tuple[Stream, SignalMap]:
     signals = model.signals
     if any(not s.topic for s in signals.signals):
         raise SignalError(
@@ -286,7 +302,7 @@ def read_for_model(
             f"{bag.path}: no message of {signals.clock} has a stamp, and the model goes by them; fit it to such "
             f"recordings, with time: log for that topic"
         )
-    return sample(stream, signals, progress)
+    return stream, signals
 
 
 def _types(bags: Sequence[Bag], signals: SignalMap) -> Mapping[str, str]:

@@ -41,6 +41,19 @@ class Samples:
     counters: Counter[str]
 
 
+@dataclass(frozen=True)
+class Decisions:
+    """What became of each clock message of a recording, in the order in which it was decided.
+
+    arrival (M,) ns is that of the message that decided it, t_ns (M,) its own instant; dropped (M,) says that it made
+    no sample. The others are the samples of `sample_arrays`, one after the other.
+    """
+
+    arrival: Integers
+    t_ns: Integers
+    dropped: Mask
+
+
 class _BackwardError(Exception):
     """This recording is left to the Sampler."""
 
@@ -66,6 +79,31 @@ def sample_arrays(
         return _Sampling(signals, topic, arrival, stamp, values).run()
     except _BackwardError:
         return None
+
+
+def decided(
+    signals: SignalMap, topic: Integers, arrival: Integers, stamp: Integers, values: Sequence[Values]
+) -> Decisions:
+    """When the `Sampler` decides each clock message; arguments as for `sample_arrays`, in any order of time.
+
+    A sample is decided by its own message, or, where states span several topics, by the next one that opens a sample;
+    without a next one it is not decided. A message that is dropped is decided at once.
+    """
+    sampling = _Sampling(signals, topic, arrival, stamp, values)
+    clock = sampling.topics[signals.clock or ""]
+    by_header = signals.time[signals.clock or ""] == "header"
+    usable = clock.stamp > 0 if by_header else np.ones(len(clock.order), dtype=bool)
+    instants = np.where(usable, clock.stamp, clock.arrival) if by_header else clock.arrival
+    kept = np.flatnonzero(usable)[sampling._accepted(instants[usable])[0]]
+    dropped = np.ones(len(instants), dtype=bool)
+    dropped[kept] = False
+    by = np.arange(len(instants))  # position of the message that decides
+    if any(s.topic != signals.clock for s in signals.states):
+        by[kept[:-1]] = kept[1:]
+        by[kept[-1:]] = len(instants)
+    order = np.lexsort((np.arange(len(by)), ~dropped, by))
+    order = order[by[order] < len(instants)]
+    return Decisions(clock.arrival[by[order]], instants[order], dropped[order])
 
 
 @dataclass(frozen=True)

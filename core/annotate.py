@@ -1,0 +1,286 @@
+"""Annotated recordings: a copy of what was recorded, with what the monitor says of it on topics beside it.
+
+The topics, types and bytes are those that the live node would have published had it listened; the log time of a
+verdict is that of the message which decided it. Everything recorded is in the copy unchanged: the bytes of messages,
+their log and publish times and sequence numbers, definitions, channel metadata, attachments and metadata records.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, repeat
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti import __version__
+from uncertain_lti.bag import Bag
+from uncertain_lti.bag_arrays import Progress
+from uncertain_lti.errors import BagError
+from uncertain_lti.files import whole_file
+from uncertain_lti.mcap_copy import Copier, profile_of
+from uncertain_lti.mcap_records import Contents, scan
+from uncertain_lti.mcap_writer import McapWriter
+from uncertain_lti.message_types import define, jazzy_text
+from uncertain_lti.model import Alarm, UncertainLTI
+from uncertain_lti.monitor import Verdicts
+from uncertain_lti.sampler_arrays import Decisions
+from uncertain_lti.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
+
+METADATA = "uncertain_lti_check"
+"""Name of the metadata record that says what was checked with what."""
+_CHUNK = 1 << 20  # bytes of verdicts
+_SMALL = 1 << 18  # bytes of verdicts that wait for more
+
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Annotated:
+    """What was written: messages of the recording, clock messages that something is said of, the topics' beginning."""
+
+    path: Path
+    messages: int
+    verdicts: int
+    topics: str
+    notes: tuple[str, ...]
+
+
+def targets(wish: str | os.PathLike[str], bags: Sequence[Bag]) -> list[Path]:
+    """Where annotated copies of these recordings go: a file `*.mcap` for one, any other path is a folder.
+
+    In a folder, which is made, the copy of `run.mcap` is `run_annotated.mcap`.
+
+    Raises
+    ------
+    BagError
+        A file would take the place of another one or lie among the parts of a recording, or is one for several.
+    """
+    path = Path(wish)
+    if path.suffix == ".mcap" and not path.is_dir():
+        if len(bags) > 1:
+            raise BagError(
+                f"{path}: one file for {len(bags)} recordings; name a folder for them, or check them one by one"
+            )
+        if not path.parent.is_dir():
+            raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
+        chosen = [path]
+    else:
+        if path.exists() and not path.is_dir():
+            raise BagError(f"{path}: is neither a folder nor called *.mcap; choose another name")
+        chosen = []
+        for bag in bags:
+            stem = bag.path.resolve().stem if bag.path.suffix == ".mcap" else bag.path.resolve().name
+            name, number = f"{stem}_annotated.mcap", 1
+            while path / name in chosen:
+                number += 1
+                name = f"{stem}_{number}_annotated.mcap"
+            chosen.append(path / name)
+    for target in chosen:
+        for bag in bags:
+            if bag.path.is_dir() and target.parent.resolve() == bag.path.resolve():
+                raise BagError(f"{target}: lies in the folder of the recording {bag.path}; choose another place")
+            if target.exists() and any(target.samefile(part) for part in bag.parts):
+                raise BagError(f"{target}: is the recording itself, which is never written to; choose another name")
+        if target.exists() or target.is_symlink():
+            raise BagError(f"{target}: is there already; choose another name or move it away")
+    return chosen
+
+
+def annotate(
+    parts: Iterable[str | os.PathLike[str]],
+    verdicts: Verdicts,
+    decisions: Decisions,
+    output: str | os.PathLike[str],
+    model: UncertainLTI,
+    model_file: str | os.PathLike[str] = "",
+    rule: Alarm | None = None,
+    progress: Progress | None = None,
+) -> Annotated:
+    """Write a copy of a recording with the verdicts beside it; block by block, whatever its size.
+
+    Parameters
+    ----------
+    parts : paths
+        Files of the recording in order; together they become one file.
+    verdicts : Verdicts
+        Of `EnvelopeMonitor.check`.
+    decisions : Decisions
+        Of the same reading (`reading.read_with_decisions`).
+    output : path
+        MCAP file to write; it bears this name once it is whole.
+    model, model_file, rule
+        What was checked with, for the record.
+    progress : callable, optional
+        As for `read_transients`.
+
+    Returns
+    -------
+    Annotated
+        Where topics of the monitor's name are in the recording, as in one of a live monitor, those written here bear
+        another, and a note says so.
+
+    Raises
+    ------
+    BagError
+        A part cannot be read, or the output cannot be written.
+    ModelError
+        A state's name cannot be sent.
+    """
+    output = Path(output)
+    contents = [scan(Path(part)) for part in parts]
+    try:
+        output.parent.mkdir(exist_ok=True)
+    except OSError as error:
+        raise BagError(f"{output.parent}: cannot be made: {error.strerror}; choose another folder") from None
+    try:
+        with whole_file(output) as stream:
+            profile = profile_of(contents[0].path)
+            writer = McapWriter(stream, f"uncertain-lti {__version__}", profile, _compression(contents))
+            copier = Copier(writer)
+            numbers = [copier.declare(part) for part in contents]
+            base = _base({c.topic for part in contents for c in part.channels.values()})
+            channels = {
+                name: copier.channel(_schema(copier, contents, kind), f"{base}/{name}", "cdr", {})
+                for name, kind in TOPICS.items()
+            }
+            writer.metadata(METADATA, _about(contents, base, model, model_file, rule))
+            said = _Said(writer, VerdictRecords(model.state_names, channels), verdicts, decisions)
+            total = sum(part.count for part in contents)
+            counted: Iterable[object] = _weave(copier, contents, numbers, said)
+            if progress is not None:
+                counts = _weave(copier, contents, numbers, said)
+                counted = progress(chain.from_iterable(repeat(None, count) for count in counts), total)
+            for _ in counted:
+                pass
+            writer.finish()
+    except OSError as error:
+        why = error.strerror or error
+        raise BagError(f"{output}: cannot be written: {why}; make room or choose another place") from None
+    notes = list(copier.notes)
+    if base != NODE:
+        notes.append(f"{output}: the recording has topics below {NODE}, so the verdicts are below {base}")
+    return Annotated(output, total, len(said), base, tuple(notes))
+
+
+def _weave(
+    copier: Copier, contents: Sequence[Contents], numbers: Sequence[Mapping[int, int]], said: _Said
+) -> Iterator[int]:
+    """Copy block after block, verdicts in between; yields the messages of each block."""
+    horizon = 0
+    for part, renumbered in zip(contents, numbers, strict=True):
+        for count, last in copier.copy(part, renumbered):
+            horizon = max(horizon, last)
+            said.until(horizon)
+            yield count
+    said.finish()
+
+
+class _Said:
+    """What is said of the clock messages, in the order of their decisions, written as the copy goes on."""
+
+    def __init__(self, writer: McapWriter, records: VerdictRecords, verdicts: Verdicts, decisions: Decisions) -> None:
+        self._writer, self._records, self._verdicts = writer, records, verdicts
+        self._log_time = np.maximum.accumulate(decisions.arrival)
+        self._t_ns = decisions.t_ns
+        self._row = np.cumsum(~decisions.dropped) - 1  # in the verdicts; of a dropped message the one before
+        self._kept = ~decisions.dropped
+        assert int(self._kept.sum()) == len(verdicts.judged), "decisions of another reading"
+        self._next = 0
+        self._step = max(1, _CHUNK // records.size)
+        self._least = max(1, _SMALL // records.size)
+
+    def __len__(self) -> int:
+        return len(self._t_ns)
+
+    def until(self, horizon: int) -> None:
+        """Write what was decided up to this log time, unless it is little."""
+        stop = int(np.searchsorted(self._log_time, horizon, side="right"))
+        if stop - self._next >= self._least:
+            self._write(stop)
+
+    def finish(self) -> None:
+        """Write the rest."""
+        self._write(len(self))
+
+    def _write(self, stop: int) -> None:
+        for begin in range(self._next, stop, self._step):
+            chosen = slice(begin, min(begin + self._step, stop))
+            self._chunk(chosen)
+        self._next = max(self._next, stop)
+
+    def _chunk(self, chosen: slice) -> None:
+        v, row, kept = self._verdicts, self._row[chosen], self._kept[chosen]
+        known = row >= 0  # before the first sample nothing is, and no alarm
+        at = np.maximum(row, 0)
+        if not len(v.judged):
+            at = np.empty(0, dtype=np.int64)
+        times = self._log_time[chosen]
+        judged = kept & v.judged[at]
+        arrays = {"lower": v.lower, "upper": v.upper, "state": v.transient.x, "utilisation": v.utilisation}
+        records, index = self._records.encode(
+            times,
+            self._t_ns[chosen],
+            judged,
+            v.outside_domain[at],
+            known & v.alarm[at],
+            np.where(judged[:, None], v.flags[at], np.nan),
+            {name: arrays[name][at] for name in JUDGED},
+        )
+        self._writer.chunk(records, index, (int(times[0]), int(times[-1])))
+
+
+def _compression(contents: Sequence[Contents]) -> str:
+    """That of the recording: the one that most of its bytes have."""
+    sizes: dict[str, int] = {}
+    for block in (block for part in contents for block in part.blocks):
+        sizes[block.compression] = sizes.get(block.compression, 0) + block.length
+    return max(sizes, key=lambda name: sizes[name], default="zstd")
+
+
+def _base(topics: set[str]) -> str:
+    """Beginning of the topics, under which none of the recording is."""
+    base, number = NODE, 1
+    while any(f"{base}/{name}" in topics for name in TOPICS):
+        base = f"{NODE}_check" if number == 1 else f"{NODE}_check_{number}"
+        number += 1
+    return base
+
+
+def _schema(copier: Copier, contents: Sequence[Contents], type_name: str) -> int:
+    """The recording's own schema of a type where it is that of ROS 2 Jazzy; two texts of one type confuse readers."""
+    ours = define(type_name, "ros2msg", jazzy_text(type_name).encode())
+    for schema in (schema for part in contents for schema in part.schemas.values()):
+        if schema.name == type_name and schema.data.strip():
+            theirs = define(schema.name, schema.encoding, schema.data)
+            if not theirs.reason and _fields(theirs.types) == _fields(ours.types):
+                return copier.schema(schema.name, schema.encoding, schema.data)
+    return copier.schema(type_name, "ros2msg", jazzy_text(type_name).encode())
+
+
+def _fields(types: object) -> str:
+    assert isinstance(types, dict)
+    return repr(sorted((name, fields) for name, (_, fields) in types.items()))
+
+
+def _about(
+    contents: Sequence[Contents], base: str, model: UncertainLTI, model_file: str | os.PathLike[str], rule: Alarm | None
+) -> dict[str, str]:
+    rule = rule or model.alarm
+    about = {
+        "recording": json.dumps([part.path.name for part in contents]),
+        "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
+        "topics": base,
+        "states": json.dumps([{"name": s.name, "unit": s.unit} for s in model.signals.states]),
+    }
+    if model_file:
+        about["model"] = os.path.basename(model_file)
+        if os.path.isfile(model_file):
+            about["model_sha256"] = hashlib.sha256(Path(model_file).read_bytes()).hexdigest()
+    return about

@@ -1,0 +1,529 @@
+"""Annotated recordings: what was recorded is unchanged, and the verdicts are the check's, for every reader."""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_writer import COMPRESSIONS, Message, Topic, metadata_yaml, ramp, write, write_folder
+from engine_bag import SIGNALS, engine_bag
+from hypothesis import given
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Message as Recorded
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
+from test_sampler import cases, loops
+from test_sampler_arrays import columns
+
+from uncertain_lti import EnvelopeMonitor, fit, read_transients
+from uncertain_lti.annotate import METADATA, annotate, targets
+from uncertain_lti.bag import Bag, group_recordings
+from uncertain_lti.cli import main
+from uncertain_lti.errors import BagError, ModelError
+from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.reading import read_for_model, read_with_decisions
+from uncertain_lti.sampler import Sampler
+from uncertain_lti.sampler_arrays import Decisions, decided
+from uncertain_lti.verdict_messages import FALSE, JUDGED, NODE, TOPICS, TRUE, NamedVector, VerdictRecords
+
+BAGS = Path(__file__).resolve().parents[1] / "bags"
+SIGNALS_FOLDER = BAGS.parent / "config" / "signals"
+
+
+@dataclass
+class Held:
+    """Everything in a file, as another library reads it, in file order."""
+
+    messages: list
+    attachments: list
+    metadata: list
+    channels: set
+    compressions: set
+
+
+def held(path, without=()):
+    """A file, without the topics that begin with these texts."""
+    found = Held([], [], [], set(), set())
+    schemas, channels = {}, {}
+    with open(path, "rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
+            if isinstance(record, Chunk):
+                found.compressions.add(record.compression)
+    with open(path, "rb") as stream:
+        for record in StreamReader(stream, validate_crcs=True).records:
+            if isinstance(record, Schema):
+                schemas[record.id] = (record.name, record.encoding, record.data)
+            elif isinstance(record, Channel):
+                about = (record.topic, record.message_encoding, tuple(record.metadata.items()))
+                channels[record.id] = (*about, schemas.get(record.schema_id))
+                if not record.topic.startswith(tuple(without)):
+                    found.channels.add(channels[record.id])
+            elif isinstance(record, Recorded):
+                channel = channels[record.channel_id]
+                if not channel[0].startswith(tuple(without)):
+                    m = record
+                    found.messages.append((channel, m.sequence, m.log_time, m.publish_time, m.data))
+            elif isinstance(record, Attachment):
+                found.attachments.append(record)
+            elif isinstance(record, Metadata) and record.name != METADATA:
+                found.metadata.append(record)
+    return found
+
+
+def check(model, path, output, **options):
+    """Annotate the one recording at a path; verdicts and what was written."""
+    (bag,) = group_recordings(path if isinstance(path, list) else [path])
+    transient, decisions = read_with_decisions(bag, model)
+    verdicts = EnvelopeMonitor(model).check(transient)
+    return verdicts, annotate(bag.parts, verdicts, decisions, output, model, **options)
+
+
+def same_recording(source, copy, topics=NODE):
+    one, other = held(source), held(copy, without=[f"{topics}/"])
+    assert other.messages == one.messages
+    assert other.attachments == one.attachments and other.metadata == one.metadata
+    assert other.channels == one.channels
+    assert other.compressions == one.compressions or (one.compressions == set() and other.compressions == {""})
+
+
+def by_rosbags(path, base=NODE):
+    """{topic: [(log time, message)]} of the annotations, by rosbags."""
+    found = {name: [] for name in TOPICS}
+    with AnyReader([Path(path)], default_typestore=None) as reader:
+        wanted = [c for c in reader.connections if c.topic.startswith(f"{base}/")]
+        assert {c.topic: c.msgtype for c in wanted} == {f"{base}/{name}": kind for name, kind in TOPICS.items()}
+        for connection, time, data in reader.messages(wanted):
+            message = reader.deserialize(data, connection.msgtype)
+            found[connection.topic.removeprefix(f"{base}/")].append((time, message))
+    return found
+
+
+def stamp(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def same_verdicts(model, verdicts, path, base=NODE):
+    """The bits of the check, in what rosbags reads."""
+    found, transient = by_rosbags(path, base), verdicts.transient
+    judged = verdicts.judged
+    rows = {name: np.array([m.position for _, m in found[name]]) for name in TOPICS if name != "violation"}
+    stamps = {name: np.array([stamp(m) for _, m in found[name]]) for name in rows}
+    for name in rows:
+        assert all(list(m.name) == list(model.state_names) for _, m in found[name])
+    kept = np.isin(stamps["flags"], transient.t_ns)
+    arrays = {"lower": verdicts.lower, "upper": verdicts.upper, "utilisation": verdicts.utilisation}
+    for name, array in (*arrays.items(), ("state", transient.x)):
+        assert stamps[name].tolist() == transient.t_ns[judged].tolist()
+        assert rows[name].tobytes() == array[judged].tobytes()
+    flags = rows["flags"]
+    assert np.array_equal(flags[np.isfinite(flags).all(axis=1)], verdicts.flags[judged])
+    marks = np.array([m.velocity for _, m in found["flags"]])
+    told = np.isfinite(flags).all(axis=1)
+    assert np.array_equal(marks[told], np.repeat(verdicts.outside_domain[judged, None], model.n, axis=1))
+    assert np.isnan(marks[~told]).all()
+    alarm = np.array([m.data for _, m in found["violation"]])
+    assert len(alarm) == len(flags)
+    if kept.all() and len(alarm) == len(transient):
+        assert np.array_equal(alarm, verdicts.alarm)
+    return found
+
+
+# --- shipped and real recordings ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["leibov_check", "turbofan_fan_damage"])
+def test_shipped_recordings(name, tmp_path):
+    source, copy = BAGS / f"{name}.mcap", tmp_path / "out.mcap"
+    if name.startswith("leibov"):
+        model = leibov2006()
+    else:
+        fitted = read_transients(BAGS / "turbofan_levels_noise.mcap", SIGNALS_FOLDER / "turbofan.yaml")
+        model = fit(fitted, "qp", additive="noise")
+    verdicts, made = check(model, source, copy)
+    assert verdicts.violated.any() and made.messages == len(held(source).messages) and not made.notes
+    same_recording(source, copy)
+    found = same_verdicts(model, verdicts, copy)
+    # decided by the state message itself, at whose log time it is told
+    with AnyReader([source]) as reader:
+        states = [c for c in reader.connections if c.topic == model.sampling.clock]
+        arrivals = [time for _, time, _ in reader.messages(states)]
+    assert [time for time, _ in found["flags"]] == arrivals
+
+
+REAL = {
+    "micro_gas_turbine/ex_20.mcap": ("micro_gas_turbine", None),
+    "go2/test_3.mcap": ("go2_joint", None),
+    "neato/draw_square.mcap": ("neato", "both"),
+    "crazyflie/yx3bag_0.mcap": ("crazyflie_vicon", None),
+    "crazyflie/yx4bag_0.mcap": ("crazyflie_estimate", "both"),
+    "hunter_se/straight_odd_t_0_5_run_01.mcap": ("hunter_se", None),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL)
+def test_real_recordings(name, recordings, signals_folder, tmp_path):
+    source = recordings / name
+    if not source.is_file():
+        source = sorted(source.parent.glob("*.mcap"))[0]
+    transients = read_transients(source, signals_folder / f"{REAL[name][0]}.yaml")
+    model = fit(transients, "qp", additive=REAL[name][1])
+    halved = model.with_(dA=model.dA / 2, dB=model.dB / 2, v=model.v / 2, dc=model.dc / 2)
+    verdicts, _ = check(halved, source, tmp_path / "out.mcap")
+    assert verdicts.violated.any() and not verdicts.violated.all()
+    same_recording(source, tmp_path / "out.mcap")
+    same_verdicts(halved, verdicts, tmp_path / "out.mcap")
+
+
+@pytest.mark.parametrize("name", ["split", "service_events", "zstd"])
+def test_odd_recordings_are_copied_whole(name, recordings, tmp_path):
+    """Channels that nobody can decode, several parts, other encodings: all are in the copy."""
+    odd = recordings / "odd"
+    files = sorted(odd.glob("multiple_files_*.mcap")) if name == "split" else None
+    if name != "split":
+        files = [p for p in sorted(odd.glob("*.mcap")) if readable(p) and p.stat().st_size < 1 << 22]
+    for number, group in enumerate([files] if name == "split" else [[f] for f in files]):
+        verdicts, decisions = nothing_said()
+        copy = tmp_path / f"{number}.mcap"
+        annotate(group, verdicts, decisions, copy, leibov2006())
+        messages = [m for part in group for m in held(part).messages]
+        assert held(copy, without=[f"{NODE}/"]).messages == messages
+
+
+def readable(path):
+    try:
+        Bag(path)
+        held(path)
+    except Exception:  # whatever the other library says of a broken file
+        return False
+    return True
+
+
+def nothing_said():
+    """Verdicts on no sample."""
+    from uncertain_lti import Transient
+
+    nothing = Transient(np.empty(0), np.empty((0, 5)), np.empty((0, 4)))
+    none = np.empty(0, dtype=np.int64)
+    return EnvelopeMonitor(leibov2006()).check(nothing), Decisions(none, none, none == 0)
+
+
+# --- layouts of files -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory):
+    """A model of two states, a recording with a jump, and its folder."""
+    folder = tmp_path_factory.mktemp("engine")
+    (folder / "signals.yaml").write_text(SIGNALS)
+    engine_bag(folder / "run.mcap")
+    model = fit(read_transients(folder / "run.mcap", folder / "signals.yaml"), additive="noise")
+    model.save(folder / "m.model.json")
+    engine_bag(folder / "bad.mcap", change=lambda k, x: x + (5.0 if 100 <= k < 103 else 0.0) * np.eye(5)[0])
+    return folder, model
+
+
+def rewritten(source, target, *, extra=True, metadata=None, first=1, **options):
+    """The same messages with another layout, an attachment, metadata and a topic of megabytes besides."""
+    with open(source, "rb") as stream, open(target, "wb") as out:
+        reader, writer = make_reader(stream), Writer(out, **options)
+        writer.start(profile="ros2", library="tests")
+        for _ in range(first - 1):  # so that numbers are other ones
+            writer.register_schema("unused", "", b"")
+        numbers = {}
+        for schema, channel, m in reader.iter_messages(log_time_order=False):
+            if channel.id not in numbers:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                about = metadata or {"maker": "- depth: 3\n", "a": ""}
+                numbers[channel.id] = writer.register_channel(channel.topic, "cdr", number, about)
+            writer.add_message(numbers[channel.id], m.log_time, m.data, m.publish_time, m.sequence)
+        if extra:
+            big = writer.register_channel("/camera", "jpeg", 0, {})
+            writer.add_message(big, m.log_time, os.urandom(100_000), 7, 4_000_000_000)
+            writer.register_channel("/never/used", "cdr", numbers and 1, {"a": "b"})
+            writer.add_attachment(5, 6, "map.pgm", "image/x", b"\x00\x01" * 700_000)
+            writer.add_metadata("rosbag2", {"serialized_metadata": "x: ü\n"})
+            writer.add_metadata("uncertain_lti", {})
+        writer.finish()
+    return target
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("chunked", [True, False])
+def test_everything_recorded_is_in_the_copy(engine, tmp_path, compression, chunked):
+    folder, model = engine
+    options = {"compression": COMPRESSIONS[compression], "use_chunking": chunked, "chunk_size": 3000}
+    source = rewritten(folder / "bad.mcap", tmp_path / "in.mcap", **options)
+    verdicts, made = check(model, source, tmp_path / "out.mcap")
+    same_recording(source, tmp_path / "out.mcap")
+    same_verdicts(model, verdicts, tmp_path / "out.mcap")
+    with open(tmp_path / "out.mcap", "rb") as stream:  # by the index as well, in order of log time
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary.statistics.message_count == made.messages + 2 * made.verdicts + 4 * int(verdicts.judged.sum())
+        assert len(summary.attachment_indexes) == 1 and len(summary.metadata_indexes) == 3
+        assert [a.data for a in reader.iter_attachments()] == [b"\x00\x01" * 700_000]
+        times = [m.log_time for _, _, m in reader.iter_messages(log_time_order=True)]
+        assert times == sorted(times) and len(times) == summary.statistics.message_count
+    with open(tmp_path / "out.mcap", "rb") as stream:
+        assert len(list(NonSeekingReader(stream, validate_crcs=True).iter_messages())) == len(times)
+    assert not Bag(tmp_path / "out.mcap").warnings
+    (again,) = [read_for_model(tmp_path / "out.mcap", model)]
+    assert np.array_equal(again.x, verdicts.transient.x) and np.array_equal(again.t_ns, verdicts.transient.t_ns)
+
+
+def test_parts_of_one_recording_become_one_file(engine, tmp_path):
+    """Also where their numbers of channels contradict each other."""
+    folder, model = engine
+    whole = held(folder / "bad.mcap")
+    for part, first in ((0, 1), (1, 4)):
+        stream = open(tmp_path / f"bag_{part}.mcap", "wb")
+        with stream, open(folder / "bad.mcap", "rb") as source:
+            writer = Writer(stream)
+            writer.start(profile="ros2")
+            for _ in range(first - 1):
+                writer.register_schema(f"unused{first}", "", bytes([first]))
+            numbers = {}
+            for k, (schema, channel, m) in enumerate(make_reader(source).iter_messages(log_time_order=False)):
+                if (k < 250) != (part == 0):
+                    continue
+                if channel.topic not in numbers:
+                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+                writer.add_message(numbers[channel.topic], m.log_time, m.data, m.publish_time, m.sequence)
+            writer.finish()
+    parts = [tmp_path / "bag_0.mcap", tmp_path / "bag_1.mcap"]
+    verdicts, _ = check(model, parts, tmp_path / "out.mcap")
+    assert held(tmp_path / "out.mcap", without=[f"{NODE}/"]).messages == whole.messages
+    same_verdicts(model, verdicts, tmp_path / "out.mcap")
+    with open(tmp_path / "out.mcap", "rb") as stream:
+        topics = [c.topic for c in make_reader(stream).get_summary().channels.values()]
+    assert len(topics) == len(set(topics)) == 2 + len(TOPICS)
+
+
+def test_a_damaged_recording_is_copied_as_far_as_it_can_be_read(engine, tmp_path):
+    folder, model = engine
+    source = rewritten(folder / "bad.mcap", tmp_path / "whole.mcap", extra=False, chunk_size=3000)
+    data = bytearray(source.read_bytes())
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
+    data[len(data) // 3] ^= 0xFF
+    (tmp_path / "flipped.mcap").write_bytes(data)
+    for name in ("cut", "flipped"):
+        bag = Bag(tmp_path / f"{name}.mcap")
+        expected = [(m.topic, m.log_time_ns, m.publish_time_ns, m.data) for m in bag.raw_messages()]
+        assert bag.warnings and 0 < len(expected) < 600
+        verdicts, _ = check(model, bag.path, tmp_path / f"{name}_out.mcap")
+        copy = held(tmp_path / f"{name}_out.mcap", without=[f"{NODE}/"])
+        assert [(c[0], log, publish, data) for c, _, log, publish, data in copy.messages] == expected
+        same_verdicts(model, verdicts, tmp_path / f"{name}_out.mcap")
+
+
+def test_topics_of_a_live_monitor_are_left_alone(engine, tmp_path):
+    folder, model = engine
+    base = NODE
+    source = folder / "bad.mcap"
+    for number, expected in enumerate([NODE, f"{NODE}_check", f"{NODE}_check_2"]):
+        copy = tmp_path / f"{number}.mcap"
+        verdicts, made = check(model, source, copy)
+        assert made.topics == expected and bool(made.notes) == (expected != NODE)
+        same_verdicts(model, verdicts, copy, expected)
+        same_recording(folder / "bad.mcap", copy, NODE) if expected == NODE else None
+        assert held(copy, without=[f"{expected}/"]).messages == held(source).messages
+        source, base = copy, expected
+    assert base == f"{NODE}_check_2"
+
+
+def test_dropped_messages_get_flags_without_a_verdict(engine, tmp_path):
+    """As live: something is said of every clock message."""
+    folder, model = engine
+    original = held(folder / "run.mcap").messages
+    topics = [Topic(name, "sensor_msgs/msg/JointState") for name in ("/engine/state", "/engine/control")]
+    messages = []
+    for k, (channel, _, log, _, data) in enumerate(original):
+        messages.append(Message(channel[0], log, data, log))
+        if k in (0, 40, 41):
+            messages.append(Message(channel[0], log, data, log))  # an equal stamp
+    write(topics, messages).save(tmp_path / "in.mcap")
+    verdicts, made = check(model, tmp_path / "in.mcap", tmp_path / "out.mcap")
+    dropped = verdicts.transient.counters["equal stamp"]
+    assert dropped == 2 and made.verdicts == len(verdicts.transient) + dropped
+    found = same_verdicts(model, verdicts, tmp_path / "out.mcap")
+    assert np.isnan(found["flags"][1][1].position).all() and stamp(found["flags"][1][1]) == verdicts.transient.t_ns[0]
+    assert len(found["violation"]) == made.verdicts and len(found["lower"]) == int(verdicts.judged.sum())
+
+
+def test_records_of_many_verdicts_are_those_of_one_at_a_time():
+    rng = np.random.default_rng(3)
+    for n in (1, 2, 5):
+        names = [f"{'x' * i}é" for i in range(1, n + 1)]
+        records = VerdictRecords(names, {name: i for i, name in enumerate(TOPICS)})
+        plain, marked = NamedVector(names), NamedVector(names, velocities=True)
+        for _ in range(2):
+            count = 40
+            times = np.sort(rng.integers(0, 2**62, count))
+            stamps = rng.integers(0, 2**62, count)
+            judged, outside, alarm = rng.random((3, count)) < 0.5
+            vectors = {name: rng.normal(size=(count, n)) for name in JUDGED}
+            flags = np.where(judged[:, None], rng.integers(0, 2, (count, n)).astype(float), np.nan)
+            data, index = records.encode(times, stamps, judged, outside, alarm, flags, vectors)
+            expected = []
+            for k in range(count):
+                mark = np.full(n, float(outside[k]) if judged[k] else np.nan)
+                expected.append((0, marked(int(stamps[k]), flags[k].tobytes(), mark.tobytes())))
+                expected.append((1, TRUE if alarm[k] else FALSE))
+                if judged[k]:
+                    expected += [
+                        (2 + i, plain(int(stamps[k]), vectors[name][k].tobytes())) for i, name in enumerate(JUDGED)
+                    ]
+            read, at, places = [], 0, {}
+            while at < len(data):
+                opcode, length, channel, sequence, log, publish = struct.unpack_from("<BQHIQQ", data, at)
+                assert opcode == 5 and log == publish
+                places.setdefault(channel, []).append((log, at))
+                read.append((channel, data[at + 31 : at + 9 + length]))
+                at += 9 + length
+            assert read == expected
+            assert {c: [e for p in places[c] for e in p] for c in places} == {
+                c: list(struct.unpack(f"<{len(text) // 8}Q", text)) for c, text in index.items()
+            }
+    with pytest.raises(ModelError, match="rename"):
+        NamedVector(["a\0b"])
+
+
+# --- the command ------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_and_says_so(engine, tmp_path, capsys):
+    folder, model = engine
+    model_file, bad = str(folder / "m.model.json"), str(folder / "bad.mcap")
+    assert main(["check", model_file, bad, "--write", str(tmp_path / "out.mcap")]) == 1
+    assert f"{NODE} written to {tmp_path / 'out.mcap'}" in capsys.readouterr().out
+    same_recording(bad, tmp_path / "out.mcap")
+    # a folder for several; the alarm rule of the command line is what is told
+    rule = ["--violations", "250", "--window", "250", "--json"]
+    both = [bad, str(folder / "run.mcap")]
+    assert main(["check", model_file, *both, "--write", str(tmp_path / "all"), *rule]) == 0
+    said = json.loads(capsys.readouterr().out)["recordings"]
+    assert [Path(r["written"]["file"]).name for r in said] == ["bad_annotated.mcap", "run_annotated.mcap"]
+    found = by_rosbags(tmp_path / "all" / "bad_annotated.mcap")
+    assert not any(m.data for _, m in found["violation"]) and len(found["violation"]) == 300
+    with open(tmp_path / "all" / "bad_annotated.mcap", "rb") as stream:
+        (about,) = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == METADATA]
+    assert about["alarm"] == "250 of 250, margin 1.0" and about["model"] == "m.model.json"
+    assert len(about["model_sha256"]) == 64 and json.loads(about["states"])[0]["name"] == "fan"
+
+
+def test_nothing_recorded_is_ever_overwritten(engine, tmp_path, capsys):
+    folder, _ = engine
+    model_file = str(folder / "m.model.json")
+    before = (folder / "bad.mcap").read_bytes()
+    (tmp_path / "other.mcap").write_bytes(b"precious")
+    (tmp_path / "link.mcap").symlink_to(folder / "bad.mcap")
+    parts = {f"bag_{i}.mcap": write([Topic("/a")], ramp("/a", range(i * 10, i * 10 + 10))) for i in range(2)}
+    write_folder(tmp_path / "bag", parts, metadata_yaml(parts))
+    cases = {
+        (str(folder / "bad.mcap"),): (str(folder / "bad.mcap"), "is the recording itself"),
+        (str(folder / "bad.mcap"), ""): (str(tmp_path / "link.mcap"), "is the recording itself"),
+        (str(folder / "bad.mcap"), "", ""): (str(tmp_path / "other.mcap"), "is there already"),
+        (str(folder / "bad.mcap"), "", "", ""): (str(tmp_path / "no" / "out.mcap"), "make it first"),
+        (str(folder / "bad.mcap"), str(folder / "run.mcap")): (str(tmp_path / "x.mcap"), "one file for 2 recordings"),
+        (str(tmp_path / "bag"),): (str(tmp_path / "bag" / "x.mcap"), "folder of the recording"),
+        (str(folder / "bad.mcap"), "", "", "", ""): (model_file, "neither a folder nor"),
+    }
+    for bags, (output, why) in cases.items():
+        assert main(["check", model_file, *filter(None, bags), "--write", output]) == 2
+        said = capsys.readouterr()
+        assert why in said.err and said.err.count("\n") == 1 and not said.out
+    assert (folder / "bad.mcap").read_bytes() == before and (tmp_path / "other.mcap").read_bytes() == b"precious"
+    assert not (tmp_path / "x.mcap").exists()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError, BagError("x: gone")])
+def test_nothing_is_left_of_a_copy_that_did_not_get_whole(engine, tmp_path, error):
+    folder, model = engine
+
+    def interrupted(steps, total):
+        for number, step in enumerate(steps):
+            if number == 100:
+                raise error
+            yield step
+
+    with pytest.raises(error if isinstance(error, type) else type(error)):
+        check(model, folder / "bad.mcap", tmp_path / "out.mcap", progress=interrupted)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_sentence(engine, tmp_path):
+    folder, model = engine
+    limit = (
+        "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); "
+        "from uncertain_lti.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    source = rewritten(folder / "bad.mcap", tmp_path / "in.mcap")
+    arguments = ["check", str(folder / "m.model.json"), str(source), "--write", str(tmp_path / "out" / "")]
+    done = subprocess.run([sys.executable, "-c", limit, *arguments], capture_output=True, text=True)
+    assert done.returncode == 2 and "cannot be written" in done.stderr and "Traceback" not in done.stderr
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_names_for_several_recordings_differ(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        write([Topic("/a")], ramp("/a", range(10))).save(tmp_path / folder / "run_0.mcap")
+    bags = group_recordings([tmp_path / "a" / "run_0.mcap", tmp_path / "b" / "run_0.mcap", tmp_path / "a"][:2])
+    assert [p.name for p in targets(tmp_path / "out", bags)] == ["run_0_annotated.mcap", "run_0_2_annotated.mcap"]
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_recording(engine, tmp_path):
+    """A camera beside the states: 400 MB of messages."""
+    folder, _ = engine
+    source = tmp_path / "big.mcap"
+    with open(folder / "bad.mcap", "rb") as small, open(source, "wb") as out:
+        writer = Writer(out, compression=COMPRESSIONS["none"])
+        writer.start(profile="ros2")
+        numbers = {}
+        camera = writer.register_channel("/camera", "raw", 0)
+        picture = os.urandom(1 << 20)
+        for k, (schema, channel, m) in enumerate(make_reader(small).iter_messages()):
+            if channel.topic not in numbers:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(numbers[channel.topic], m.log_time, m.data, m.publish_time)
+            if k % 3 < 2:
+                writer.add_message(camera, m.log_time, picture, m.publish_time)
+        writer.finish()
+    run = (
+        "import resource, sys; from uncertain_lti.cli import main; status = main(sys.argv[1:]); "
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024); sys.exit(status)"
+    )
+    peaks = []
+    for bag in (folder / "bad.mcap", source):
+        target = tmp_path / f"{bag.stem}_out.mcap"
+        arguments = ["check", str(folder / "m.model.json"), str(bag), "--write", str(target)]
+        done = subprocess.run([sys.executable, "-c", run, *arguments], capture_output=True, text=True)
+        assert done.returncode == 1, done.stderr
+        peaks.append(int(done.stdout.split()[-1]))
+    assert (tmp_path / "big_out.mcap").stat().st_size > source.stat().st_size > 400_000_000
+    assert peaks[1] - peaks[0] < 60, peaks
+
+
+@given(cases() | loops())
+def test_decisions_are_those_of_the_sampler(case):
+    signals, messages = case
+    data = columns(signals, messages)
+    found = decided(signals, **data)
+    sampler, rows = Sampler(signals), [iter(v.tolist()) for v in data["values"]]
+    expected = []
+    for topic, arrival, stamp in zip(*(data[k].tolist() for k in ("topic", "arrival", "stamp")), strict=True):
+        for step in sampler.push(signals.topics[topic], arrival, stamp if stamp >= 0 else None, next(rows[topic])):
+            expected.append((arrival, step.t_ns, step.status.dropped))
+    assert list(zip(found.arrival.tolist(), found.t_ns.tolist(), found.dropped.tolist(), strict=True)) == expected
