@@ -443,7 +443,7 @@ class Watch:
             "violations": repr(rule.violations),
             "window": repr(rule.window),
             "margin": repr(rule.margin),
-            "late": str(self.late),
+            "late messages": str(self.late),
             "dropped": str(sum(counters[status.value] for status in Status if status.dropped)),
         }
         for name in ("samples", "gaps", "resets", "missing"):
