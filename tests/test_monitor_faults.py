@@ -580,3 +580,39 @@ def test_without_a_folder_there_are_no_snapshots(world: World, tmp_path: Path) -
     process = world.run_node("envelope_monitor", options, "-r", "__node:=second")
     process.says("cannot be written to")
     assert world.state("/second") == "unconfigured"
+
+
+def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) -> None:
+    from uncertain_lti.errors import ModelError
+    from uncertain_lti_ros.snapshot import Album, Entry, Scene
+
+    folder = tmp_path / "album"
+    rng = np.random.default_rng(3)
+
+    def scene(size: int) -> Scene:
+        entries = [Entry(0.0, k, "/t", rng.bytes(size // 10), (), False) for k in range(10)]
+        return Scene(
+            entries, ["a"], {"/t": "std_msgs/msg/UInt8"}, {"flags": "/n/flags", "violation": "/n/violation"}, {}
+        )
+
+    limit = 100_000
+    album = Album(str(folder), "/rig/../../../etc/monitor", keep=100, limit=limit)
+    (folder / "foreign-20240101T000000.000000Z.mcap").write_bytes(bytes(2 * limit))
+    outside = tmp_path / "outside.mcap"
+    outside.write_bytes(b"of someone else")
+    written = []
+    for _ in range(8):
+        said = album.take(scene(30_000), patience=10.0)
+        written.append(Path(said.removeprefix("wrote ")))
+        assert written[-1].parent == folder and written[-1].is_file()
+        mine = [p for p in folder.iterdir() if not p.name.startswith("foreign")]
+        assert sum(p.stat().st_size for p in mine) <= limit
+        assert sorted(p.name for p in mine) == [p.name for p in written[-len(mine) :]], "the oldest go first"
+    assert len(mine) == 3 and len(list(folder.iterdir())) == 4
+    # a link that bears the name of a snapshot leads elsewhere, and is left alone
+    (folder / written[0].name).symlink_to(outside)
+    with pytest.raises(ModelError, match=r"more than snapshot.megabytes allows"):
+        album.take(scene(150_000), patience=10.0)
+    album.take(scene(30_000), patience=10.0)
+    assert outside.read_bytes() == b"of someone else" and (folder / written[0].name).is_symlink()
+    assert not list(tmp_path.rglob("*.part"))

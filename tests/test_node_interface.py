@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +25,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 from test_live import ERROR, STATE, STEP_NS, Outputs, Plant, by_hand, header_bag, offline, saved
+from test_monitor_faults import ever
 
 from uncertain_lti_ros.parameters import PARAMETERS
 
@@ -258,3 +260,45 @@ def test_statuses_group_by_node_and_hardware(world: World, tmp_path: Path) -> No
             assert len(set(keys)) == len(keys) and status.message
     values = Diagnostics.values(diagnostics.latest(f"rig{NODE}: monitor"))
     assert values["verdicts"] == "29"
+
+
+# --- what is lost on the way --------------------------------------------------------------------------------
+
+
+def test_messages_that_are_lost_on_the_way_are_counted_and_never_bridged(world: World, tmp_path: Path) -> None:
+    """The monitor stands still (SIGSTOP) while best-effort publishers go on, until their messages find no room."""
+    model = by_hand()
+    process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1, **{"qos.depth": 5})
+    diagnostics = world.diagnostics()
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model)
+    best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    world.node.destroy_publisher(plant.state)
+    plant.state = world.publisher(JointState, STATE, best_effort)
+    plant.subscribed().send(10)
+    flags.count(10)
+    until(lambda: diagnostics.latest(f"{NODE[1:]}: monitor"), "a report")
+    process.signal(signal.SIGSTOP)
+    try:
+        padding = [0.0] * 4000
+        x = model.operating_point.recorded_x(np.zeros(2)).tolist()
+        for k in range(400):
+            message = JointState(name=["a", "b"], position=x, effort=padding)
+            t = plant.t_ns + k * STEP_NS
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(t, 10**9)
+            plant.state.publish(message)
+            time.sleep(0.001)
+        plant.t_ns += 400 * STEP_NS
+    finally:
+        process.signal(signal.SIGCONT)
+    until(lambda: ever(diagnostics, 1, "messages lost on the way"), "a word on it")
+    plant.send(5)
+    until(lambda: flags.messages[-1].position[0] == 0.0, "verdicts again")
+    status = world.status()
+    assert status["lost"][STATE] > 0 and status["received"][STATE] + status["lost"][STATE] <= 415
+    assert status["counters"]["gaps"] >= 1, "what was lost is a gap"
+    for _ in range(2):  # counted for good, but told once: a monitor that runs for months is not to warn for ever
+        time.sleep(0.3)
+        plant.send(20)
+        values = Diagnostics.values(diagnostics.reaches(0))
+        assert values[f"lost {STATE}"] == str(status["lost"][STATE])

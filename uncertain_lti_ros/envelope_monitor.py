@@ -85,6 +85,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._reason = ""  # why the last configure failed
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self._inputs: dict[str, MatchedSubscription] = {}
+        self._told: dict[str, tuple[int, int]] = {}  # topic: lost and late messages that the last report told of
         self._outputs: dict[str, _Output] = {}
         self._enable_problem = ""
         self._candidate: Watch | Rule | None = None  # accepted, not yet in place
@@ -477,14 +478,15 @@ class EnvelopeMonitorNode(LifecycleNode):
         )
 
     def _problems(self) -> list[str]:
-        """What keeps messages from coming, beside silence, and what went wrong here."""
+        """What keeps messages from coming, beside silence, and what went wrong here since the last report."""
         problems = []
-        for subscription in self._inputs.values():
+        for topic, subscription in self._inputs.items():
             problems += subscription.problems
-            if subscription.lost:
-                problems.append(f"{subscription.topic}: {subscription.lost} messages lost on the way")
-            if subscription.late:
-                problems.append(f"{subscription.topic}: {subscription.late} deadlines missed by its publishers")
+            lost, late = self._told.get(topic, (0, 0))
+            if subscription.lost > lost:
+                problems.append(f"{subscription.topic}: {subscription.lost - lost} messages lost on the way")
+            if subscription.late > late:
+                problems.append(f"{subscription.topic}: {subscription.late - late} deadlines missed by its publishers")
         if self._enable_problem:
             problems.append(self._enable_problem)
         if self._album is not None and self._album.problem:
@@ -517,6 +519,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             if self.watch is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.watch.model.state_names]
         self._failures_told = self._failures
+        self._told = {topic: (subscription.lost, subscription.late) for topic, subscription in self._inputs.items()}
         full_name = self.get_fully_qualified_name().lstrip("/")
         hardware = str(self.get_parameter("hardware_id").value) or self.get_name()
         message = DiagnosticArray()
