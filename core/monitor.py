@@ -55,7 +55,7 @@ class Verdict:
 
     @property
     def judged(self) -> bool:
-        """There is a verdict: the message is neither dropped nor without a complete transition."""
+        """Whether there is a verdict, the message being neither dropped nor without a complete transition."""
         return self._judgement is not None
 
     @property
@@ -201,7 +201,7 @@ class Verdicts:
 
     @property
     def violated(self) -> NDArray[np.bool_]:
-        """(N+1,): some state left its bounds."""
+        """Whether some state left its bounds, (N+1,)."""
         left: NDArray[np.bool_] = (self.flags == 1.0).any(axis=1)
         return left
 

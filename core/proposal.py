@@ -635,7 +635,9 @@ def _coupled(steps: _Steps, pool: list[Candidate], most: int, pose: bool) -> lis
     n = len(pool)
     driven = steps.effect(range(n)) if steps.U.shape[1] else np.zeros(n)
     least = max(SHOWS, 0.5 * float(driven.max(initial=0.0))) if pose else SHOWS
-    kept = [int(i) for i in np.argsort(-driven, kind="stable") if driven[i] > least][:most]
+    kept = [int(i) for i in np.argsort(-driven, kind="stable") if driven[i] > least]
+    angles = [i for i in kept if "(" in pool[i].path]
+    kept = (angles if pose and angles else kept)[:most]
     if not kept:
         for candidate in pool[most:]:
             candidate.reason = "the recording is too short for so many states"
@@ -658,7 +660,7 @@ def _coupled(steps: _Steps, pool: list[Candidate], most: int, pose: bool) -> lis
             candidate.reason = (
                 "the recording is too short for more"
                 if len(kept) == most
-                else "the controls show less in it"
+                else "a place moves with the attitude by geometry, or the controls show less in it"
                 if pose
                 else "the controls do not show in it, and nothing couples it to the states above"
             )
@@ -760,7 +762,8 @@ def _text(
     topics = list(dict.fromkeys(c.topic for c in [*states, *controls]))
     clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
     lines = [
-        f"# Proposed by `uncertain-lti init` from {', '.join(bag.path.name for bag in bags)}; read it, and edit it.",
+        "# Proposed by `uncertain-lti init`; read it, and edit it. From:",
+        *(f"#   {bag.path.name}" for bag in bags),
         "# States are what the machine remembers from one sample to the next; controls are what is done to it, as",
         "# it is commanded. Then: uncertain-lti fit BAG... --signals THIS_FILE --output machine.model.json",
         "",

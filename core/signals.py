@@ -403,7 +403,7 @@ class SignalMap:
 
     @property
     def signals(self) -> tuple[Signal, ...]:
-        """States, then controls: the order of z = [x; u]."""
+        """States, then controls, in the order of z = [x; u]."""
         return self.states + self.controls
 
     @property

@@ -134,7 +134,7 @@ class Transient:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """(N,): the transition k -> k+1 lies in one segment and is finite at both ends."""
+        """Whether the transition k -> k+1 lies in one segment and is finite at both ends, (N,)."""
         if len(self.t_ns) < 2:
             return np.zeros(0, dtype=bool)
         finite_x = np.asarray(np.isfinite(self.x).all(axis=1))

@@ -1,5 +1,6 @@
 """Sphinx settings; `./run docs` builds the pages, and a warning is an error."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -23,14 +24,17 @@ myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build", "reference/*.generated.md"]
 default_role = "code"
+smartquotes = False  # --json is no dash
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings give shapes and units
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True}
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["math.css"]
 html_title = "uncertain_lti_ros"
 html_math_renderer = "mathml"
 html_show_sourcelink = False
@@ -39,8 +43,11 @@ html_copy_source = False
 
 def _mathml(block: bool):
     def visit(translator, node):
-        text = convert(node.astext(), display="block" if block else "inline")
-        number = node.get("number")
+        formula = node.astext()
+        number = None
+        if tag := re.search(r"\\tag\{([^}]*)\}", formula):  # which the converter sets right behind the formula
+            formula, number = formula.replace(tag[0], ""), tag[1]
+        text = convert(formula, display="block" if block else "inline")
         label = f'<span class="eqno">({number})</span>' if number else ""
         translator.body.append(f"<div class='math'>{text}{label}</div>" if block else text)
         raise nodes.SkipNode

@@ -35,7 +35,7 @@ def commands() -> str:
         usage = re.sub(r"\n +", "\n    ", parser.format_usage().removeprefix("usage: ").strip())
         lines = [f"## {name}", "", _escape(parser.description or ""), "", "```text", usage, "```", ""]
         rows = []
-        for action in parser._actions:
+        for action in sorted(parser._actions, key=lambda a: bool(a.option_strings)):  # a stable sort
             if isinstance(action, argparse._HelpAction):
                 continue
             rows.append((_called(action), _escape(action.help or "")))
