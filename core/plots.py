@@ -1,9 +1,17 @@
-"""Figures of what was fitted and what was judged."""
+"""Figures of what was fitted and what was judged.
+
+Each function returns a matplotlib Figure; `save` writes it, Jupyter shows it. Colours are told apart by colour-blind
+people as well (Okabe and Ito 2008; Blues, PuOr). Long recordings are drawn by pixel: in each stretch of time the
+least and the greatest value, and a mark wherever a single sample of it was violated.
+"""
 
 from __future__ import annotations
 
+import math
 import os
+import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,28 +20,34 @@ from numpy.typing import NDArray
 from uncertain_lti.errors import ModelError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
+from uncertain_lti.transient import Transient
 
-# colour-blind safe (Okabe and Ito 2008)
-ENVELOPE, RECORDED, VIOLATED, ALARM = "#56B4E9", "#000000", "#D55E00", "#E69F00"
+ENVELOPE, RECORDED, VIOLATED, ALARM, NO_VERDICT = "#56B4E9", "#000000", "#D55E00", "#F0E442", "#999999"
+PIXELS = 1200
+"""Stretches of time that a longer recording is drawn in."""
+_FEW = 8  # states that get a panel of full size each, and columns whose numbers fit into a heat map
+_WIDTH = 10.0  # inches
+_LONGEST_NAME = 34
+_MANY = 30  # names beside each other are written smaller from here on
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 def envelope_figure(
     model: UncertainLTI,
     verdicts: Verdicts,
-    path: str | os.PathLike[str],
     states: Sequence[str] | None = None,
     event: tuple[float, str] | None = None,
     span: tuple[float, float] | None = None,
-) -> None:
-    """Each state between its one-step bounds over time, in recorded units, violations marked, gaps left open.
+) -> Any:
+    """Each state between its one-step bounds over time, in recorded units, violations marked, gaps shown.
 
     Parameters
     ----------
     model : UncertainLTI
     verdicts : Verdicts
         Of `EnvelopeMonitor.check`.
-    path : path
-        Image file to write; its ending says the format.
     states : sequence of str, optional
         Names of the states to show; default all.
     event : (float, str), optional
@@ -41,77 +55,659 @@ def envelope_figure(
     span : (float, float), optional
         Show only this time, s.
 
+    Returns
+    -------
+    matplotlib.figure.Figure
+
     Raises
     ------
     ModelError
         A name is not a state of the model.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    chosen = _chosen(model, states)
+    axis_time = _Time(verdicts.transient)
+    drawn = _Drawn.of(verdicts, axis_time.t, span)
+    figure, axes = _panels(len(chosen))
+    for axis, i in zip(axes, chosen, strict=True):
+        lower, upper = drawn.least(verdicts.lower[:, i]), drawn.greatest(verdicts.upper[:, i])
+        low, high = drawn.least(verdicts.transient.x[:, i]), drawn.greatest(verdicts.transient.x[:, i])
+        _shade(axis, drawn)
+        axis.fill_between(*drawn.broken(lower, upper), color=ENVELOPE, alpha=0.55, linewidth=0.5)
+        if drawn.binned:
+            axis.fill_between(*drawn.broken(low, high), color=RECORDED, linewidth=0.7)
+        else:
+            dot = "." if len(drawn.t) <= 200 else None
+            axis.plot(*drawn.broken(low), color=RECORDED, linewidth=0.9, marker=dot, markersize=3)
+        bottom, top = _limits(np.concatenate([lower, low]), np.concatenate([upper, high]))
+        axis.set_ylim(bottom, top)
+        _mark(axis, *drawn.worst(verdicts, i, verdicts.transient.x[:, i]), bottom, top, len(drawn.t))
+        _title(axis, model, i, verdicts, drawn)
+        _ticks(axis)
+    _finish_time(figure, axes, axis_time, drawn, event)
+    handles = [
+        _patch(ENVELOPE, 0.55, "one-step bounds"),
+        _line(RECORDED, "recorded"),
+        _line(VIOLATED, "violated", "o"),
+        _patch(ALARM, 0.45, "alarm"),
+        _patch(NO_VERDICT, 0.35, "no verdict"),
+    ]
+    return _head(figure, verdicts, handles)
 
+
+def utilisation_figure(
+    model: UncertainLTI,
+    verdicts: Verdicts,
+    states: Sequence[str] | None = None,
+    span: tuple[float, float] | None = None,
+) -> Any:
+    """Where between its bounds each state lay over time: -1 at the lower bound, 1 at the upper one.
+
+    Up to eight states have a panel each; more become the rows of a map of the greatest |utilisation| in each stretch
+    of time. Parameters, return value and errors as for `envelope_figure`.
+    """
+    chosen = _chosen(model, states)
+    axis_time = _Time(verdicts.transient)
+    drawn = _Drawn.of(verdicts, axis_time.t, span, always=len(chosen) > _FEW)
+    if len(chosen) > _FEW:
+        return _utilisation_map(model, verdicts, chosen, axis_time, drawn)
+    figure, axes = _panels(len(chosen), height=1.0)
+    for axis, i in zip(axes, chosen, strict=True):
+        low, high = drawn.least(verdicts.utilisation[:, i]), drawn.greatest(verdicts.utilisation[:, i])
+        greatest = np.abs(np.concatenate([low, high]))
+        greatest = greatest[np.isfinite(greatest)]
+        limit = min(max(1.25, 1.1 * float(greatest.max(initial=0.0))), 4.0)
+        _shade(axis, drawn)
+        axis.axhspan(-1.0, 1.0, color=ENVELOPE, alpha=0.25, linewidth=0)
+        low, high = np.clip(low, -limit, limit), np.clip(high, -limit, limit)
+        if drawn.binned:
+            axis.fill_between(*drawn.broken(low, high), color=RECORDED, linewidth=0.6)
+        else:
+            axis.plot(*drawn.broken(low), color=RECORDED, linewidth=0.6)
+        axis.set_ylim(-limit, limit)
+        _mark(axis, *drawn.worst(verdicts, i, verdicts.utilisation[:, i]), -limit, limit, len(drawn.t))
+        axis.set_yticks([-1, 0, 1])
+        _title(axis, model, i, verdicts, drawn, unit=False)
+        _ticks(axis)
+    _finish_time(figure, axes, axis_time, drawn, None)
+    handles = [
+        _patch(ENVELOPE, 0.25, "inside the bounds"),
+        _line(RECORDED, "utilisation"),
+        _line(VIOLATED, "violated", "o"),
+        _patch(ALARM, 0.45, "alarm"),
+        _patch(NO_VERDICT, 0.35, "no verdict"),
+    ]
+    return _head(figure, verdicts, handles)
+
+
+def matrices_figure(model: UncertainLTI) -> Any:
+    """A and B beside their half-widths ΔA and ΔB as heat maps with names, in 1/s of normalised quantities.
+
+    A dot marks an element whose half-width is greater than itself: its sign is not known. Columns c (drift) and
+    v (noise, not multiplied by Δt) appear where the model has them.
+    """
+    from matplotlib.colors import LogNorm, SymLogNorm
+
+    nominal, half, columns = _with_additive(model)
+    rows = [_short(name) for name in model.state_names]
+    numbers = nominal.size <= 110
+    cell = 0.62 if numbers else max(0.16, min(0.4, 9.0 / len(columns)))
+    width, height = cell * 1.1 * len(columns), max(cell * 0.7 * len(rows), 1.0)
+    crowd = max(len(rows), len(columns))
+    label, below = _length(rows, crowd), _length(columns, crowd)
+    figure = _figure(max(label + width + 1.0, 3.6), 2 * (height + below + 0.45) + 0.3)
+    total_w, total_h = figure.get_size_inches()
+    greatest = float(np.abs(nominal).max(initial=0.0)) or 1.0
+    least = float(half[half > 0].min(initial=math.inf))
+    widest = float(half.max(initial=0.0)) or 1.0
+    least = min(max(least, widest * 1e-4), widest * 0.5)
+    maps = (
+        ("A | B, nominal elements [1/s]", nominal, "PuOr", SymLogNorm(greatest * 1e-3, 0.5, -greatest, greatest)),
+        ("ΔA | ΔB, half-widths [1/s]", half, "Blues", LogNorm(least, widest)),
+    )
+    doubtful = (half[:, : model.n + model.m] > np.abs(nominal[:, : model.n + model.m])).nonzero()
+    for k, (title, values, colours, norm) in enumerate(maps):
+        bottom = (2 - k - 1) * (height + below + 0.45) + below + 0.25
+        axis = figure.add_axes((label / total_w, bottom / total_h, width / total_w, height / total_h))
+        shown = np.where(values == 0.0, np.nan, values) if k else values
+        image = axis.imshow(shown, cmap=colours, norm=norm, aspect="auto", interpolation="nearest")
+        bar = figure.add_axes(((label + width + 0.15) / total_w, bottom / total_h, 0.15 / total_w, height / total_h))
+        figure.colorbar(image, cax=bar)
+        bar.tick_params(labelsize=7)
+        bar.yaxis.set_minor_locator(_no_ticks())
+        axis.set_title(title, loc="left", fontsize=9)
+        _name_cells(axis, rows, columns)
+        axis.axvline(model.n - 0.5, color=RECORDED, linewidth=0.8)
+        if len(columns) > model.n + model.m:
+            axis.axvline(model.n + model.m - 0.5, color=RECORDED, linewidth=0.8)
+        if numbers:
+            _number_cells(axis, values, image)
+        if not k:
+            axis.plot(doubtful[1] + 0.36, doubtful[0] - 0.3, ".", color=VIOLATED, markersize=5 if numbers else 3)
+    figure.text(
+        0.1 / total_w, 0.08 / total_h, "dot: the half-width is greater than the element; white: zero", fontsize=7
+    )
+    return figure
+
+
+def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
+    """Which element contributes how much of the mean one-step width, per state, over the transitions of recordings.
+
+    The width of state i is 2 (Δt (ΔA |x| + ΔB |u| + Δc) + v) X_i, eqs. (6)(7) with additive terms: each column is one
+    summand as a share of its mean; the width itself stands beside the names in recorded units.
+
+    Raises
+    ------
+    ModelError
+        No recording has a usable transition.
+    """
+    shares, width, columns = width_budget(model, transients)
+    rows = []
+    for i, name in enumerate(model.state_names):
+        unit = model.signals.states[i].unit
+        rows.append(f"{_short(name)}\n{width[i]:.3g}{' ' + _plain(unit) if unit else ''}")
+    numbers = shares.size <= 250
+    few = len(rows) <= 12
+    if not few:
+        rows = [row.replace("\n", ": ") for row in rows]
+    crowd = max(len(rows), len(columns))
+    cell = 0.55 if numbers else max(0.16, min(0.4, 9.0 / len(columns)))
+    width_in, height = cell * len(columns), (0.42 if few else 0.2) * len(rows)
+    label = _length([part for row in rows for part in row.split("\n")], crowd)
+    below = _length(columns, crowd)
+    figure = _figure(max(label + width_in + 0.8, 3.8), height + below + 0.35)
+    total_w, total_h = figure.get_size_inches()
+    axis = figure.add_axes((label / total_w, below / total_h, width_in / total_w, height / total_h))
+    top = 100 * float(shares.max(initial=0.0)) or 100.0
+    image = axis.imshow(100 * shares, cmap="Blues", vmin=0, vmax=top, aspect="auto", interpolation="nearest")
+    bar = figure.add_axes(((label + width_in + 0.12) / total_w, below / total_h, 0.15 / total_w, height / total_h))
+    figure.colorbar(image, cax=bar)
+    bar.tick_params(labelsize=7)
+    axis.set_title("share of the mean one-step width [%]", loc="left", fontsize=9)
+    _name_cells(axis, rows, columns)
+    for place in (model.n, model.n + model.m):
+        if place < len(columns):
+            axis.axvline(place - 0.5, color=RECORDED, linewidth=0.8)
+    if numbers:
+        for i, j in np.argwhere(shares >= 0.005):
+            dark = 100 * shares[i, j] > 0.6 * top
+            axis.text(
+                j, i, f"{100 * shares[i, j]:.0f}", ha="center", va="center", fontsize=7, color="w" if dark else "k"
+            )
+    return figure
+
+
+def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[Array, Array, list[str]]:
+    """Shares (n, columns) of the mean one-step width, that width in recorded units (n,), and the columns' names.
+
+    Columns are states, controls, and what the model has of drift and noise; a row of zeros where the width is 0.
+
+    Raises
+    ------
+    ModelError
+        No recording has a usable transition.
+    """
+    point = model.operating_point
+    total, count = np.zeros(model.n + model.m + 2), 0
+    for transient in transients:
+        steps = transient.transitions()
+        if not len(steps.k):
+            continue
+        count += len(steps.k)
+        z = np.abs(np.hstack([point.normalise_x(steps.x), point.normalise_u(steps.u)]))
+        total += [*(steps.dt @ z), steps.dt.sum(), len(steps.k)]
+    if not count:
+        raise ModelError("no recording has a usable transition, so there is no width to share out")
+    parts = 2.0 * np.hstack([model.dA, model.dB, model.dc[:, None], model.v[:, None]]) * (total / count)
+    columns = [_short(name) for name in (*model.state_names, *model.control_names)]
+    kept = list(range(model.n + model.m))
+    for place, (values, name) in enumerate(((model.dc, "drift"), (model.v, "noise")), start=len(kept)):
+        if values.any():
+            kept.append(place)
+            columns.append(name)
+    width = parts.sum(axis=1)
+    shares = np.divide(parts, width[:, None], out=np.zeros_like(parts), where=width[:, None] > 0)
+    return shares[:, kept], width * point.X, columns
+
+
+def coverage_figure(model: UncertainLTI, checked: Sequence[Verdicts]) -> Any:
+    """Share of the verdicts outside the bounds, per recording: of any state, and state by state."""
+    names = [_short(os.path.basename(v.transient.name) or v.transient.name, 40) for v in checked]
+    outside, of_any, judged = _outside(checked, model.n)
+    rows = [f"{name}  ({_count(n)})" for name, n in zip(names, judged, strict=True)]
+    columns = [_short(name) for name in model.state_names]
+    below, bars = max(_length(columns, len(columns)), 0.55), 2.6
+    label = _length(rows, len(rows))
+    cell = max(0.16, min(0.6, 9.0 / len(columns)))
+    width = max(cell * len(columns), 0.6)
+    height = (0.3 if len(rows) <= 15 else 0.2) * len(rows) + 0.1
+    figure = _figure(label + bars + 0.35 + width + 0.9, height + below + 0.75)
+    total_w, total_h = figure.get_size_inches()
+    axis = figure.add_axes((label / total_w, below / total_h, bars / total_w, height / total_h))
+    places = np.arange(len(rows))
+    axis.barh(places, 100 * np.nan_to_num(of_any), color=VIOLATED, height=0.7)
+    widest = 100 * float(np.nanmax(of_any)) if judged.any() else 0.0
+    axis.set_xlim(0, max(1.45 * widest, 0.01) if widest < 70 else 140)
+    if widest >= 70:
+        axis.set_xticks([0, 50, 100])
+    for place, share, n in zip(places, of_any, judged, strict=True):
+        text = "no verdict" if not n else "none" if share == 0 else f"{100 * share:.3g} %"
+        axis.text(100 * (0.0 if math.isnan(share) else share), place, f" {text}", va="center", fontsize=7)
+    axis.set_yticks(places, rows, fontsize=7 if len(rows) <= _MANY else 5.5)
+    axis.set_ylim(len(rows) - 0.5, -0.5)
+    axis.tick_params(axis="x", labelsize=7)
+    axis.set_xlabel("outside any bound [%]", fontsize=8)
+    axis.spines[["top", "right"]].set_visible(False)
+    left = label + bars + 0.35
+    axis = figure.add_axes((left / total_w, below / total_h, width / total_w, height / total_h))
+    top = max(float(np.nanmax(100 * outside)) if judged.any() else 0.0, 1e-9)
+    colours = _over("Blues")
+    image = axis.imshow(100 * outside, cmap=colours, vmin=0, vmax=top, aspect="auto", interpolation="nearest")
+    _name_cells(axis, [], columns)
+    axis.set_yticks([])
+    axis.set_title("state by state [%]", loc="left", fontsize=8)
+    if outside.size <= 150:
+        for i, j in np.argwhere(np.isfinite(outside)):
+            share = 100 * float(outside[i, j])
+            dark = share > 0.6 * top
+            text = "0" if share == 0 else f"{share:.2g}" if share < 99.5 else "100"
+            axis.text(j, i, text, ha="center", va="center", fontsize=6.5, color="w" if dark and share else "k")
+    if top > 1e-9:
+        bar = figure.add_axes(((left + width + 0.12) / total_w, below / total_h, 0.15 / total_w, height / total_h))
+        figure.colorbar(image, cax=bar)
+        bar.tick_params(labelsize=7)
+    figure.text(
+        0.1 / total_w, 1 - 0.28 / total_h, "recording (verdicts), and the share of them that was violated", fontsize=9
+    )
+    return figure
+
+
+def save(figure: Any, path: str | os.PathLike[str], dpi: int = 110) -> None:
+    """Write a figure to an image file; its ending says the format. Raises OSError."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names may be in any script
+        figure.savefig(path, dpi=dpi)
+
+
+# --- long recordings, by pixel ----------------------------------------------------------------------------------
+
+
+class _Time:
+    """Time axis of a recording: s since the first sample; passes of a looped one stand one behind the other."""
+
+    def __init__(self, transient: Transient) -> None:
+        t = transient.t
+        steps = np.diff(t)
+        self.loops = int((steps < 0).sum())
+        if self.loops:
+            forward = steps[steps > 0]
+            steps[steps < 0] = float(np.median(forward)) if len(forward) else 1.0
+            t = np.concatenate([[0.0], np.cumsum(steps)])
+        self.t: Array = t
+
+    @property
+    def label(self) -> str:
+        return "time [s]" + (f", {self.loops + 1} passes one behind the other" if self.loops else "")
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What of a recording is drawn: its samples, or stretches of time with all of their samples.
+
+    t (P,) s where each stands; starts (P,) its first sample and stop the end of the last; judged, alarm, and after,
+    whether something lies between it and the one before, (P,); edges (P, 2) from where to where it reaches, s.
+    """
+
+    t: Array
+    starts: NDArray[np.intp]
+    stop: int
+    binned: bool
+    judged: Mask
+    alarm: Mask
+    after: Mask
+    edges: Array
+
+    @classmethod
+    def of(cls, verdicts: Verdicts, t: Array, span: tuple[float, float] | None, always: bool = False) -> _Drawn:
+        first, stop = 0, len(t)
+        if span is not None:
+            first, stop = int(np.searchsorted(t, span[0])), int(np.searchsorted(t, span[1], side="right"))
+        here = t[first:stop]
+        count = len(here)
+        broken = np.zeros(count, dtype=bool)
+        broken[1:] = np.diff(verdicts.transient.segment[first:stop]) != 0
+        if count <= 2 * PIXELS and not always:
+            starts = np.arange(first, stop)
+            before = np.concatenate([here[:1], here[:-1]])
+            judged, alarm = verdicts.judged[first:stop], verdicts.alarm[first:stop]
+            return cls(here, starts, stop, False, judged, alarm, broken, np.column_stack([before, here]))
+        low, high = (float(here[0]), float(here[-1])) if count else (0.0, 1.0)
+        cells = np.linspace(low, high if high > low else low + 1.0, min(PIXELS, max(count, 1)) + 1)
+        places = np.searchsorted(here, cells[:-1])
+        ends = np.append(places[1:], count)
+        filled = np.flatnonzero(ends > places)
+        starts = (places[filled] + first).astype(np.intp)
+        any_of = [np.logical_or.reduceat(a[:stop], starts) for a in (verdicts.judged, verdicts.alarm)]
+        centre = (cells[filled] + cells[filled + 1]) / 2
+        after = np.zeros(len(filled), dtype=bool)
+        after[1:] = np.diff(filled) > 1
+        return cls(
+            centre, starts, stop, True, any_of[0], any_of[1], after, np.column_stack([cells[filled], cells[filled + 1]])
+        )
+
+    def least(self, values: Array) -> Array:
+        """Least value of each; NaN only where there is none."""
+        return self._reduced(np.fmin, values)
+
+    def greatest(self, values: Array) -> Array:
+        """Greatest value of each."""
+        return self._reduced(np.fmax, values)
+
+    def _reduced(self, which: np.ufunc, values: Array) -> Array:
+        if not self.binned:
+            return values[self.starts]
+        reduced: Array = which.reduceat(np.ascontiguousarray(values[: self.stop]), self.starts)
+        return reduced
+
+    def worst(self, verdicts: Verdicts, state: int, values: Array) -> tuple[Array, Array, Array]:
+        """Where something of a state is violated: t, the value of the worst sample there, and its utilisation."""
+        flags, utilisation = verdicts.flags[:, state], verdicts.utilisation[:, state]
+        bad = np.flatnonzero(self.greatest(flags) == 1.0)
+        if not self.binned:
+            rows = self.starts[bad]
+        else:
+            ends = np.append(self.starts[1:], self.stop)
+            rows = np.array([_worst_row(flags, utilisation, self.starts[b], ends[b]) for b in bad], dtype=np.intp)
+        return self.t[bad], values[rows], utilisation[rows]
+
+    def broken(self, *values: Array) -> list[Array]:
+        """Times and values with a hole wherever something lies between."""
+        at = np.flatnonzero(self.after)
+        return [np.insert(array, at, np.nan) for array in (self.t, *values)]
+
+    def spans(self, which: Mask) -> list[tuple[float, float]]:
+        """(begin, length) of each run, s."""
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8))).reshape(-1, 2)
+        return [(float(self.edges[a, 0]), float(self.edges[b - 1, 1] - self.edges[a, 0])) for a, b in edges]
+
+
+def _worst_row(flags: Array, utilisation: Array, start: int, stop: int) -> int:
+    """The violated sample that lies farthest out."""
+    rows = np.flatnonzero(flags[start:stop] == 1.0) + start
+    return int(rows[np.argmax(np.abs(utilisation[rows]))])
+
+
+def _outside(checked: Sequence[Verdicts], n: int) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Shares of the verdicts violated (recordings, n), of any state (recordings,), and the verdicts."""
+    judged = np.array([int(v.judged.sum()) for v in checked], dtype=np.int64)
+    outside, of_any = np.full((len(checked), n), np.nan), np.full(len(checked), np.nan)
+    for row, (v, count) in enumerate(zip(checked, judged, strict=True)):
+        if count:
+            outside[row] = (v.flags == 1.0).sum(axis=0) / count
+            of_any[row] = v.violated.sum() / count
+    return outside, of_any, judged
+
+
+# --- pieces -----------------------------------------------------------------------------------------------------
+
+
+def _chosen(model: UncertainLTI, states: Sequence[str] | None) -> list[int]:
     names = list(model.state_names if states is None else states)
     for name in names:
         if name not in model.state_names:
             raise ModelError(f"there is no state '{name}' to draw; states are {', '.join(model.state_names)}")
-    t = verdicts.transient.t
-    figure = Figure(figsize=(11, 1.2 + 2.6 * len(names)), layout="constrained")
+    return [model.state_names.index(name) for name in names]
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
-    axes: Any = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-    broken = np.flatnonzero(np.diff(verdicts.transient.segment) > 0) + 1
-    for axis, name in zip(axes, names, strict=True):
-        i = model.state_names.index(name)
-        lower, upper = verdicts.lower[:, i], verdicts.upper[:, i]
-        axis.fill_between(t, lower, upper, color=ENVELOPE, alpha=0.55, linewidth=0.4, label="one-step bounds")
-        axis.plot(*_broken(t, verdicts.transient.x[:, i], broken), color=RECORDED, linewidth=0.9, label="recorded")
-        bad = verdicts.flags[:, i] == 1.0
-        if bad.any():
+    return figure
+
+
+def _panels(count: int, height: float = 1.45) -> tuple[Any, list[Any]]:
+    """One panel per state; many in two columns."""
+    columns = 1 if count <= _FEW else 2
+    rows = math.ceil(count / columns)
+    if columns == 2:
+        height = min(height, 0.8)
+    left, gap, top, bottom, title = 0.75, 0.75, 0.5, 0.5, 0.3
+    width = (_WIDTH - left - 0.15 - (columns - 1) * gap) / columns
+    figure = _figure(_WIDTH, top + bottom + rows * (height + title))
+    total = figure.get_size_inches()[1]
+    axes: list[Any] = []
+    for i in range(count):
+        column, row = divmod(i, rows)
+        x, y = left + column * (width + gap), bottom + (rows - 1 - row) * (height + title)
+        axes.append(
+            figure.add_axes((x / _WIDTH, y / total, width / _WIDTH, height / total), sharex=axes[0] if axes else None)
+        )
+        last = row == rows - 1 or i == count - 1
+        axes[-1].tick_params(labelbottom=last, labelsize=7)
+        if last:
+            axes[-1].set_xlabel("time [s]", fontsize=8)
+    return figure, axes
+
+
+def _utilisation_map(
+    model: UncertainLTI, verdicts: Verdicts, chosen: Sequence[int], axis_time: _Time, drawn: _Drawn
+) -> Any:
+    names = [_short(model.state_names[i]) for i in chosen]
+    label = _length(names, 0)
+    height = 0.19 * len(names)
+    figure = _figure(_WIDTH, height + 1.35)
+    total = figure.get_size_inches()[1]
+    axis = figure.add_axes((label / _WIDTH, 0.5 / total, (_WIDTH - label - 0.9) / _WIDTH, height / total))
+    edge = np.unique(drawn.edges)
+    column = np.searchsorted(edge, drawn.edges[:, 0])
+    values = np.full((len(chosen), max(len(edge) - 1, 1)), np.nan)
+    for row, i in enumerate(chosen):
+        u = verdicts.utilisation[:, i]
+        worst = np.fmax(np.abs(drawn.least(u)), np.abs(drawn.greatest(u)))
+        bad = drawn.greatest(verdicts.flags[:, i]) == 1.0
+        values[row, column] = np.where(bad, 2.0, np.minimum(worst, 1.0))
+    mesh = axis.pcolormesh(
+        edge if len(edge) > 1 else [0.0, 1.0], np.arange(len(chosen) + 1), np.ma.masked_invalid(values),
+        cmap=_over("Blues"), vmin=0.0, vmax=1.0, rasterized=True,
+    )  # fmt: skip
+    axis.set_yticks(np.arange(len(chosen)) + 0.5, names, fontsize=7)
+    axis.set_ylim(len(chosen), 0)
+    axis.tick_params(axis="x", labelsize=7)
+    axis.set_xlabel(axis_time.label, fontsize=8)
+    bar = figure.add_axes(((_WIDTH - 0.75) / _WIDTH, 0.5 / total, 0.15 / _WIDTH, height / total))
+    figure.colorbar(mesh, cax=bar, extend="max")
+    bar.tick_params(labelsize=7)
+    bar.set_title("|utilisation|", fontsize=7)
+    return _head(figure, verdicts, [_patch(VIOLATED, 1.0, "violated"), _patch("#FFFFFF", 1.0, "no verdict")])
+
+
+def _with_additive(model: UncertainLTI) -> tuple[Array, Array, list[str]]:
+    """Nominal elements and half-widths (n, columns), with what the model has of drift and noise."""
+    nominal, half = [model.A, model.B], [model.dA, model.dB]
+    columns = [_short(name) for name in (*model.state_names, *model.control_names)]
+    if model.c.any() or model.dc.any():
+        nominal.append(model.c[:, None])
+        half.append(model.dc[:, None])
+        columns.append("c (drift)")
+    if model.v.any():
+        nominal.append(np.zeros((model.n, 1)))
+        half.append(model.v[:, None])
+        columns.append("v (noise)")
+    return np.hstack(nominal), np.hstack(half), columns
+
+
+def _name_cells(axis: Any, rows: Sequence[str], columns: Sequence[str]) -> None:
+    size = 7 if max(len(rows), len(columns)) <= _MANY else 5.5
+    axis.set_xticks(range(len(columns)), columns, rotation=90, fontsize=size)
+    axis.set_yticks(range(len(rows)), rows, fontsize=size)
+    axis.tick_params(length=2)
+
+
+def _number_cells(axis: Any, values: Array, image: Any) -> None:
+    for i, j in np.argwhere(values != 0.0):
+        red, green, blue, _ = image.cmap(image.norm(values[i, j]))
+        dark = 0.3 * red + 0.6 * green + 0.1 * blue < 0.5
+        axis.text(j, i, _brief(values[i, j]), ha="center", va="center", fontsize=6.5, color="w" if dark else "k")
+
+
+def _brief(value: float) -> str:
+    if 1e-3 <= abs(value) < 1e4:
+        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def _limits(lower: Array, upper: Array) -> tuple[float, float]:
+    """Of an axis: everything, unless a few far values would flatten the rest; those are then marked at its edge."""
+    lower, upper = lower[np.isfinite(lower)], upper[np.isfinite(upper)]
+    if not len(lower) or not len(upper):
+        return 0.0, 1.0
+    bottom, top = float(lower.min()), float(upper.max())
+    low, high = float(np.quantile(lower, 0.02)), float(np.quantile(upper, 0.98))
+    if top - bottom > 8.0 * (high - low) > 0.0:
+        bottom, top = max(bottom, low - (high - low)), min(top, high + (high - low))
+    room = 0.08 * (top - bottom) or 0.05 * max(abs(top), 1e-12)
+    return bottom - room, top + room
+
+
+def _mark(axis: Any, t: Array, values: Array, utilisation: Array, bottom: float, top: float, points: int) -> None:
+    """A mark on each, and one at the edge of the panel for what lies beyond it; a line of them below all."""
+    if not len(t):
+        return
+    size = 3.5 if len(t) <= 150 else 2.0 if len(t) <= 600 else 1.2
+    values = np.where(np.isfinite(values), values, np.where(utilisation > 0, top, bottom))
+    for which, marker in ((values > top, "^"), (values < bottom, "v"), ((values <= top) & (values >= bottom), "o")):
+        if which.any():
+            shown = np.clip(values[which], bottom, top)
             axis.plot(
-                t[bad],
-                verdicts.transient.x[bad, i],
-                linestyle="none",
-                marker="o",
-                markersize=3.5,
-                color=VIOLATED,
-                label=f"violated ({int(bad.sum())})",
+                t[which], shown, linestyle="none", marker=marker, markersize=size if marker == "o" else 5,
+                color=VIOLATED, markeredgewidth=0, clip_on=marker == "o", zorder=3,
+            )  # fmt: skip
+    axis.plot(
+        t, np.full(len(t), 0.025), "|", color=VIOLATED, markersize=5, markeredgewidth=1.0 if len(t) > 300 else 1.4,
+        transform=axis.get_xaxis_transform(), zorder=3,
+    )  # fmt: skip
+
+
+def _shade(axis: Any, drawn: _Drawn) -> None:
+    silent = ~drawn.judged | drawn.after
+    silent[:1] = False
+    low, length = (drawn.edges[0, 0], drawn.edges[-1, 1] - drawn.edges[0, 0]) if len(drawn.t) else (0.0, 1.0)
+    holes = [
+        (float(a), float(b - a))
+        for a, b in zip(drawn.edges[:-1, 1], drawn.edges[1:, 0], strict=True)
+        if b - a > 1e-9 * length
+    ]
+    for spans, colour, alpha in (
+        (drawn.spans(drawn.alarm), ALARM, 0.45),
+        ((drawn.spans(silent) if not drawn.binned else drawn.spans(~drawn.judged)) + holes, NO_VERDICT, 0.35),
+    ):
+        if spans:
+            least = length / (2 * PIXELS)  # wide enough to be seen
+            wide = [(begin, max(extent, least)) for begin, extent in spans]
+            axis.broken_barh(
+                wide, (0, 1), transform=axis.get_xaxis_transform(), color=colour, alpha=alpha, linewidth=0, zorder=0
             )
-        _shade(axis, t, verdicts.alarm)
+    axis.set_xlim(low - 0.01 * length, low + 1.01 * length)
+
+
+def _title(axis: Any, model: UncertainLTI, i: int, verdicts: Verdicts, drawn: _Drawn, unit: bool = True) -> None:
+    signal = model.signals.states[i]
+    first = int(drawn.starts[0]) if len(drawn.starts) else 0
+    bad = int((verdicts.flags[first : drawn.stop, i] == 1.0).sum())
+    wide = axis.get_position().width > 0.6
+    text, size = _short(signal.name, 70 if wide else 30), 8 if wide else 7
+    if unit and signal.unit:
+        text += f" [{_plain(signal.unit)}]"
+    axis.set_title(text, loc="left", fontsize=size, pad=3)
+    if bad:
+        axis.set_title(f"violated {_count(bad)}", loc="right", fontsize=size, pad=3, color=VIOLATED)
+
+
+def _ticks(axis: Any) -> None:
+    axis.grid(alpha=0.25, linewidth=0.5)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(axis="y", labelsize=7)
+
+
+def _finish_time(
+    figure: Any, axes: Sequence[Any], axis_time: _Time, drawn: _Drawn, event: tuple[float, str] | None
+) -> None:
+    for axis in axes:
+        if axis.get_xlabel():
+            axis.set_xlabel(axis_time.label, fontsize=8)
         if event is not None:
             axis.axvline(event[0], color=RECORDED, linestyle="--", linewidth=1.0)
-        unit = model.signals.states[i].unit
-        axis.set_ylabel(name.replace("_", " ") + (f" [{unit}]" if unit else ""))
-        axis.margins(x=0.01)
-        if span is not None:
-            shown = (t >= span[0]) & (t <= span[1])
-            values = np.concatenate([lower[shown], upper[shown], verdicts.transient.x[shown, i]])
-            low, high = np.nanmin(values), np.nanmax(values)
-            axis.set_xlim(*span)
-            axis.set_ylim(low - 0.08 * (high - low), high + 0.25 * (high - low))
-        axis.grid(alpha=0.25)
-        axis.legend(loc="upper left", fontsize="small", ncols=4)
-    if event is not None:
+    if event is not None and axes:
         axes[0].annotate(
-            event[1], (event[0], 1.0), xycoords=("data", "axes fraction"), xytext=(4, 4), textcoords="offset points"
-        )
-    axes[-1].set_xlabel("time [s]")
+            _plain(event[1]), (event[0], 1.0), xycoords=("data", "axes fraction"), xytext=(4, -10),
+            textcoords="offset points", fontsize=8,
+        )  # fmt: skip
+
+
+def _head(figure: Any, verdicts: Verdicts, handles: list[Any]) -> Any:
     judged = int(verdicts.judged.sum())
-    inside = 1.0 - verdicts.violated.sum() / judged if judged else float("nan")
-    figure.suptitle(f"{os.path.basename(verdicts.transient.name)}: {judged} verdicts, {inside:.2%} inside all bounds")
-    figure.savefig(path, dpi=120)
+    total = figure.get_size_inches()[1]
+    bad = int(verdicts.violated.sum())
+    said = (
+        f"{_count(bad)} violated ({100 * bad / judged:.3g} %)"
+        if bad
+        else "none violated"
+        if judged
+        else "nothing is known"
+    )
+    name = _short(os.path.basename(verdicts.transient.name) or verdicts.transient.name, 60)
+    figure.text(0.1 / _WIDTH, 1 - 0.22 / total, f"{name}: {_count(judged)} verdicts, {said}", fontsize=9)
+    figure.legend(
+        handles=handles, loc="upper right", ncols=len(handles), fontsize=7, frameon=False, borderaxespad=0.1,
+        bbox_to_anchor=(0.99, 1 - 0.24 / total),
+    )  # fmt: skip
+    return figure
 
 
-def _broken(t: NDArray[Any], values: NDArray[Any], at: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The same line with a hole before each of the positions `at`."""
-    return np.insert(t, at, np.nan), np.insert(values, at, np.nan)
+def _patch(colour: str, alpha: float, label: str) -> Any:
+    from matplotlib.patches import Patch
+
+    return Patch(facecolor=colour, alpha=alpha, label=label, edgecolor="#999999", linewidth=0.3)
 
 
-def _shade(axis: Any, t: NDArray[Any], alarm: NDArray[np.bool_]) -> None:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], alarm, [False]]).astype(np.int8))).reshape(-1, 2)
-    for number, (start, stop) in enumerate(edges):
-        axis.axvspan(
-            t[start],
-            t[min(stop, len(t) - 1)],
-            color=ALARM,
-            alpha=0.25,
-            linewidth=0,
-            label="alarm" if not number else None,
-        )
+def _line(colour: str, label: str, marker: str = "") -> Any:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=colour, label=label, marker=marker, markersize=4, linewidth=0 if marker else 1)
+
+
+def _over(name: str) -> Any:
+    from matplotlib import colormaps
+
+    return colormaps[name].with_extremes(over=VIOLATED, bad="#FFFFFF")
+
+
+def _no_ticks() -> Any:
+    from matplotlib.ticker import NullLocator
+
+    return NullLocator()
+
+
+def _count(number: int) -> str:
+    """12 345."""
+    return f"{number:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def _length(names: Sequence[str], crowd: int) -> float:
+    """Room for the longest of these, inches; less where there are many and they are written smaller."""
+    return (0.068 if crowd <= _MANY else 0.055) * max(map(len, names), default=0) + 0.15
+
+
+def _plain(text: str) -> str:
+    """Text of a file, which is never a formula and never a line break."""
+    return " ".join(text.split()).replace("$", r"\$")
+
+
+def _short(text: str, longest: int = _LONGEST_NAME) -> str:
+    """A name with its middle left out where it is long."""
+    text = " ".join(text.split())
+    if len(text) > longest:
+        text = f"{text[: longest // 2]}…{text[len(text) - longest // 2 + 1 :]}"
+    return text.replace("$", r"\$")

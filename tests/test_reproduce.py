@@ -65,13 +65,13 @@ def test_the_direct_search_refuses_what_it_cannot_do():
 
 
 def test_the_published_model_can_be_checked_simulated_and_drawn(tmp_path):
-    from uncertain_lti.plots import envelope_figure
+    from uncertain_lti.plots import envelope_figure, save
 
     model, run = leibov2006(), transient(300, 3)
     verdicts = EnvelopeMonitor(model).check(run)
     assert not verdicts.violated.any()
     assert model.simulate(run.x[0], run.u[:-1], run.dt).shape == run.x.shape
-    envelope_figure(model, verdicts, tmp_path / "f.png")
+    save(envelope_figure(model, verdicts), tmp_path / "f.png")
     assert (tmp_path / "f.png").stat().st_size > 10_000
     narrower = UncertainLTI(model.A, model.B, 0.5 * model.dA, 0.5 * model.dB, signals=model.signals)
     assert EnvelopeMonitor(narrower).check(replace_name(run)).violated.any()

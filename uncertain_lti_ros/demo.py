@@ -21,7 +21,7 @@ from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.errors import BagError, UncertainLTIError
 from uncertain_lti.model import Alarm
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
-from uncertain_lti.plots import envelope_figure
+from uncertain_lti.plots import budget_figure, envelope_figure, matrices_figure, save, utilisation_figure
 from uncertain_lti.reading import read_for_model
 from uncertain_lti.report import check_data, check_text, fit_text
 from uncertain_lti_ros.process import Life, living
@@ -88,8 +88,15 @@ def run(args: argparse.Namespace) -> int:
         + (f"{raised[0] - t:.3f} s after that" if len(raised) and raised[0] >= t else "too early or not at all")
     )
     event = (t, what)
-    for name, span in (("envelope.png", None), ("envelope_close.png", (t - 1.5, t + 1.5))):
-        envelope_figure(model, offline, output / name, states=SHOWN, event=event, span=span)
+    figures = {
+        "envelope.png": envelope_figure(model, offline, states=SHOWN, event=event),
+        "envelope_close.png": envelope_figure(model, offline, states=SHOWN, event=event, span=(t - 1.5, t + 1.5)),
+        "utilisation.png": utilisation_figure(model, offline, states=SHOWN),
+        "matrices.png": matrices_figure(model),
+        "width_budget.png": budget_figure(model, transients),
+    }
+    for name, figure in figures.items():
+        save(figure, output / name)
         print(f"figure: {output / name}")
     return 0 if same == len(expected) and len(raised) and raised[0] >= t else 2
 

@@ -1,0 +1,141 @@
+"""Figures: what they must not hide, and that they can be drawn at both extremes of size."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti.errors import ModelError
+from uncertain_lti.plots import (
+    PIXELS,
+    _Drawn,
+    _Time,
+    budget_figure,
+    coverage_figure,
+    envelope_figure,
+    matrices_figure,
+    save,
+    utilisation_figure,
+    width_budget,
+)
+from uncertain_lti.signals import Signal, SignalMap
+
+LONG = "x_$the$_total <pressure>\nbehind_the_high_pressure_compressor_état_"
+
+
+def by_hand(n, m, name="x", width=1.0):
+    rng = np.random.default_rng(n)
+    states = tuple(Signal(name=f"{name}{i}", topic="/s", field=f"data[{i}]", unit="$kPa$", scale=2.0) for i in range(n))
+    controls = tuple(Signal(name=f"u{i}", topic="/c", field=f"data[{i}]") for i in range(m))
+    return UncertainLTI(
+        -np.eye(n),
+        rng.normal(size=(n, m)),
+        width * np.abs(rng.normal(size=(n, n))),
+        width * np.abs(rng.normal(size=(n, m))),
+        dc=np.full(n, 0.1 * width),
+        v=np.full(n, 0.01 * width),
+        signals=SignalMap(states=states, controls=controls),
+    )
+
+
+def checked(model, count, jumps=(), gaps=(), back=(), unknown=()):
+    """A quiet run that jumps at some samples, with pauses before others, and where time steps back."""
+    rng = np.random.default_rng(count)
+    step = np.full(count, 10**7, dtype=np.int64)
+    step[list(gaps)] = 10**9
+    step[list(back)] = -(10**9)
+    x = 0.01 * rng.normal(size=(count, model.n))
+    for k in jumps:
+        x[k, k % model.n] += 100.0
+    x[list(unknown)] = math.nan
+    u = np.zeros((count, model.m))
+    return EnvelopeMonitor(model).check(Transient(10**18 + np.cumsum(step), x, u, name="/tmp/$a$.mcap", max_gap=0.1))
+
+
+@given(
+    count=st.integers(2 * PIXELS + 1, 40_000),
+    jumps=st.lists(st.integers(1, 2 * PIXELS), max_size=20),
+    gaps=st.lists(st.integers(1, 2 * PIXELS), max_size=4),
+    back=st.lists(st.integers(1, 2 * PIXELS), max_size=1),
+)
+def test_no_violation_is_hidden_in_a_long_recording(count, jumps, gaps, back):
+    """Every violated sample lies in a stretch that is marked, and every extreme is drawn."""
+    model = by_hand(3, 1)
+    verdicts = checked(model, count, jumps, gaps, back)
+    drawn = _Drawn.of(verdicts, _Time(verdicts.transient).t, None)
+    assert drawn.binned and len(drawn.t) <= PIXELS
+    ends = np.append(drawn.starts[1:], drawn.stop)
+    for i in range(3):
+        x = verdicts.transient.x[:, i]
+        marked, value, _ = drawn.worst(verdicts, i, x)
+        bad = {
+            int(np.searchsorted(drawn.starts, k, side="right")) - 1 for k in np.flatnonzero(verdicts.flags[:, i] == 1)
+        }
+        assert marked.tolist() == drawn.t[sorted(bad)].tolist()
+        for b, worst in zip(sorted(bad), value, strict=True):
+            rows = np.arange(drawn.starts[b], ends[b])
+            utilisation = np.abs(verdicts.utilisation[rows, i])
+            assert worst == x[rows[np.nanargmax(utilisation)]]
+        assert np.nanmax(drawn.greatest(x)) == x.max() and np.nanmin(drawn.least(x)) == x.min()
+    assert drawn.alarm.any() == verdicts.alarm.any()
+
+
+@pytest.mark.parametrize("n,count", [(1, 1), (1, 2), (5, 100), (5, 50_000), (9, 300), (50, 5000)])
+@pytest.mark.parametrize("jumps", ["none", "some", "all"])
+def test_every_size_can_be_drawn(n, count, jumps, tmp_path):
+    model = by_hand(n, 20 if n == 50 else 3, LONG)
+    at = {"none": (), "some": range(1, count, 50), "all": range(1, count)}[jumps]
+    verdicts = checked(model, count, at, gaps=[count // 2], unknown=[count // 3] if count > 10 else ())
+    for make in (envelope_figure, utilisation_figure):
+        figure = make(model, verdicts)
+        save(figure, tmp_path / "f.png", 50)
+        assert (tmp_path / "f.png").stat().st_size > 1000
+        if count > 4:
+            save(make(model, verdicts, span=(0.01, 0.03)), tmp_path / "f.svg")
+    with pytest.raises(ModelError, match="no state 'other'"):
+        envelope_figure(model, verdicts, states=["other"])
+
+
+def test_a_panel_says_what_it_shows():
+    model = by_hand(2, 1)
+    verdicts = checked(model, 200, jumps=[51, 52])
+    axes = envelope_figure(model, verdicts, states=["x1"]).axes
+    assert len(axes) == 1 and axes[0].get_title("left") == r"x1 [\$kPa\$]"
+    assert axes[0].get_title("right") == f"violated {int((verdicts.flags[:, 1] == 1).sum())}"
+    assert axes[0].get_xlabel() == "time [s]"
+    looped = checked(model, 200, back=[100])
+    assert "2 passes" in envelope_figure(model, looped).axes[-1].get_xlabel()
+
+
+@pytest.mark.parametrize("n", [2, 50])
+@pytest.mark.parametrize("width", [0.0, 1.0])
+def test_matrices_budget_and_coverage(n, width, tmp_path):
+    model = by_hand(n, 4, LONG, width)
+    runs = [checked(model, 60, jumps=[7] * (k % 2)) for k in range(40 if n == 50 else 1)]
+    nothing = checked(model, 1)
+    figures = (
+        matrices_figure(model),
+        budget_figure(model, [v.transient for v in runs]),
+        coverage_figure(model, [*runs, nothing]),
+        coverage_figure(model, [nothing]),
+    )
+    for k, figure in enumerate(figures):
+        save(figure, tmp_path / f"{k}.png", 40)
+    with pytest.raises(ModelError, match="no usable transition|no recording"):
+        budget_figure(model, [nothing.transient])
+
+
+def test_the_budget_is_the_width_that_a_check_gives():
+    """Its shares are of the mean of upper - lower, over several recordings together."""
+    model = by_hand(4, 2)
+    runs = [checked(model, count, gaps=[9]) for count in (50, 300)]
+    shares, width, columns = width_budget(model, [v.transient for v in runs])
+    assert columns == ["x0", "x1", "x2", "x3", "u0", "u1", "drift", "noise"]
+    assert np.allclose(shares.sum(axis=1), 1.0)
+    judged = np.vstack([(v.upper - v.lower)[v.judged] for v in runs])
+    assert np.allclose(width, judged.mean(axis=0), rtol=1e-9)
+    assert (shares[:, 4:6] == 0).all()  # no control was given
+    assert np.allclose(shares[:, 7] * width, 2 * model.v * 2.0)
