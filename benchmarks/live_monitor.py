@@ -22,6 +22,7 @@ import argparse
 import json
 import os
 import random
+import signal
 import subprocess
 import sys
 import tempfile
@@ -447,6 +448,14 @@ def soak(seconds: float, rate: float, n: int) -> dict[str, Any]:
             publisher.line()
             began, memory = time.perf_counter(), []
             warm = min(60.0, seconds / 3)
+            time.sleep(warm / 3)
+            # Queues take their memory when something stands still for the first time, and never again: that is part
+            # of the warm-up, whether or not this machine stalls a process by itself later.
+            for child in (hearer, subject):
+                child.process.send_signal(signal.SIGSTOP)
+                time.sleep(0.6)
+                child.process.send_signal(signal.SIGCONT)
+                time.sleep(1.0)
             while (now := time.perf_counter() - began) < seconds - 1.0:
                 time.sleep(min(10.0, seconds / 12))
                 if now > warm:

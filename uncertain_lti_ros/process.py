@@ -15,6 +15,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 _PATIENCE = 0.1  # s that a signal waits at most
+_SPELL = 30.0  # s between two looks at whether rclpy has been shut down by somebody else
 _RESPITE = 0.01  # s of rest after an error, which may come again at once
 
 
@@ -30,6 +31,7 @@ class Life:
     def __init__(self, node: Node, stop: list[int]) -> None:
         self.node = node
         self._stop = stop
+        self._end: Future | None = None
         try:
             from rclpy.experimental import EventsExecutor
 
@@ -50,28 +52,45 @@ class Life:
         self.executor.spin_once(timeout_sec=min(seconds, _PATIENCE))
 
     def spin(self, note: Callable[[str, Exception], None]) -> None:
-        """Work until the end; an error that a callback lets through is noted, and the work goes on."""
-        never: Future = Future(executor=self.executor)
+        """Work until the end; an error that a callback lets through is noted, and the work goes on.
+
+        The node must have a timer: a signal is seen when Python comes to run.
+        """
         while self.alive:
+            self._end = Future(executor=self.executor)
             try:
-                # As `spin_once`, for as many callbacks as there are: the way back here costs 8 µs for each.
-                self.executor.spin_until_future_complete(never, timeout_sec=_PATIENCE)
+                # As `spin_once`, for as many callbacks as there are: the way back here costs 8 µs for each. And
+                # seldom: in some releases each of these calls costs 32 bytes that never come back.
+                self.executor.spin_until_future_complete(self._end, timeout_sec=_SPELL)
             except Exception as error:
                 if self.alive:
                     note("in the executor", error)
                     time.sleep(_RESPITE)
+
+    def end(self) -> None:
+        """Come back from `spin` as soon as may be: a signal has come."""
+        if self._end is not None and not self._end.done():
+            self._end.set_result(None)
 
 
 @contextmanager
 def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
     """Start rclpy (on these arguments, or those of the process), make the node, and put all away at the end."""
     stop: list[int] = []
-    before = {name: signal.signal(name, lambda number, _: stop.append(number)) for name in _SIGNALS}
+    lives: list[Life] = []
+
+    def end(number: int, _: Any) -> None:
+        stop.append(number)
+        for life in lives:
+            life.end()
+
+    before = {name: signal.signal(name, end) for name in _SIGNALS}
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
         node = make_node()
-        yield Life(node, stop)
+        lives.append(Life(node, stop))
+        yield lives[0]
     finally:
         if node is not None:
             node.destroy_node()
