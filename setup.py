@@ -26,7 +26,7 @@ extras = {
     "fit": ["cvxpy", "daqp", "highspy", "osqp>=1", "piqp", "scipy"],
     "cluster": ["distributed"],
     "frames": ["pandas"],
-    "plots": ["matplotlib"],
+    "plots": ["matplotlib", "pillow"],
     # To and from python-control; MATLAB files take scipy alone.
     "control": ["control", "scipy"],
     # The pages in docs/, built by `./run docs`.

@@ -59,7 +59,7 @@ _EXTRAS = {
     **dict.fromkeys(("cvxpy", "osqp", "daqp", "piqp", "highspy", "scipy"), _FIT),
     **dict.fromkeys(("rclpy", "std_msgs", "sensor_msgs", "rosgraph_msgs", "std_srvs", "uncertain_lti_ros"), _ROS),
     "distributed": "install what a cluster needs: pip install 'uncertain-lti-ros[cluster]'",
-    "matplotlib": "install what figures need: pip install 'uncertain-lti-ros[plots]'",
+    **dict.fromkeys(("matplotlib", "PIL"), "install what figures need: pip install 'uncertain-lti-ros[plots]'"),
 }
 
 
@@ -151,6 +151,18 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
         help="write a copy of the recording with bounds, utilisation and flags on topics of their own; "
         "for several recordings a folder",
     )
+
+    report = command(
+        "report",
+        _report,
+        "write a page that says whether a model may be relied on, and what happened in recordings",
+        silent,
+        "say what took how long",
+    )
+    report.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
+    report.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders to check against it")
+    report.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
+    report.add_argument("--json", action="store_true", help="print the same facts as JSON")
 
     validate = command(
         "validate",
@@ -414,6 +426,34 @@ def _check(options: argparse.Namespace) -> int:
     if options.json:
         _print_json({"model": options.model, "alarm": any(r["alarm"] for r in results), "recordings": results})
     return ALARM if any(r["alarm"] for r in results) else DONE
+
+
+def _report(options: argparse.Namespace) -> int:
+    from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.bag import group_recordings
+    from uncertain_lti.findings import findings, page_target
+    from uncertain_lti.reading import read_for_model
+    from uncertain_lti.report import findings_text
+
+    model = _named(options.model)
+    bags = group_recordings(options.bags)
+    output = page_target(options.output or (None if options.json else "report.html"), options.model, bags)
+    monitor = EnvelopeMonitor(model)
+    checked = []
+    for bag in bags:
+        transient = read_for_model(bag, model, options.progress.iterate("reading"))
+        _say(options, transient.notes)
+        checked.append(monitor.check(transient))
+    facts = findings(model, options.model, checked, monitor.rule)
+    _tell(options, findings_text(facts))
+    if output is not None:
+        from uncertain_lti.html_report import html_report, write_page
+
+        write_page(output, html_report(model, checked, facts, options.progress.iterate("drawing", "sections")))
+        _tell(options, f"report written to {output}")
+    if options.json:
+        _print_json(facts)
+    return ALARM if facts["alarm"] else DONE
 
 
 def _validate(options: argparse.Namespace) -> int:

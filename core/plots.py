@@ -12,7 +12,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -321,8 +321,8 @@ def coverage_figure(model: UncertainLTI, checked: Sequence[Verdicts]) -> Any:
     return figure
 
 
-def save(figure: Any, path: str | os.PathLike[str], dpi: int = 110) -> None:
-    """Write a figure to an image file; its ending says the format. Raises OSError."""
+def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) -> None:
+    """Write a figure to an image file, whose ending says the format, or as PNG to a stream. Raises OSError."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names may be in any script
         figure.savefig(path, dpi=dpi)
@@ -609,6 +609,7 @@ def _shade(axis: Any, drawn: _Drawn) -> None:
             axis.broken_barh(
                 wide, (0, 1), transform=axis.get_xaxis_transform(), color=colour, alpha=alpha, linewidth=0, zorder=0
             )
+    length = length or 1.0
     axis.set_xlim(low - 0.01 * length, low + 1.01 * length)
 
 
@@ -626,6 +627,15 @@ def _title(axis: Any, model: UncertainLTI, i: int, verdicts: Verdicts, drawn: _D
 
 
 def _ticks(axis: Any) -> None:
+    from matplotlib.ticker import FuncFormatter, ScalarFormatter
+
+    greatest = max(map(abs, axis.get_ylim()))
+    if 1e-3 <= greatest < 1e8:
+        plain = ScalarFormatter(useOffset=False)
+        plain.set_scientific(False)
+        axis.yaxis.set_major_formatter(plain)
+    else:
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
     axis.grid(alpha=0.25, linewidth=0.5)
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(axis="y", labelsize=7)
@@ -697,7 +707,7 @@ def _count(number: int) -> str:
 
 def _length(names: Sequence[str], crowd: int) -> float:
     """Room for the longest of these, inches; less where there are many and they are written smaller."""
-    return (0.068 if crowd <= _MANY else 0.055) * max(map(len, names), default=0) + 0.15
+    return (0.06 if crowd <= _MANY else 0.048) * max(map(len, names), default=0) + 0.15
 
 
 def _plain(text: str) -> str:

@@ -388,3 +388,12 @@ def _interval(low: float, high: float | None) -> str:
     if high is None:
         return "unknown"
     return f"{number(low if low > 1e-4 * high else 0.0)} to {number(high)}"
+
+
+def findings_text(facts: dict[str, Any]) -> str:
+    """The answers of `findings.findings`, with the reasons, for a person."""
+    lines = [f"may I rely on it? {facts['rely']['answer']}"]
+    lines += [f"  {r['weight']}: {r['text']}" for r in facts["rely"]["reasons"]]
+    lines.append("what happened?")
+    lines += [f"  {h['recording']}: {h['text']}" for h in facts["happened"]]
+    return "\n".join(lines)

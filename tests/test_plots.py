@@ -83,7 +83,9 @@ def test_no_violation_is_hidden_in_a_long_recording(count, jumps, gaps, back):
     assert drawn.alarm.any() == verdicts.alarm.any()
 
 
-@pytest.mark.parametrize("n,count", [(1, 1), (1, 2), (5, 100), (5, 50_000), (9, 300), (50, 5000)])
+@pytest.mark.parametrize(
+    "n,count", [(1, 1), (1, 2), (5, 100), (5, 50_000), (9, 300), pytest.param(50, 5000, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("jumps", ["none", "some", "all"])
 def test_every_size_can_be_drawn(n, count, jumps, tmp_path):
     model = by_hand(n, 20 if n == 50 else 3, LONG)

@@ -1,0 +1,443 @@
+"""The report as one HTML page that needs nothing else: no script, no other file; figures are inside it.
+
+Whatever comes from a file (names, units, notes, messages) is text and never HTML: every value passes `html.escape`, and
+the page forbids scripts and other resources besides.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from html import escape
+from typing import Any
+
+from PIL import Image  # which matplotlib brings
+
+from uncertain_lti import plots
+from uncertain_lti.bag_arrays import Progress
+from uncertain_lti.errors import BagError, ModelError
+from uncertain_lti.files import whole_file
+from uncertain_lti.findings import APART, CARE, NO, YES
+from uncertain_lti.model import UncertainLTI
+from uncertain_lti.monitor import Verdicts
+from uncertain_lti.report import number
+
+MOST_DRAWN = 8
+"""Recordings with figures of their own; those with most violations."""
+_MOST_STATES = 8
+_MOST_ROWS = 40
+_DPI = 105
+_COLOURS = 96
+
+_ANSWER = {YES: "Yes", CARE: "With care", NO: "No"}
+_STATE = {"quiet": "nothing", "violations": "violations", "alarm": "alarm", "unknown": "no verdict"}
+
+_STYLE = """
+:root { --line: #d5d9de; --ink: #1b1f24; --soft: #57606a; --good: #00684a; --care: #8a5a00; --bad: #a83b00; }
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 1060px; padding: 1.2rem; color: var(--ink); background: #fff;
+  font: 15px/1.5 system-ui, "Segoe UI", "Liberation Sans", sans-serif; overflow-wrap: anywhere; }
+h1 { font-size: 1.35rem; margin: 0 0 .2rem; } h2 { font-size: 1.1rem; margin: 2rem 0 .5rem; padding-top: .6rem;
+  border-top: 1px solid var(--line); } h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
+p { margin: .4rem 0; } .soft { color: var(--soft); } code { font-family: ui-monospace, monospace; font-size: .85em; }
+.cards { display: grid; grid-template-columns: 1fr 1fr; gap: 1rem; margin-top: .8rem; }
+.card { border: 1px solid var(--line); border-top: 5px solid var(--soft); border-radius: 4px; padding: .7rem 1rem; }
+.card h2 { border: 0; margin: 0; padding: 0; font-size: .95rem; color: var(--soft); font-weight: 600; }
+.answer { font-size: 1.7rem; font-weight: 700; line-height: 1.25; margin: 0 0 .3rem; }
+.good { border-top-color: var(--good); } .care { border-top-color: var(--care); } .bad { border-top-color: var(--bad); }
+.good > .answer, b.good { color: var(--good); } .care > .answer, b.care { color: var(--care); }
+.bad > .answer, b.bad { color: var(--bad); }
+ul { margin: .3rem 0; padding-left: 0; list-style: none; } li { margin: .35rem 0; }
+.table { overflow-x: auto; } table { border-collapse: collapse; font-size: .87rem; margin: .4rem 0; }
+th, td { padding: .22rem .6rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: top;
+  font-variant-numeric: tabular-nums; overflow-wrap: normal; }
+th { font-weight: 600; color: var(--soft); } th:first-child, td:first-child, .left { text-align: left; }
+td:first-child { min-width: 6.5rem; max-width: 24rem; overflow-wrap: anywhere; }
+figure { margin: .8rem 0; } img { max-width: 100%; height: auto; } figcaption { font-size: .85rem; color: var(--soft); }
+nav a { margin-right: 1rem; } a { color: #0550ae; }
+@media (max-width: 720px) { .cards { grid-template-columns: 1fr; } body { padding: .7rem; } }
+@media print { body { max-width: none; padding: 0; font-size: 10.5pt; } nav { display: none; }
+  figure, tr, .card { break-inside: avoid; } h2, h3 { break-after: avoid; } .table { overflow: visible; } }
+"""
+
+
+def html_report(
+    model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any], progress: Progress | None = None
+) -> str:
+    """The page.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+    checked : sequence of Verdicts
+    facts : mapping
+        What `findings` gave for them.
+    progress : callable, optional
+        Wraps what goes through the sections, given their number.
+    """
+    name = os.path.basename(facts["model"]["file"]) or "model"
+    title = f"{name}: may I rely on it, and what happened?"
+    makers = [
+        partial(_first_screen, name, facts),
+        *_recordings(model, checked, facts),
+        partial(_tightness, model, checked, facts),
+        partial(_trust, facts),
+        partial(_origin, facts),
+    ]
+    going: Iterable[Any] = makers if progress is None else progress(makers, len(makers))
+    parts = [maker() for maker in going]
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
+        "style-src 'unsafe-inline'\">\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{_text(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        + "\n".join(parts)
+        + f'\n<p class="soft">Written by uncertain-lti {_text(facts["version"])}.</p>\n</body>\n</html>\n'
+    )
+
+
+def write_page(path: str | os.PathLike[str], page: str) -> None:
+    """Write a page, whole or not at all; raises BagError where that is not possible."""
+    try:
+        with whole_file(path) as stream:
+            stream.write(page.encode("utf-8", "replace"))
+    except OSError as error:
+        raise BagError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+
+
+# --- sections ---------------------------------------------------------------------------------------------------
+
+
+def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
+    rely, happened = facts["rely"], facts["happened"]
+    tone = {YES: "good", CARE: "care", NO: "bad"}
+    reasons = sorted(rely["reasons"], key=lambda r: [NO, CARE, YES].index(r["weight"]))
+    words = {YES: "in its favour", CARE: "mind", NO: "against it"}
+    listed = "".join(
+        f'<li><b class="{tone[r["weight"]]}">{words[r["weight"]]}:</b> {_text(_without_address(r["text"]))}</li>'
+        for r in reasons[:6]
+    )
+    if len(reasons) > 6:
+        listed += f'<li class="soft">and {len(reasons) - 6} more <a href="#trust">below</a></li>'
+    states = [h["state"] for h in happened]
+    if "alarm" in states:
+        what, look = "Alarm", "bad"
+    elif "violations" in states:
+        what, look = "Violations, no alarm", "care"
+    elif "quiet" in states:
+        what, look = ("Nothing left its bounds", "good") if "unknown" not in states else ("Partly unknown", "care")
+    else:
+        what, look = "Unknown", "care"
+    order = sorted(happened, key=lambda h: ["alarm", "unknown", "violations", "quiet"].index(h["state"]))
+    told = "".join(
+        f"<li><b>{_text(os.path.basename(h['recording']) or h['recording'])}</b>: {_text(h['text'])}.</li>"
+        for h in order[:5]
+    )
+    if len(order) > 5:
+        told += f'<li class="soft">and {len(order) - 5} more recordings <a href="#recordings">below</a></li>'
+    rule = facts["rule"]
+    return (
+        f"<header><h1>{_text(name)}</h1>"
+        f'<p class="soft">{_text(_summary(facts))}. Alarm: {rule["violations"]} of the last {rule["window"]} verdicts '
+        f"violated, margin {number(rule['margin'])}.</p>"
+        '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a><a href="#trust">How far to trust it'
+        '</a><a href="#origin">Where it comes from</a></nav></header>\n'
+        f'<div class="cards"><section class="card {tone[rely["answer"]]}"><h2>May I rely on it?</h2>'
+        f'<p class="answer">{_ANSWER[rely["answer"]]}</p><ul>{listed}</ul></section>\n'
+        f'<section class="card {look}"><h2>What happened?</h2><p class="answer">{what}</p><ul>{told}</ul></section>'
+        "</div>"
+    )
+
+
+def _summary(facts: Mapping[str, Any]) -> str:
+    model = facts["model"]
+    text = f"{len(model['states'])} states, {len(model['controls'])} controls"
+    fit = model["fit"]
+    if "criterion" in fit:
+        text += f"; fitted by criterion {'(11)' if fit['criterion'] == 'lp' else '(10)'}"
+        if "transitions" in fit:
+            text += f" to {fit['transitions']} transitions of {_several(fit.get('transients', '?'), 'recording')}"
+    return text
+
+
+def _recordings(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> list[partial[str]]:
+    recordings = facts["recordings"]
+    drawn = sorted(range(len(recordings)), key=lambda i: -recordings[i]["violated"])[:MOST_DRAWN]
+    return [
+        partial(_all_recordings, model, checked, facts),
+        *(partial(_recording, model, checked[i], recordings[i]) for i in sorted(drawn)),
+    ]
+
+
+def _all_recordings(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> str:
+    recordings = facts["recordings"]
+    parts = ['<h2 id="recordings">What happened</h2>']
+    if len(recordings) > 1:
+        rows = [
+            [
+                _text(os.path.basename(r["recording"])),
+                str(r["verdicts"]),
+                str(r["violated"]),
+                str(r["episode_count"]),
+                _text(_STATE[h["state"]]),
+            ]
+            for r, h in zip(recordings, facts["happened"], strict=True)
+        ]
+        parts.append(_table(("recording", "verdicts", "violated", "episodes", "what"), rows, most=200))
+        parts.append(_figure(plots.coverage_figure(model, checked), "Violated shares, recording by recording"))
+    if len(recordings) > MOST_DRAWN:
+        parts.append(f'<p class="soft">Drawn are the {MOST_DRAWN} recordings with most violations.</p>')
+    return "\n".join(parts)
+
+
+def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]) -> str:
+    states = facts["states"]
+    parts = [f"<h3>{_text(os.path.basename(facts['recording']) or facts['recording'])}</h3>"]
+    silent = f" Without a verdict, or not used: {', '.join(facts['no_verdict'])}." if facts["no_verdict"] else ""
+    parts.append(
+        f"<p>{facts['samples']} samples over {number(facts['seconds'])} s, {facts['verdicts']} verdicts, "
+        f"{facts['violated']} of them violated.{_text(silent)} "
+        f"Outside the fitted ranges: {facts['outside_domain']}.</p>"
+    )
+    parts += [f'<p class="soft">{_text(note)}</p>' for note in facts["notes"][:5]]
+    if facts["episodes"]:
+        parts.append(_episodes(facts))
+    worst = sorted(model.state_names, key=lambda name: -states[name]["violations"])[:_MOST_STATES]
+    shown = [name for name in model.state_names if name in worst]
+    some = f"{len(shown)} of {model.n} states, those with most violations. " if len(shown) < model.n else ""
+    parts.append(
+        _figure(
+            plots.envelope_figure(model, verdicts, shown),
+            f"{some}Recorded values between their one-step bounds; marks: violated, at the foot of a panel as well.",
+        )
+    )
+    span = _close_up(verdicts, facts)
+    if span is not None:
+        bad = [name for name in shown if states[name]["violations"]]
+        parts.append(
+            _figure(
+                plots.envelope_figure(model, verdicts, bad, span=span),
+                "The first episode of the alarm, or of all, closer",
+            )
+        )
+    parts.append(
+        _figure(
+            plots.utilisation_figure(model, verdicts),
+            "Utilisation: where between its bounds each sample lay, -1 and 1 at the bounds",
+        )
+    )
+    return "\n".join(parts)
+
+
+def _close_up(verdicts: Verdicts, facts: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Time around the first episode with an alarm, or the first one, where that is little of the whole; s."""
+    episodes = facts["episodes"]
+    t = verdicts.transient.t
+    if not episodes or (t[1:] < t[:-1]).any():
+        return None
+    episode = next((e for e in episodes if e["alarm"]), episodes[0])
+    begin, end = episode["first"]["t"], min(episode["last"]["t"], episode["first"]["t"] + 0.1 * float(t[-1]))
+    step = float(t[-1]) / max(len(t) - 1, 1)
+    room = max(40 * step, 0.3 * (end - begin))
+    span = max(begin - room, 0.0), min(end + room, float(t[-1]))
+    return span if span[1] - span[0] < 0.5 * float(t[-1]) else None
+
+
+def _episodes(facts: Mapping[str, Any]) -> str:
+    rows = []
+    for e in facts["episodes"][:_MOST_ROWS]:
+        where = sorted(e["states"].items(), key=lambda item: -item[1]["violations"])
+        listed = ", ".join(f"{name} ({s['violations']}, worst {_utilisation(s)})" for name, s in where[:4])
+        more = f" and {len(where) - 4} more" if len(where) > 4 else ""
+        rows.append(
+            [
+                f"{e['first']['t']:.4f}",
+                f"{e['last']['t']:.4f}",
+                str(e["verdicts_violated"]),
+                "yes" if e["alarm"] else "",
+                _text(listed + more),
+            ]
+        )
+    header = ("first [s]", "last [s]", "violated", "alarm", "states (violations, worst utilisation)")
+    text = f"<p>Episodes (violations with fewer than {APART} verdicts between them): {facts['episode_count']}.</p>"
+    if facts["episode_count"] > _MOST_ROWS:
+        text += f'<p class="soft">The first {_MOST_ROWS}; <code>--json</code> has more.</p>'
+    return text + _table(header, rows, left=(4,))
+
+
+def _utilisation(state: Mapping[str, Any]) -> str:
+    return "without width" if state["utilisation"] is None else f"{state['utilisation']:.3g}"
+
+
+def _tightness(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> str:
+    rows = []
+    for state in facts["model"]["states"]:
+        here = [r["states"][state["name"]] for r in facts["recordings"]]
+        judged = [r["verdicts"] for r in facts["recordings"]]
+        total = sum(judged)
+        width = sum(s["mean_width"] * n for s, n in zip(here, judged, strict=True) if n) / total if total else None
+        spans = [s["range"] for s in here if s["range"] is not None]
+        span = max(spans, default=None)
+        bad = sum(s["violations"] for s in here)
+        worst = [s["worst"]["utilisation"] for s in here if s["violations"]]
+        rows.append(
+            [
+                _text(state["name"]) + (f" [{_text(state['unit'])}]" if state["unit"] else ""),
+                number(state["mean_width"]),
+                number(width),
+                number(max((s["max_width"] for s in here if s["max_width"] is not None), default=None)),
+                number(span),
+                f"{width / span:.1%}" if width is not None and span else "-",
+                str(bad),
+                f"{100 * bad / total:.3g} %" if total else "-",
+                "-" if not worst else "no width" if None in worst else f"{max(worst, key=abs):.3g}",
+            ]
+        )
+    header = (
+        "state", "mean width when fitted", "mean width here", "largest here", "range here", "width/range", "violated",
+        "of the verdicts", "worst utilisation",
+    )  # fmt: skip
+    parts = [
+        '<h2 id="tight">How tight</h2>',
+        "<p>Bounds that contain everything are worth something only where they are narrow. Widths of the one-step "
+        "bounds, in recorded units, over all recordings checked:</p>",
+        _table(header, rows, most=200),
+    ]
+    try:
+        figure = plots.budget_figure(model, [v.transient for v in checked])
+        parts.append(_figure(figure, "Which element contributes how much of the mean width of each state"))
+    except ModelError:
+        pass  # no transition: the reasons above say so
+    parts.append(_figure(plots.matrices_figure(model), "The matrices and their half-widths, for normalised quantities"))
+    return "\n".join(parts)
+
+
+def _trust(facts: Mapping[str, Any]) -> str:
+    parts = ['<h2 id="trust">How far to trust it</h2>']
+    v = facts["validation"]
+    if v is None:
+        parts.append(
+            "<p>The model has not been validated. Where its recordings are, run "
+            "<code>uncertain-lti validate MODEL --output MODEL</code>: it leaves out one recording after the other, "
+            "and says how often the others' bounds hold on it, and how many false alarms an hour to expect.</p>"
+        )
+    else:
+        what = "recording" if v["kind"] == "transients" else "block"
+        low, high = v["inside_interval"]
+        parts.append(
+            f"<p>Left out one {what} at a time ({_text(v['parts'])}): {_text(v['verdicts'])} verdicts in "
+            f"{number(v['hours'])} h"
+            + (
+                ""
+                if v["inside"] is None
+                else f", {v['inside']:.3%} inside all bounds ({v['confidence']:.0%} interval {low:.3%} to {high:.3%})"
+            )
+            + f"; whole {what}s inside: {_text(v['parts_inside'])}.</p>"
+        )
+        rows = [
+            [
+                _text(name),
+                "-" if s["inside"] is None else f"{s['inside']:.3%}",
+                str(s["parts_inside"]),
+                number(s["mean_width_left_out"]),
+                number(s["mean_width_full"]),
+            ]
+            for name, s in v["states"].items()
+        ]
+        header = ("left out", "inside", f"{what}s inside", "mean width", "mean width of the full fit")
+        parts.append(_table(header, rows, most=200))
+        rows = [
+            [
+                f"{a['violations']} of {a['window']}, margin {number(a['margin'])}",
+                str(a["alarms"]),
+                number(a["per_hour"]),
+                f"{number(a['interval'][0])} to {'unknown' if a['interval'][1] is None else number(a['interval'][1])}",
+            ]
+            for a in v["false_alarms"]
+        ]
+        parts.append(_table(("alarm rule", "false alarms", "per hour", "interval"), rows))
+        parts += [f"<p>{_text(line)}.</p>" for line in [v["words"], *v["notes"]]]
+    if facts["model"]["messages"]:
+        listed = "".join(f"<li>{_text(_without_address(m))}</li>" for m in facts["model"]["messages"])
+        parts.append(f"<h3>What the fit had to say</h3><ul>{listed}</ul>")
+    reasons = "".join(f"<li><b>{_text(r['weight'])}</b>: {_text(r['text'])}</li>" for r in facts["rely"]["reasons"])
+    parts.append(f"<h3>Every reason for the answer above</h3><ul>{reasons}</ul>")
+    return "\n".join(parts)
+
+
+def _origin(facts: Mapping[str, Any]) -> str:
+    model = facts["model"]
+    rows = [["model checked with", _text(model["file"]), _code(model["sha256"] or "none")]]
+    rows += [["fitted to", _text(s["file"]), _code(s["sha256"])] for s in model["sources"]]
+    rows += [["checked", _text(f["file"]), _code(f["sha256"])] for r in facts["recordings"] for f in r["files"]]
+    signals = [
+        [kind, _text(s["name"]), _text(s["unit"] or "-"), _text(s["topic"] or "-"), _code(s["field"])]
+        for kind, group in (("state", model["states"]), ("control", model["controls"]))
+        for s in group
+    ]
+    said = {**model["fit"], "clock": model["clock"] or "-", "median step [s]": number(model["dt_median"])}
+    about = [[_text(key), _text(number(v) if isinstance(v, float) else v)] for key, v in said.items()]
+    eigenvalues = ", ".join(f"{a:.4g}{b:+.4g}j" if b else f"{a:.4g}" for a, b in model["eigenvalues"])
+    return "\n".join(
+        [
+            '<h2 id="origin">Where it comes from</h2>',
+            _table(("what", "file", "sha256"), rows, left=(1, 2), most=300),
+            _table(("fit", ""), about, left=(1,)),
+            f"<p>Eigenvalues of A [1/s]: {_text(eigenvalues)}</p>",
+            _table(("signal", "name", "unit", "topic", "field"), signals, left=(1, 2, 3, 4), most=300),
+        ]
+    )
+
+
+# --- pieces -----------------------------------------------------------------------------------------------------
+
+
+def _text(value: object) -> str:
+    """A value of a file as text of the page."""
+    return escape("".join(c if c.isprintable() or c == " " else "\N{REPLACEMENT CHARACTER}" for c in str(value)))
+
+
+def _code(value: object) -> str:
+    return f"<code>{_text(value)}</code>"
+
+
+def _without_address(text: str) -> str:
+    return text[:400] + (" ..." if len(text) > 400 else "")
+
+
+def _several(number_: object, what: str) -> str:
+    return f"{number_} {what}{'' if number_ == 1 else 's'}"
+
+
+def _table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (), most: int = _MOST_ROWS
+) -> str:
+    """Cells are HTML already; columns but the first stand to the right unless named."""
+    listed = list(rows)
+    classes = ['class="left"' if i in left else "" for i in range(len(header))]
+    head = "".join(f"<th {c}>{_text(cell)}</th>" for cell, c in zip(header, classes, strict=True))
+    body = "".join(
+        "<tr>" + "".join(f"<td {c}>{cell}</td>" for cell, c in zip(row, classes, strict=True)) + "</tr>\n"
+        for row in listed[:most]
+    )
+    more = (
+        f'<p class="soft">and {len(listed) - most} more rows, in <code>--json</code></p>' if len(listed) > most else ""
+    )
+    return f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>{more}'
+
+
+def _figure(figure: Any, caption: str) -> str:
+    stream = io.BytesIO()
+    plots.save(figure, stream, _DPI)
+    small = io.BytesIO()  # few colours: a quarter of the bytes
+    Image.open(stream).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+    data = base64.b64encode(small.getvalue()).decode("ascii")
+    width, height = (round(side * _DPI) for side in figure.get_size_inches())
+    return (
+        f'<figure><img src="data:image/png;base64,{data}" alt="{_text(caption)}" width="{width}" height="{height}">'
+        f"<figcaption>{_text(caption)}</figcaption></figure>"
+    )

@@ -1,0 +1,253 @@
+"""The report: its answers follow from the facts, it is one page that needs nothing else, and files never speak HTML."""
+
+import json
+import math
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from engine_bag import SIGNALS, engine_bag
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti.cli import main
+from uncertain_lti.findings import APART, CARE, MOST_EPISODES, NO, YES, findings
+from uncertain_lti.html_report import MOST_DRAWN, html_report
+from uncertain_lti.validation import validate
+
+HOSTILE = "<script>alert(1)</script>\"'&amp;<img src=http://x/y.png onerror=alert(2)>\u202e\x07"
+
+
+class Page(HTMLParser):
+    """Tags, attributes and text of a page."""
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.tags, self.attributes, self.text, self.open = set(), [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.text.append(data)
+
+
+def needs_nothing_else(page):
+    """No script, no handler, nothing that is loaded; anchors stay on the page."""
+    assert not page.tags & {"script", "link", "iframe", "object", "embed", "form", "base", "svg", "video", "audio"}
+    for tag, name, value in page.attributes:
+        assert not name.startswith("on") and name != "style"
+        if name == "src":
+            assert tag == "img" and value.startswith("data:image/png;base64,")
+        elif name == "href":
+            assert value.startswith("#")
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "signals.yaml").write_text(SIGNALS)
+    engine_bag(folder / "run.mcap")
+    engine_bag(folder / "other.mcap", steps=250, seed=5)
+    engine_bag(folder / "bad.mcap", change=lambda k, x: x + (5.0 if 100 <= k < 103 else 0.0) * np.eye(5)[0])
+    runs = read_transients([folder / "run.mcap"], folder / "signals.yaml")
+    fit(runs, additive="noise").save(folder / "m.model.json")
+    return folder
+
+
+def test_the_page_answers_first(engine, tmp_path, capsys):
+    out = tmp_path / "page.html"
+    model = str(engine / "m.model.json")
+    assert main(["report", model, str(engine / "bad.mcap"), str(engine / "other.mcap"), "--output", str(out)]) == 1
+    said = capsys.readouterr().out
+    assert "may I rely on it? with care" in said and str(out) in said
+    page = Page(out.read_text(encoding="utf-8"))
+    needs_nothing_else(page)
+    text = " ".join(page.text)
+    first = text.index("May I rely on it?"), text.index("What happened?")
+    assert max(first) < text.index("Violated shares") and "has not been validated" in text
+    assert "bad.mcap" in text and "2.5" in text and "fan (" in text
+    assert out.stat().st_size < 3_000_000
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_json_has_the_facts_of_the_page(engine, tmp_path, capsys):
+    model, bags = str(engine / "m.model.json"), [str(engine / name) for name in ("bad.mcap", "other.mcap")]
+    assert main(["report", model, *bags, "--json"]) == 1
+    facts = json.loads(capsys.readouterr().out)
+    assert main(["check", model, *bags, "--json"]) == 1
+    checked = json.loads(capsys.readouterr().out)["recordings"]
+    for said, recording in zip(facts["recordings"], checked, strict=True):
+        assert {key: said[key] for key in ("verdicts", "violated", "alarm", "alarms", "inside")} == {
+            key: recording[key] for key in ("verdicts", "violated", "alarm", "alarms", "inside")
+        }
+        for name, state in recording["states"].items():
+            assert {key: said["states"][name][key] for key in state} == state
+    assert facts["recordings"][0]["episodes"][0]["first"]["k"] == 100
+    assert set(facts["recordings"][0]["episodes"][0]["states"]) >= {"fan"}
+    assert len(facts["model"]["sha256"]) == 64 and facts["recordings"][0]["files"][0]["file"] == bags[0]
+    assert facts["rely"]["answer"] in (CARE, NO) and facts["validation"] is None
+    out = tmp_path / "p.html"
+    assert main(["report", model, *bags, "--json", "--output", str(out)]) == 1
+    assert json.loads(capsys.readouterr().out) == facts and out.exists()
+    assert main(["report", model, str(engine / "other.mcap"), "--output", str(out), "--quiet"]) in (0, 1)
+    assert capsys.readouterr().out == ""
+
+
+def test_what_was_fitted_proves_nothing(engine, capsys, tmp_path):
+    """And a validated model says how it did on what was left out."""
+    runs = read_transients([engine / "run.mcap", engine / "other.mcap"], engine / "signals.yaml")
+    model = fit(runs, additive="noise")
+    model = model.with_(validation=validate(runs, additive="noise", full=model).to_dict())
+    model.save(tmp_path / "v.model.json")
+    from uncertain_lti.findings import sha256
+
+    source = {"file": "elsewhere/run.mcap", "sha256": sha256(engine / "run.mcap")}
+    model.with_(fit={**model.fit, "sources": [source]}).save(tmp_path / "v.model.json")
+    assert main(["report", str(tmp_path / "v.model.json"), str(engine / "run.mcap"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    reasons = {r["about"]: r for r in facts["rely"]["reasons"] if r["about"] != "fit"}
+    assert "proves nothing" in reasons["recordings"]["text"]
+    inside = model.validation["inside"]
+    assert facts["validation"]["inside"] == inside
+    assert reasons["validation"]["weight"] == (NO if inside < 0.9 else CARE if inside < 0.99 else YES)
+    (loaded,) = [UncertainLTI.load(tmp_path / "v.model.json")]
+    verdicts = [EnvelopeMonitor(loaded).check(runs[0])]
+    page = Page(html_report(loaded, verdicts, findings(loaded, tmp_path / "v.model.json", verdicts)))
+    assert "Left out one recording at a time" in " ".join(page.text)
+
+
+def test_names_from_files_are_text(tmp_path, engine):
+    """In names, units, notes, messages, sections of the model file and paths."""
+    model = UncertainLTI.load(engine / "m.model.json")
+    signals = replace(
+        model.signals,
+        states=tuple(replace(s, name=f"{HOSTILE}{i}", unit=HOSTILE) for i, s in enumerate(model.signals.states)),
+    )
+    nasty = {
+        **model.fit,
+        "criterion": HOSTILE,
+        "messages": [HOSTILE, 3],
+        "sources": [{"file": HOSTILE, "sha256": HOSTILE}, HOSTILE],
+        "transients": HOSTILE,
+    }
+    run = read_transients(engine / "bad.mcap", engine / "signals.yaml")[0]
+    transient = Transient(run.t_ns, run.x, run.u, name=f"/x/{HOSTILE}", signals=signals, notes=[HOSTILE])
+    good = validate([run], additive="noise").to_dict()
+    validations = [
+        {},
+        {"kind": HOSTILE},
+        {**good, "inside": HOSTILE},
+        {**good, "states": {s.name: next(iter(good["states"].values())) for s in signals.states}, "kind": HOSTILE},
+        {**good, "false_alarms": [{**good["false_alarms"][0], "alarms": HOSTILE}]},
+        {**good, "notes": [HOSTILE], "states": {s.name: next(iter(good["states"].values())) for s in signals.states}},
+    ]
+    for validation in validations:
+        changed = model.with_(signals=signals, fit=nasty, validation=validation)
+        verdicts = [EnvelopeMonitor(changed).check(transient)]
+        facts = findings(changed, f"{HOSTILE}.json", verdicts)
+        text = html_report(changed, verdicts, facts)
+        needs_nothing_else(Page(text))
+        assert "<script" not in text and "\u202e" not in text and "\x07" not in text
+        assert "alert(1)" in text  # shown, as text
+        json.dumps(facts, allow_nan=False)
+
+
+def by_hand(n=2):
+    return UncertainLTI(np.zeros((n, n)), np.zeros((n, 1)), np.zeros((n, n)), np.zeros((n, 1)), v=np.full(n, 0.5))
+
+
+@given(st.lists(st.sampled_from("....vwnb"), min_size=2, max_size=120))
+def test_episodes_hold_every_violation(letters):
+    """v, w: a state jumps; n: a sample is missing; b: time steps back."""
+    t = np.cumsum([-(10**10) if c == "b" else 10**7 for c in letters]) + 10**18
+    x = np.zeros((len(letters), 2))
+    for k, c in enumerate(letters):
+        x[k:, 0] += 10.0 * (c == "v")
+        x[k:, 1] += 10.0 * (c == "w")
+    x[[c == "n" for c in letters]] = math.nan
+    model = by_hand()
+    verdicts = EnvelopeMonitor(model).check(Transient(t, x, np.zeros((len(letters), 1)), max_gap=0.1))
+    (recording,) = findings(model, "m", [verdicts])["recordings"]
+    episodes = recording["episodes"]
+    bad = np.flatnonzero(verdicts.violated)
+    assert recording["episode_count"] == len(episodes)
+    assert sum(e["verdicts_violated"] for e in episodes) == len(bad) == recording["violated"]
+    for e in episodes:
+        inside = bad[(bad >= e["first"]["k"]) & (bad <= e["last"]["k"])]
+        assert len(inside) == e["verdicts_violated"]
+        assert (np.diff(np.cumsum(verdicts.judged)[inside]) <= APART).all()
+        assert (np.diff(verdicts.transient.t_ns[e["first"]["k"] : e["last"]["k"] + 1]) > 0).all()
+        for i, name in enumerate(model.state_names):
+            count = int((verdicts.flags[inside, i] == 1).sum())
+            assert e["states"].get(name, {"violations": 0})["violations"] == count
+    for one, other in zip(episodes, episodes[1:], strict=False):
+        between = int(verdicts.judged[one["last"]["k"] + 1 : other["first"]["k"] + 1].sum())
+        assert (
+            between > APART or (np.diff(verdicts.transient.t_ns[one["last"]["k"] : other["first"]["k"] + 1]) < 0).any()
+        )
+
+
+def test_endless_violations_stay_one_page():
+    model = by_hand()
+    count = (APART + 2) * (MOST_EPISODES + 50)
+    x = np.zeros((count, 2))
+    x[:: APART + 2, 0] = 10.0
+    verdicts = [EnvelopeMonitor(model).check(Transient(np.arange(count) * 0.01, x, np.zeros((count, 1))))]
+    facts = findings(model, "m", verdicts)
+    assert len(facts["recordings"][0]["episodes"]) == MOST_EPISODES < facts["recordings"][0]["episode_count"]
+    text = html_report(model, verdicts, facts)
+    assert len(text) < 3_000_000 and text.count("<tr>") < 200
+
+
+def test_no_verdict_is_no_good_news():
+    model = by_hand()
+    verdicts = [EnvelopeMonitor(model).check(Transient([0.0], [[0.0, 0.0]], [[0.0]]))]
+    facts = findings(model, "m", verdicts)
+    assert facts["rely"]["answer"] == NO and facts["happened"][0]["state"] == "unknown" and not facts["alarm"]
+    assert "Nothing left" not in html_report(model, verdicts, facts)
+
+
+@pytest.mark.slow
+def test_fifty_states_and_forty_recordings():
+    rng = np.random.default_rng(0)
+    n = 50
+    model = UncertainLTI(
+        -np.eye(n), rng.normal(size=(n, 3)), 0.1 * np.ones((n, n)), np.zeros((n, 3)), v=np.full(n, 0.05)
+    )
+    runs = [0.01 * rng.normal(size=(3000, n)) + (k == 7) * rng.normal(size=(3000, n)) for k in range(40)]
+    verdicts = [
+        EnvelopeMonitor(model).check(Transient(np.arange(3000) * 0.01, x, np.zeros((3000, 3)), name=f"run {k}"))
+        for k, x in enumerate(runs)
+    ]
+    text = html_report(model, verdicts, findings(model, "m", verdicts))
+    needs_nothing_else(Page(text))
+    assert len(text) < 12_000_000 and text.count("<img") <= 3 * MOST_DRAWN + 3
+
+
+def test_bad_places_are_one_sentence(engine, tmp_path, capsys):
+    model, bag = str(engine / "m.model.json"), str(engine / "bad.mcap")
+    before = Path(bag).read_bytes(), Path(model).read_bytes()
+    for output, why in (
+        (bag, "what the report is about"),
+        (model, "what the report is about"),
+        (str(tmp_path), "is a folder"),
+        (str(tmp_path / "no" / "x.html"), "make it first"),
+    ):
+        assert main(["report", model, bag, "--output", output]) == 2
+        said = capsys.readouterr()
+        assert why in said.err and said.err.count("\n") == 1 and not said.out
+    assert (Path(bag).read_bytes(), Path(model).read_bytes()) == before
