@@ -26,8 +26,8 @@ FEWEST = 20
 """Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""
 LONGEST_ARRAY = 24
 """Entries of an array that are looked at one by one; a longer one is a picture, a scan or a map."""
-MOST_VALUES = 30_000_000
-"""Numbers read per recording and topic at most; fields beyond are listed and not looked at."""
+MOST_VALUES = 50_000_000
+"""Numbers read at most; fields beyond are listed and not looked at."""
 SHOWS = 20.0
 """F statistic from which on something is said to show in the next step."""
 FAINT = 5.0
@@ -44,8 +44,9 @@ _STATE = re.compile(
     r"depth|pressure|temperature|power|attitude|estimat|log|response|data$)"
 )
 _ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|measur|estimat")
-_APART = re.compile(
-    r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|status|gps|fix$)"
+_APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
+_PHYSICAL = re.compile(
+    r"^(imu|jointstate|odometry|twist|pose|wrench|accel|vector3|quaternion|transformstamped|ackermann)"
 )
 _APART_TYPES = {
     "rcl_interfaces/msg/Log", "rcl_interfaces/msg/ParameterEvent", "tf2_msgs/msg/TFMessage", "rosgraph_msgs/msg/Clock",
@@ -201,7 +202,9 @@ def _look(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
             source.reason = "no signal of a machine by its name or type"
         elif total < (FEWEST if source.role == "state" else 3):
             source.reason = f"{total} messages only"
-        elif any(b.topics[topic].type != fact.info.type for b in bags if topic in b.topics):
+        elif any(topic not in b.topics or not b.topics[topic].count for b in bags):
+            source.reason = "not in every recording"
+        elif any(b.topics[topic].type != fact.info.type for b in bags):
             source.reason = "of different types in these recordings"
         else:
             source.candidates = _candidates(topic, fact.fields)
@@ -209,11 +212,26 @@ def _look(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
                 source.reason = "no number in it"
         if source.reason:
             source.candidates = []
+    _limit(bags, sources)
     for bag in bags:
-        _read(bag, [s for s in sources if s.candidates and s.topic in bag.topics], progress)
+        _read(bag, [s for s in sources if s.candidates], progress)
     for source in sources:
         _sift(source)
     return sources
+
+
+def _limit(bags: Sequence[Bag], sources: Sequence[Source]) -> None:
+    """Look at no more numbers than memory holds: commands first, then states, from the first field on."""
+    order = ("control", "state", "wish", "")
+    left = MOST_VALUES
+    for source in sorted((s for s in sources if s.candidates), key=lambda s: order.index(s.role)):
+        count = max(1, sum(bag.topics[source.topic].count for bag in bags))
+        for candidate in source.candidates:
+            if candidate.reason:
+                continue
+            left -= count
+            if left < 0:
+                candidate.reason = "not looked at, the recordings are too large: propose from a shorter one"
 
 
 def _role(topic: str, type_name: str) -> str:
@@ -223,7 +241,7 @@ def _role(topic: str, type_name: str) -> str:
     name = topic.strip("/").lower()
     last = name.rpartition("/")[2]
     kind = type_name.rpartition("/")[2].lower()
-    if any(_APART.search(text) for text in (last, name)):
+    if not _PHYSICAL.search(kind) and any(_APART.search(text) for text in (last, name)):
         return "apart"
     for text in (last, name, kind):
         if _ANSWER.search(text):
@@ -264,11 +282,7 @@ def _candidates(topic: str, fields: Sequence[str]) -> list[Candidate]:
 def _read(bag: Bag, sources: Sequence[Source], progress: Iterate | None) -> None:
     """Values of every candidate in one recording."""
     for source in sources:
-        count = bag.topics[source.topic].count
         readable = [c for c in source.candidates if not c.reason]
-        for candidate in readable[max(1, MOST_VALUES // max(count, 1)) :]:
-            candidate.reason = "not looked at: the topic is too large"
-        readable = [c for c in readable if not c.reason]
         paths = [FieldPath(c.path) for c in readable]
         try:
             columns = read_columns(bag, [source.topic], [paths], progress)

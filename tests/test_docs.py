@@ -14,6 +14,7 @@ A block is run by its language. Comments above it say more:
 
 import contextlib
 import importlib
+import inspect
 import io
 import os
 import re
@@ -297,3 +298,23 @@ def test_the_pages_build_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     theory = (tmp_path / "html" / "theory.html").read_text()
     assert theory.count("<math") > 20 and "cdn" not in theory.lower()
+
+
+def test_public_docstrings_name_their_arguments():
+    """Every argument of what is public is described under its own name, and no other is."""
+    package = importlib.import_module("uncertain_lti")
+    things = [getattr(package, n) for n in package.__all__]
+    things += [importlib.import_module("uncertain_lti.archive").fit_archive]
+    things += [getattr(importlib.import_module("uncertain_lti.interchange"), n) for n in ("to_control", "from_control")]
+    things += [package.UncertainLTI.bounds, package.Transient.from_dataframe, package.Transient.from_csv]
+    for thing in things:
+        text = inspect.getdoc(thing) or ""
+        if "Parameters\n---" not in text:
+            continue
+        section = re.split(r"\n\w[\w ]*\n-{3,}", text.split("Parameters\n")[1].split("\n", 1)[1])[0]
+        described = set()
+        for line in section.splitlines():
+            if match := re.fullmatch(r"(\*{0,2}\w+(?:, \*{0,2}\w+)*)(?: : .*)?", line):
+                described |= {name.lstrip("*") for name in match[1].split(", ")}
+        there = set(inspect.signature(thing).parameters) - {"self", "cls"}
+        assert there == described, (thing, there ^ described)

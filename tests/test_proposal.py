@@ -128,6 +128,38 @@ def test_several_recordings_of_one_machine(tmp_path):
     assert fitted(paths, proposal).fit["transients"] == 3
 
 
+def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
+    """Else no fit could read both; the others keep their places."""
+
+    def extra(k, x, u):
+        return [f64("/plant/more_state", 10**18 + k * 20 * MS, 2 * x)]
+
+    paths = [
+        save(tmp_path / "a.mcap", driven(), {}),
+        save(tmp_path / "b.mcap", driven(seed=1, extra=extra), {}),
+        save(tmp_path / "c.mcap", driven(seed=2), {"/plant/more_state": FLOAT64}),
+    ]
+    for order in (paths, paths[::-1]):
+        proposal = propose(order)
+        assert signals_of(proposal) == ([("/plant/state", "data")], [("/plant/cmd", "data")])
+        assert "/plant/more_state: not in every recording" in proposal.text
+        assert fitted(order, proposal).fit["transients"] == 3
+
+
+def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
+    """The command and the first of two states fit the limit."""
+    import uncertain_lti.proposal as module
+
+    monkeypatch.setattr(module, "MOST_VALUES", 900)
+
+    def extra(k, x, u):
+        return [f64("/plant/z_state", 10**18 + k * 20 * MS, 2 * x)]
+
+    proposal = propose([save(tmp_path / "a.mcap", driven(extra=extra), {})])
+    assert signals_of(proposal) == ([("/plant/state", "data")], [("/plant/cmd", "data")])
+    assert "too large" in proposal.text
+
+
 def test_every_odd_recording_gets_a_file_or_a_sentence(recordings, tmp_path, capsys):
     for path in [*sorted((recordings / "odd").glob("*.mcap")), recordings / "neato/db3"]:
         target = tmp_path / f"{path.stem}.yaml"
@@ -159,6 +191,10 @@ def test_every_odd_recording_gets_a_file_or_a_sentence(recordings, tmp_path, cap
         ("/rosout", "rcl_interfaces/msg/Log", "apart"),
         ("/camera/image", "sensor_msgs/msg/Image", "apart"),
         ("/foo", FLOAT64, ""),
+        ("/camera/imu", "sensor_msgs/msg/Imu", "state"),
+        ("/gps/odom", "nav_msgs/msg/Odometry", "state"),
+        ("/battery/voltage", FLOAT64, "apart"),
+        ("/motor_status", FLOAT64, ""),
     ],
 )
 def test_roles_by_name_and_type(topic, kind, role):
