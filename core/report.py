@@ -145,6 +145,7 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
     rows = [
         (f"uncertain-lti check {file} BAG", "is a recording that was not fitted inside?"),
         (f"uncertain-lti validate {file}", "how far to trust it; an alarm rule for a rate of false alarms"),
+        (f"uncertain-lti report {file} BAG", "may I rely on it, and what happened? a page with figures"),
     ]
     width = max(len(command) for command, _ in rows)
     return "\n".join([*lines, "next:", *(f"  {command.ljust(width)}  {text}" for command, text in rows)])
