@@ -22,6 +22,7 @@ import argparse
 import json
 import os
 import random
+import select
 import signal
 import subprocess
 import sys
@@ -129,7 +130,7 @@ def relay(n: int, names: list[str]) -> None:
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Bool
 
-    from uncertain_lti_ros.outputs import FALSE, NamedVector
+    from uncertain_lti.verdict_messages import FALSE, NamedVector
 
     rclpy.init()
     node = rclpy.create_node("envelope_monitor")
@@ -207,8 +208,6 @@ def hear(names: list[str]) -> None:
 
 
 def listen_for_end(spinner: Any, say: Any) -> None:
-    import select
-
     from rclpy.task import Future
 
     never: Future = Future(executor=spinner)
@@ -222,6 +221,8 @@ def listen_for_end(spinner: Any, say: Any) -> None:
 
 
 class Child:
+    patient = False  # a publisher says nothing for as long as it publishes
+
     def __init__(self, env: dict[str, str], *command: str) -> None:
         self.process = subprocess.Popen(
             [sys.executable, *command], env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -243,7 +244,10 @@ class Child:
         raise RuntimeError("no Private_Dirty")
 
     def line(self) -> str:
+        """What it says next; raises where it has nothing to say for long, as when another part has died."""
         assert self.process.stdout is not None
+        if not select.select([self.process.stdout], [], [], 900.0 if self.patient else 60.0)[0]:
+            raise RuntimeError(f"{' '.join(map(str, self.process.args))} says nothing")  # type: ignore[arg-type]
         return self.process.stdout.readline().strip()
 
     def ask(self) -> dict[str, Any]:
@@ -461,6 +465,7 @@ def soak(seconds: float, rate: float, n: int) -> dict[str, Any]:
                 if now > warm:
                     memory.append(subject.memory)
                     print(f"{now:6.0f} s  {memory[-1]:.2f} MiB", file=sys.stderr, flush=True)
+            publisher.patient = True
             sent = int(publisher.line())
             time.sleep(0.7)
             said = status(run.domain)
