@@ -21,8 +21,9 @@ ROOT = Path(__file__).resolve().parent.parent
 LIVE = ["errors", "files", "signals", "sampler", "transient", "operating_point", "model", "monitor"]
 
 # Where the name to import is not the name to install.
-PIP_NAME = {"yaml": "pyyaml"}
+PIP_NAME = {"PIL": "pillow", "yaml": "pyyaml"}
 ROSDEP_KEY = {
+    "PIL": "python3-pil",
     "cvxpy": "python3-cvxpy-pip",
     "highspy": "python3-cvxpy-pip",
     "lz4": "mcap-ros2-support",
