@@ -164,6 +164,12 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
     report.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
     report.add_argument("--json", action="store_true", help="print the same facts as JSON")
 
+    layout = command("layout", _layout, "write layouts of viewers for what a model's monitor publishes")
+    layout.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
+    layout.add_argument("--foxglove", metavar="FILE.json", help="for Foxglove and Lichtblick")
+    layout.add_argument("--plotjuggler", metavar="FILE.xml", help="for PlotJuggler")
+    layout.add_argument("--topics", metavar="NAME", help="what the topics begin with (default: /envelope_monitor)")
+
     validate = command(
         "validate",
         _validate,
@@ -454,6 +460,14 @@ def _report(options: argparse.Namespace) -> int:
     if options.json:
         _print_json(facts)
     return ALARM if facts["alarm"] else DONE
+
+
+def _layout(options: argparse.Namespace) -> int:
+    from uncertain_lti.layouts import write_layouts
+
+    for path in write_layouts(_named(options.model), options.foxglove, options.plotjuggler, options.topics):
+        print(f"layout written to {path}")
+    return DONE
 
 
 def _validate(options: argparse.Namespace) -> int:

@@ -174,6 +174,10 @@ def matrices_figure(model: UncertainLTI) -> Any:
         figure.colorbar(image, cax=bar)
         bar.tick_params(labelsize=7)
         bar.yaxis.set_minor_locator(_no_ticks())
+        if not k:
+            inner = greatest * 10**-1.5
+            ticks = [-greatest, 0.0, greatest] if height < 1.3 else [-greatest, -inner, 0.0, inner, greatest]
+            bar.set_yticks(ticks, [_brief(tick) if tick else "0" for tick in ticks])
         axis.set_title(title, loc="left", fontsize=9)
         _name_cells(axis, rows, columns)
         axis.axvline(model.n - 0.5, color=RECORDED, linewidth=0.8)

@@ -1,0 +1,212 @@
+"""Layouts of viewers for the topics of a monitor, live or in an annotated recording.
+
+Foxglove and Lichtblick (JSON) take a number of a JointState by its index, PlotJuggler (XML) names its curves after the
+joints; so a layout is made for a model.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from uncertain_lti.errors import ModelError
+from uncertain_lti.files import whole_file
+from uncertain_lti.model import UncertainLTI
+from uncertain_lti.signals import Signal
+from uncertain_lti.verdict_messages import NODE
+
+BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"
+"""Told apart by colour-blind people, on light and on dark ground (Okabe and Ito 2008)."""
+_PAGE = 6  # states that one page shows
+
+
+def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any]:
+    """Layout of Foxglove and Lichtblick: bounds and samples of each state, utilisation, flags, alarm, diagnostics.
+
+    Parameters
+    ----------
+    states : sequence of Signal
+        Of the model (`model.signals.states`).
+    base : str
+        What the topics begin with.
+    """
+    panels: dict[str, Any] = {}
+
+    def panel(kind: str, name: str, title: str, config: dict[str, Any]) -> str:
+        key = f"{kind}!{name}"
+        panels[key] = {"foxglovePanelTitle": title, "lichtblickPanelTitle": title, **config}
+        return key
+
+    def plot(name: str, title: str, paths: list[dict[str, Any]]) -> str:
+        shown = {"showLegend": True, "legendDisplay": "floating", "showPlotValuesInLegend": True}
+        axes = {"showXAxisLabels": True, "showYAxisLabels": True, "isSynced": True, "xAxisVal": "timestamp"}
+        return panel("Plot", name, title, {"paths": paths, **shown, **axes, "sidebarDimension": 240})
+
+    pages = []
+    for page, begin in enumerate(range(0, len(states), _PAGE)):
+        rows = []
+        for i, state in list(enumerate(states))[begin : begin + _PAGE]:
+            title = f"{state.name} [{state.unit}]" if state.unit else state.name
+            lines = (("lower", BOUND, 1.5), ("upper", BOUND, 1.5), ("state", RECORDED, 1.5))
+            paths = [_line(f"{base}/{topic}.position[{i}]", topic, colour, size) for topic, colour, size in lines]
+            rows.append(plot(f"bounds{i}", title, paths))
+        paths = [
+            _line(f"{base}/utilisation.position[{i}]", state.name)
+            for i, state in list(enumerate(states))[begin : begin + _PAGE]
+        ]
+        limits = [_line("1", "upper bound", VIOLATED, 1.0), _line("-1", "lower bound", VIOLATED, 1.0)]
+        utilisation = plot(f"utilisation{page}", "utilisation: -1 and 1 at the bounds", paths + limits)
+        flags = panel(
+            "StateTransitions",
+            f"flags{page}",
+            "0 contained, 1 violated",
+            {
+                "isSynced": True,
+                "paths": [
+                    {"value": f"{base}/flags.position[{i}]", "label": state.name, "timestampMethod": "receiveTime"}
+                    for i, state in list(enumerate(states))[begin : begin + _PAGE]
+                ],
+            },
+        )
+        pages.append(_split("row", _stack(rows), _stack([utilisation, flags]), 60))
+    if len(pages) == 1:
+        body: Any = pages[0]
+    else:
+        titles = [f"{i * _PAGE + 1} to {min((i + 1) * _PAGE, len(states))}" for i in range(len(pages))]
+        tabs = [{"title": title, "layout": page} for title, page in zip(titles, pages, strict=True)]
+        body = panel("Tab", "states", "states", {"activeTabIdx": 0, "tabs": tabs})
+    alarm = panel(
+        "Indicator",
+        "alarm",
+        "alarm",
+        {
+            "path": f"{base}/violation.data",
+            "style": "background",
+            "fallbackColor": UNKNOWN,
+            "fallbackLabel": "no verdict yet",
+            "rules": [
+                {"operator": "=", "rawValue": "true", "color": VIOLATED, "label": "ALARM"},
+                {"operator": "=", "rawValue": "false", "color": CONTAINED, "label": "no alarm"},
+            ],
+        },
+    )
+    raised = panel(
+        "StateTransitions",
+        "alarm",
+        "alarm",
+        {
+            "isSynced": True,
+            "paths": [{"value": f"{base}/violation.data", "label": "alarm", "timestampMethod": "receiveTime"}],
+        },
+    )
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": _split("column", _split("row", alarm, raised, 25), body, 15),
+    }
+
+
+def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
+    """Layout of PlotJuggler: bounds and samples of each state, utilisation, flags and alarm, in tabs.
+
+    Parameters as for `foxglove_layout`.
+    """
+    tabs: list[tuple[str, list[tuple[str, list[tuple[str, str]]]]]] = []
+    for begin in range(0, len(states), _PAGE):
+        page = states[begin : begin + _PAGE]
+        plots = []
+        for state in page:
+            title = f"{state.name} [{state.unit}]" if state.unit else state.name
+            curves = (("lower", BOUND), ("upper", BOUND), ("state", RECORDED))
+            plots.append((title, [(f"{base}/{topic}/{state.name}/position", colour) for topic, colour in curves]))
+        some = len(states) > _PAGE
+        numbers = f" {begin + 1} to {begin + len(page)}" if some else ""
+        tabs.append((f"bounds{numbers}", plots))
+        colours = _cycle(len(page))
+        said = [
+            (title, [(f"{base}/{topic}/{s.name}/position", c) for s, c in zip(page, colours, strict=True)])
+            for topic, title in (("utilisation", "utilisation: -1 and 1 at the bounds"), ("flags", "1: violated"))
+        ]
+        tabs.append((f"verdicts{numbers}", [*said, ("alarm", [(f"{base}/violation/data", VIOLATED)])]))
+    lines = [
+        "<?xml version='1.0' encoding='UTF-8'?>",
+        "<root>",
+        ' <tabbed_widget name="Main Window" parent="main_window">',
+    ]
+    for name, plots in tabs:
+        lines += [f'  <Tab containers="1" tab_name={_attribute(name)}>', "   <Container>"]
+        sizes = ";".join([f"{1 / len(plots):.6f}"] * len(plots))
+        lines.append(f'    <DockSplitter orientation="-" sizes="{sizes}" count="{len(plots)}">')
+        for title, drawn in plots:
+            lines.append(f"     <DockArea name={_attribute(title)}>")
+            lines.append('      <plot mode="TimeSeries" style="Lines" flip_x="false" flip_y="false">')
+            lines.append("       <limitY/>")
+            lines += [f'       <curve name={_attribute(curve)} color="{colour}"/>' for curve, colour in drawn]
+            lines += ["      </plot>", "     </DockArea>"]
+        lines += ["    </DockSplitter>", "   </Container>", "  </Tab>"]
+    lines += [
+        '  <currentTabIndex index="0"/>', " </tabbed_widget>", ' <use_relative_time_offset enabled="1"/>', " <Plugins>",
+        '  <plugin ID="DataLoad MCAP"/>', " </Plugins>", " <customMathEquations/>", " <snippets/>", "</root>",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def write_layouts(
+    model: UncertainLTI, foxglove: str | None, plotjuggler: str | None, base: str | None = None
+) -> list[str]:
+    """Write one or both of the layouts, each whole or not at all; returns their paths.
+
+    Raises
+    ------
+    ModelError
+        No file is named, or one cannot be written.
+    """
+    wanted = [(foxglove, foxglove_text), (plotjuggler, plotjuggler_layout)]
+    if foxglove is None and plotjuggler is None:
+        raise ModelError("no layout is asked for; give --foxglove FILE.json, --plotjuggler FILE.xml or both")
+    base = NODE if base is None else f"/{base.strip('/')}"
+    written = []
+    for path, make in wanted:
+        if path is not None:
+            try:
+                with whole_file(path) as stream:
+                    stream.write(make(model.signals.states, base).encode("utf-8", "replace"))
+            except OSError as error:
+                raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+            written.append(path)
+    return written
+
+
+def foxglove_text(states: Sequence[Signal], base: str = NODE) -> str:
+    """`foxglove_layout` as a file holds it."""
+    return json.dumps(foxglove_layout(states, base), indent=1, ensure_ascii=False) + "\n"
+
+
+def _line(value: str, label: str, colour: str = "", size: float = 1.0) -> dict[str, Any]:
+    line = {"value": value, "label": label, "enabled": True, "timestampMethod": "receiveTime", "lineSize": size}
+    return line | ({"color": colour} if colour else {})
+
+
+def _split(direction: str, first: Any, second: Any, percentage: float) -> dict[str, Any]:
+    return {"direction": direction, "first": first, "second": second, "splitPercentage": percentage}
+
+
+def _stack(panels: Sequence[Any]) -> Any:
+    """Panels one below the other, equally high."""
+    if len(panels) == 1:
+        return panels[0]
+    return _split("column", panels[0], _stack(panels[1:]), round(100 / len(panels), 3))
+
+
+def _cycle(count: int) -> list[str]:
+    colours = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"]
+    return [colours[i % len(colours)] for i in range(count)]
+
+
+def _attribute(text: str) -> str:
+    """Text of a file as a value in XML, which has no control characters."""
+    return quoteattr("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text))
