@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import logging
 import os
 import shlex
 import signal
@@ -391,7 +392,13 @@ def _local_cluster(dask: Any, workers: int) -> Any:
     """Worker processes that leave Ctrl-C to this one, which ends them."""
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # what a child is born with
     try:
-        return dask.LocalCluster(n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
+        return dask.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,  # of work that is broken off; what goes wrong comes back as an error
+        )
     finally:
         signal.signal(signal.SIGINT, handler)
 

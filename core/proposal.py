@@ -102,7 +102,8 @@ class Candidate:
 class Source:
     """One topic: times of arrival in ns per recording, what it seems to be, and its numbers.
 
-    role is "control", "wish" (a reference of some controller), "state", "" (unknown) or "apart" (neither).
+    role is "control", "wish" (a reference of some controller), "state", "" (unknown) or "apart" (neither). halting: its
+    header stamps mostly stand still.
     """
 
     topic: str
@@ -113,6 +114,7 @@ class Source:
     arrival: list[NDArray[np.int64]] = field(default_factory=list, repr=False)
     candidates: list[Candidate] = field(default_factory=list)
     reason: str = ""
+    halting: bool = False
 
     @property
     def count(self) -> int:
@@ -200,7 +202,7 @@ def _look(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
             source.reason = fact.info.reason
         elif source.role == "apart":
             source.reason = "no signal of a machine by its name or type"
-        elif total < (FEWEST if source.role == "state" else 3):
+        elif total < (3 if source.role == "control" else FEWEST):
             source.reason = f"{total} messages only"
         elif any(topic not in b.topics or not b.topics[topic].count for b in bags):
             source.reason = "not in every recording"
@@ -216,6 +218,8 @@ def _look(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
     for bag in bags:
         _read(bag, [s for s in sources if s.candidates], progress)
     for source in sources:
+        if source.candidates and not source.rate > 0:
+            source.reason, source.candidates = "no time passes between its messages", []
         _sift(source)
     return sources
 
@@ -287,6 +291,9 @@ def _read(bag: Bag, sources: Sequence[Source], progress: Iterate | None) -> None
         try:
             columns = read_columns(bag, [source.topic], [paths], progress)
             arrival, values = columns.arrival, columns.values[0]
+            stamps = columns.stamp[columns.stamp >= 0]
+            if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(arrival) - 1):
+                source.halting = True
         except (RepeatedNamesError, SignalError):
             read = [(t, [path.read(message) for path in paths]) for _, t, message in bag.messages([source.topic])]
             arrival = np.array([t for t, _ in read], dtype=np.int64)
@@ -789,11 +796,14 @@ def _text(
     ]
     offsets = [every[t].offset for t in topics]
     stamped = [o for o in offsets if o is not None]
-    differ = len(stamped) > 0 and (max(stamped) - min(stamped) > 1.0 or (len(stamped) < len(offsets) and _far(stamped)))
+    differ = any(every[t].halting for t in topics)
+    differ |= len(stamped) > 0 and (
+        max(stamped) - min(stamped) > 1.0 or (len(stamped) < len(offsets) and _far(stamped))
+    )
     if differ:
         lines += [
             "",
-            "# Their header stamps and the log do not go by one clock: times of arrival serve for all.",
+            "# Their header stamps stand still, or not all go by one clock: times of arrival serve for all.",
             "topics:",
         ]
         lines += [f"  {_quoted(t)}: {{time: log}}" for t in topics]

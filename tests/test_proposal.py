@@ -7,10 +7,12 @@ import pytest
 import yaml
 from bag_writer import Message, Topic, cdr, header, message, write
 from engine_bag import engine_bag
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.cli import main
-from uncertain_lti.errors import BagError
+from uncertain_lti.errors import BagError, FitError
 from uncertain_lti.proposal import LONGEST_ARRAY, _role, propose
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
@@ -350,6 +352,21 @@ def test_clocks_that_disagree_are_not_mixed(tmp_path):
     assert fitted([path], proposal).fit["transitions"] > 300
 
 
+def test_stamps_that_stand_still_are_not_gone_by(tmp_path):
+    """A driver that stamps every message with the time of its start."""
+    messages = []
+    for m in driven(("/odd", "/plant/cmd")):
+        if m.topic == "/odd":
+            point = message("geometry_msgs/msg/Point", x=float(np.frombuffer(m.data[-8:])[0]), y=0.0, z=0.0)
+            data = cdr("geometry_msgs/msg/PointStamped", header=header(10**18), point=point)
+            m = Message("/plant/state", m.log_time, data, m.log_time)
+        messages.append(m)
+    path = save(tmp_path / "a.mcap", messages, {"/plant/state": "geometry_msgs/msg/PointStamped"})
+    proposal = propose([path])
+    assert yaml.safe_load(proposal.text)["topics"]["/plant/state"] == {"time": "log"}
+    assert fitted([path], proposal).fit["transitions"] > 300
+
+
 def test_topics_and_names_that_yaml_would_misread(tmp_path):
     names = ["yes", "12", "a b", "fan:speed"]
     rng = np.random.default_rng(0)
@@ -393,3 +410,44 @@ def test_init_then_fit_then_what_is_next(tmp_path, capsys):
     assert "next" in capsys.readouterr().out
     assert main(["init", str(path)]) == 0
     assert capsys.readouterr().out == target.read_text()
+
+
+# --- whatever comes ---------------------------------------------------------------------------------------------
+
+WEIRD = [0.0, -0.0, 1.0, 1e-300, 1e300, -1e16, 3.0, 2.0**53, math.pi, math.inf, -math.inf, math.nan]
+NAMES = ["/a", "/a/state", "/a/cmd", "/b/odom_vel", "/desired/x", "/x y/state", "/battery", "/ü", "no_slash", "/12"]
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_whatever_is_recorded_gets_a_file_or_a_sentence(tmp_path_factory, data):
+    """Any topics, rates, lengths of arrays and values, with the steps of a random walk or without any sense."""
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    messages = []
+    for topic in data.draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=4, unique=True)):
+        count, width = data.draw(st.integers(0, 120)), data.draw(st.integers(0, 30))
+        kind = data.draw(st.sampled_from(["walk", "weird", "constant", "steps"]))
+        values = rng.normal(size=(count, width))
+        values = np.cumsum(values, axis=0) if kind == "walk" else values
+        values = np.round(values) if kind == "steps" else values
+        values = np.ones_like(values) if kind == "constant" else values
+        if kind == "weird":
+            values = rng.choice(np.array(WEIRD), size=values.shape)
+        step = data.draw(st.sampled_from([0, 1, 10**6, 10**8]))
+        for k, row in enumerate(values):
+            some = row[: rng.integers(0, width + 1)] if data.draw(st.booleans()) and kind == "weird" else row
+            layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+            messages.append(Message(topic, k * step, cdr(ARRAY, layout=layout, data=some), k * step))
+    messages.sort(key=lambda m: m.log_time)
+    path = save(tmp_path_factory.mktemp("odd") / "a.mcap", messages, {m.topic: ARRAY for m in messages})
+    try:
+        proposal = propose([path])
+    except BagError as error:
+        assert "a.mcap" in str(error)
+        return
+    signals = SignalMap.from_dict(yaml.safe_load(proposal.text))
+    try:
+        (run,) = read_transients([path], signals)
+        fit(run)
+    except FitError as error:  # too few samples, or numbers that no arithmetic holds
+        assert str(error)
