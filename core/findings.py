@@ -107,6 +107,11 @@ def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequ
     return path
 
 
+def shortened(name: str, longest: int = 40) -> str:
+    """A name for a sentence, with its middle left out where it is long."""
+    return name if len(name) <= longest else f"{name[: longest // 2]}…{name[len(name) - longest // 2 + 1 :]}"
+
+
 def sha256(path: str | os.PathLike[str]) -> str:
     """Checksum of a file; raises OSError."""
     with open(path, "rb") as stream:
@@ -300,17 +305,13 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
     names = [name for name, share in wide.items() if share > CAUTION_WIDTH]
     useless = [name for name in names if wide[name] > TOO_WIDE]
     if useless:
-        listed = ", ".join(f"{name} ({wide[name]:.0%})" for name in useless[:6]) + (" ..." if len(useless) > 6 else "")
+        listed = ", ".join(f"{shortened(name)} ({wide[name]:.0%})" for name in useless[:6])
+        listed += " ..." if len(useless) > 6 else ""
         weight = NO if len(useless) == model.n else CARE
-        return [
-            _reason(
-                weight,
-                "tightness",
-                f"bounds over {TOO_WIDE:.0%} as wide as the state's own range say next to nothing: {listed}",
-            )
-        ]
+        text = f"bounds over {TOO_WIDE:.0%} as wide as the state's own range say next to nothing: {listed}"
+        return [_reason(weight, "tightness", text)]
     worst = max(wide, key=lambda name: wide[name])
-    text = f"one-step bounds are at most {wide[worst]:.3g} times as wide as the state's own range ({worst})"
+    text = f"one-step bounds are at most {wide[worst]:.3g} times as wide as the state's own range ({shortened(worst)})"
     return [_reason(CARE if names else YES, "tightness", text)]
 
 
@@ -352,9 +353,8 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     states = {name: s["violations"] for name, s in recording["states"].items() if s["violations"]}
     most = sorted(states, key=lambda name: -states[name])[:3]
     text = f"{over}: {bad} violated, {_episodes_word(recording['episode_count'])}, first at "
-    text += (
-        f"{recording['episodes'][0]['first']['t']:.4g} s; most often {', '.join(f'{n} ({states[n]})' for n in most)}"
-    )
+    listed = ", ".join(f"{shortened(name)} ({states[name]})" for name in most)
+    text += f"{recording['episodes'][0]['first']['t']:.4g} s; most often {listed}"
     if recording["alarm"]:
         first = recording["alarms"][0]
         times = "once" if len(recording["alarms"]) == 1 else f"{len(recording['alarms'])} times"

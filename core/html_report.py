@@ -20,7 +20,7 @@ from uncertain_lti import plots
 from uncertain_lti.bag_arrays import Progress
 from uncertain_lti.errors import BagError, ModelError
 from uncertain_lti.files import whole_file
-from uncertain_lti.findings import APART, CARE, NO, YES
+from uncertain_lti.findings import APART, CARE, NO, YES, shortened
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.report import number
@@ -29,6 +29,7 @@ MOST_DRAWN = 8
 """Recordings with figures of their own; those with most violations."""
 _MOST_STATES = 8
 _MOST_ROWS = 40
+_MOST_EPISODES = 20
 _DPI = 105
 _COLOURS = 96
 
@@ -204,8 +205,6 @@ def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]
         f"Outside the fitted ranges: {facts['outside_domain']}.</p>"
     )
     parts += [f'<p class="soft">{_text(note)}</p>' for note in facts["notes"][:5]]
-    if facts["episodes"]:
-        parts.append(_episodes(facts))
     worst = sorted(model.state_names, key=lambda name: -states[name]["violations"])[:_MOST_STATES]
     shown = [name for name in model.state_names if name in worst]
     some = f"{len(shown)} of {model.n} states, those with most violations. " if len(shown) < model.n else ""
@@ -215,6 +214,8 @@ def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]
             f"{some}Recorded values between their one-step bounds; marks: violated, at the foot of a panel as well.",
         )
     )
+    if facts["episodes"]:
+        parts.append(_episodes(facts))
     span = _close_up(verdicts, facts)
     if span is not None:
         bad = [name for name in shown if states[name]["violations"]]
@@ -249,9 +250,9 @@ def _close_up(verdicts: Verdicts, facts: Mapping[str, Any]) -> tuple[float, floa
 
 def _episodes(facts: Mapping[str, Any]) -> str:
     rows = []
-    for e in facts["episodes"][:_MOST_ROWS]:
+    for e in facts["episodes"][:_MOST_EPISODES]:
         where = sorted(e["states"].items(), key=lambda item: -item[1]["violations"])
-        listed = ", ".join(f"{name} ({s['violations']}, worst {_utilisation(s)})" for name, s in where[:4])
+        listed = ", ".join(f"{shortened(name)} ({s['violations']}, worst {_utilisation(s)})" for name, s in where[:4])
         more = f" and {len(where) - 4} more" if len(where) > 4 else ""
         rows.append(
             [
@@ -264,8 +265,8 @@ def _episodes(facts: Mapping[str, Any]) -> str:
         )
     header = ("first [s]", "last [s]", "violated", "alarm", "states (violations, worst utilisation)")
     text = f"<p>Episodes (violations with fewer than {APART} verdicts between them): {facts['episode_count']}.</p>"
-    if facts["episode_count"] > _MOST_ROWS:
-        text += f'<p class="soft">The first {_MOST_ROWS}; <code>--json</code> has more.</p>'
+    if facts["episode_count"] > _MOST_EPISODES:
+        text += f'<p class="soft">The first {_MOST_EPISODES}; <code>--json</code> has more.</p>'
     return text + _table(header, rows, left=(4,))
 
 

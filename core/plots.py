@@ -208,7 +208,7 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
     rows = []
     for i, name in enumerate(model.state_names):
         unit = model.signals.states[i].unit
-        rows.append(f"{_short(name)}\n{width[i]:.3g}{' ' + _plain(unit) if unit else ''}")
+        rows.append(f"{_short(name)}\n{width[i]:.4g}{' ' + _plain(unit) if unit else ''}")
     numbers = shares.size <= 250
     few = len(rows) <= 12
     if not few:
