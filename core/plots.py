@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.errors import ModelError
+from uncertain_lti.files import whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.transient import Transient
@@ -329,7 +330,14 @@ def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) 
     """Write a figure to an image file, whose ending says the format, or as PNG to a stream. Raises OSError."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names may be in any script
-        figure.savefig(path, dpi=dpi)
+        if not isinstance(path, (str, os.PathLike)):
+            figure.savefig(path, dpi=dpi)
+            return
+        kind = os.path.splitext(path)[1][1:] or "png"
+        if kind not in figure.canvas.get_supported_filetypes():
+            raise ModelError(f"{path}: no image is written as '{kind}'; end the name in .png, .svg or .pdf")
+        with whole_file(path) as stream:
+            figure.savefig(stream, dpi=dpi, format=kind)
 
 
 # --- long recordings, by pixel ----------------------------------------------------------------------------------
