@@ -354,11 +354,11 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     most = sorted(states, key=lambda name: -states[name])[:3]
     text = f"{over}: {bad} violated, {_episodes_word(recording['episode_count'])}, first at "
     listed = ", ".join(f"{shortened(name)} ({states[name]})" for name in most)
-    text += f"{recording['episodes'][0]['first']['t']:.4g} s; most often {listed}"
+    text += f"{recording['episodes'][0]['first']['t']:.8g} s; most often {listed}"
     if recording["alarm"]:
         first = recording["alarms"][0]
         times = "once" if len(recording["alarms"]) == 1 else f"{len(recording['alarms'])} times"
-        text += f". The alarm was raised {times}, first at {first['t']:.4g} s"
+        text += f". The alarm was raised {times}, first at {first['t']:.8g} s"
         return {"recording": recording["recording"], "state": "alarm", "text": text}
     return {"recording": recording["recording"], "state": "violations", "text": f"{text}. The alarm was not raised"}
 
