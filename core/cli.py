@@ -349,7 +349,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
     from contextlib import ExitStack
 
     from uncertain_lti.archive import fit_archive
-    from uncertain_lti.report import archive_text
+    from uncertain_lti.report import archive_text, next_text
 
     if options.discard:
         raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
@@ -385,6 +385,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
     else:
         _tell(options, archive_text(model))
         _tell(options, f"model written to {output}")
+        _tell(options, next_text(model, shlex.quote(str(output)), None))
     return DONE
 
 

@@ -135,7 +135,7 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
             f"{1 - inside:.1%} of what was left out falls outside, so expect false alarms; record more of what the "
             f"machine will do, or let validate --false-alarms find an alarm rule that stays quiet"
         )
-    elif facts["messages"]:
+    elif facts.get("messages"):
         worry = facts["messages"][0]
     elif facts["transients"] == 1:
         worry = "one recording says nothing of another day; check the model on one that was not fitted"

@@ -338,6 +338,17 @@ def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
     assert "Traceback" not in player.succeed(5)
 
 
+def test_quiet_says_nothing_but_errors(world: World, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 2 * 10**9, 10**8))).save(tmp_path / "in.mcap")
+    process = world.command("record", "/x", "--output", output, "--duration", "1", "--quiet")
+    player = world.command("play", bag, "--quiet")
+    assert player.succeed(20) == "" and process.succeed(20) == ""
+    assert Bag(output).topics["/x"].count > 5
+    again = world.command("record", "/x", "--output", output, "--quiet")
+    assert again.wait(20) == 2 and "is there already" in again.output
+
+
 # --- the plant ----------------------------------------------------------------------------------------------
 
 
