@@ -346,7 +346,7 @@ def test_quiet_says_nothing_but_errors(world: World, tmp_path: Path) -> None:
     assert player.succeed(20) == "" and process.succeed(20) == ""
     assert Bag(output).topics["/x"].count > 5
     again = world.command("record", "/x", "--output", output, "--quiet")
-    assert again.wait(20) == 2 and "is there already" in again.output
+    assert again.wait(20) != 0 and "is there already" in again.output
 
 
 # --- the plant ----------------------------------------------------------------------------------------------
