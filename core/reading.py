@@ -294,9 +294,12 @@ def _stream_for_model(
             f"fit the model to recordings"
         )
     stream = read_stream(bag, signals, progress)
+    for position, topic in enumerate(signals.topics):
+        if not (stream.topic == position).any():
+            raise BagError(
+                f"{bag.path}: {topic} has no message, so nothing can be judged; record it, or choose another recording"
+            )
     stamps = stream.stamp[stream.topic == signals.topics.index(signals.clock)]
-    if not len(stamps):
-        raise BagError(f"{bag.path}: {signals.clock} has no message; record it, or choose another recording")
     if signals.time[signals.clock] == "header" and not (stamps > 0).any():
         raise SignalError(
             f"{bag.path}: no message of {signals.clock} has a stamp, and the model goes by them; fit it to such "
@@ -322,7 +325,10 @@ def _types(bags: Sequence[Bag], signals: SignalMap) -> Mapping[str, str]:
 
 
 def _resolve_operating_point(signals: SignalMap, transients: Sequence[Transient]) -> tuple[SignalMap, str]:
-    recordings = [np.hstack([t.x, t.u])[:-1] for t in transients]  # the last row has no control yet
+    recordings = []
+    for t in transients:
+        rows = np.hstack([t.x, t.u])[:-1]  # the last row has no control yet
+        recordings += np.split(rows, np.flatnonzero(np.diff(t.segment[:-1])) + 1)  # nobody knows what was in a gap
     steady, scale, words = resolve_auto(signals.signals, recordings)
     filled = [replace(s, steady=a, scale=b) for s, a, b in zip(signals.signals, steady, scale, strict=True)]
     n = len(signals.states)

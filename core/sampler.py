@@ -16,7 +16,8 @@ from uncertain_lti.signals import FieldPath, SignalMap
 
 _TWO_PI = 2.0 * math.pi
 BUFFERED_MESSAGES = 10_000
-"""Messages kept per topic that wait for a later sample; older ones go first."""
+"""Messages kept per topic that wait for a later sample; at this many, all but the later half and the one that the
+open sample has chosen so far are forgotten."""
 REMEMBERED_SAMPLES = 100
 """Closed samples that a message is held against to see whether it came late."""
 KEPT_OVER_A_JUMP = 100
@@ -94,13 +95,29 @@ class _Message:
 class _Topic:
     """Messages of one topic that may still be chosen, and how far it got."""
 
-    __slots__ = ("header", "kept", "last", "ahead", "closed", "unwrap", "previous", "steady")
+    __slots__ = (
+        "header",
+        "clock_has_stamps",
+        "kept",
+        "forgotten",
+        "last",
+        "ahead",
+        "behind",
+        "leave",
+        "closed",
+        "unwrap",
+        "previous",
+        "steady",
+    )
 
-    def __init__(self, header: bool, unwrap: list[int], steady: list[float]) -> None:
-        self.header = header
-        self.kept: deque[_Message] = deque(maxlen=BUFFERED_MESSAGES)
+    def __init__(self, header: bool, clock_has_stamps: bool, unwrap: list[int], steady: list[float]) -> None:
+        self.header, self.clock_has_stamps = header, clock_has_stamps
+        self.kept: deque[_Message] = deque()
+        self.forgotten: dict[bool, tuple[int, int]] = {}  # first and last stamp, arrival of what there was no room for
         self.last: dict[bool, int] = {}  # instant of the last message with a stamp, and of the last one without
         self.ahead = False  # its time has stepped back, the clock's perhaps not yet
+        self.behind = False  # the clock's time has stepped back, its own not yet
+        self.leave: tuple[_Message, _Message] | None = None  # a sample of the pass before, and what it has chosen
         self.closed: deque[tuple[_Message, _Message | None]] = deque(maxlen=REMEMBERED_SAMPLES)  # and what they chose
         self.unwrap = unwrap
         self.steady = steady
@@ -125,13 +142,50 @@ class _Topic:
         return False
 
     def choose(self, sample: _Message) -> _Message | None:
-        """The message with the greatest stamp at or before the sample, ties to the latest arrival."""
+        """The message with the greatest stamp at or before the sample, ties to the latest arrival.
+
+        None where there is none, or it has been forgotten.
+        """
+        if self.leave is not None and self.leave[0] is sample:
+            return self.leave[1]
         chosen, age = None, 2**63
         for message in self.kept:
             behind = _behind(sample, message)
             if 0 <= behind <= age:
                 chosen, age = message, behind
+        for by_stamp, (first, last) in self.forgotten.items():
+            instant = sample.stamp if by_stamp else sample.arrival
+            if instant is None or (first <= instant and max(instant - last, 0) < age):
+                return None  # perhaps; there may be nothing between the sample and what would be chosen
         return chosen
+
+    def keep(self, message: _Message, sample: _Message | None) -> None:
+        """Take a message that may be chosen; sample is the open one."""
+        if len(self.kept) >= BUFFERED_MESSAGES:
+            held = None if sample is None else self.choose(sample)
+            older = [self.kept.popleft() for _ in range(len(self.kept) // 2)]
+            if held is not None and any(m is held for m in older):
+                self.kept.appendleft(held)
+            for m in older:
+                if sample is None or _behind(sample, m) < 0:
+                    by_stamp = self.clock_has_stamps and m.stamp is not None
+                    instant = m.arrival if m.stamp is None or not by_stamp else m.stamp
+                    first, last = self.forgotten.get(by_stamp, (instant, instant))
+                    self.forgotten[by_stamp] = min(first, instant), max(last, instant)
+        self.kept.append(message)
+
+    def start_anew(self, sample: _Message | None) -> None:
+        """The topic's time has stepped back, as in a bag that is played again: what was kept is of the last pass.
+
+        The open sample may be of that pass too, where the clock has not stepped back yet.
+        """
+        held = None if sample is None or self.behind else self.choose(sample)
+        self.leave = (sample, held) if sample is not None and held is not None else None
+        self.kept.clear()
+        self.forgotten.clear()
+        self.closed.clear()
+        self.ahead, self.behind = True, False
+        self.previous = list(self.steady)
 
     def close(self, sample: _Message, chosen: _Message | None, reset: bool) -> None:
         """Forget what no later sample can choose.
@@ -139,17 +193,31 @@ class _Topic:
         Where time jumps, later samples are earlier: what came before them on the new time is kept.
         """
         jumps = reset or (self.ahead and len(self.kept) < KEPT_OVER_A_JUMP)
+        if self.leave is not None:  # chosen is not among those kept
+            jumps, self.leave = True, None
         if chosen is not None and not jumps:
             kept = self.kept
             while kept[0] is not chosen and _behind(sample, kept[0]) >= 0:  # most often this is all
                 kept.popleft()
             if len(kept) > 1:
-                self.kept = deque((m for m in kept if m is chosen or _behind(sample, m) < 0), BUFFERED_MESSAGES)
+                self.kept = deque(m for m in kept if m is chosen or _behind(sample, m) < 0)
+            if self.forgotten:
+                self._forget_until(sample)
         if reset:
+            self.behind = not self.ahead
             self.ahead = False
             self.closed.clear()  # nothing of this pass can be late for a sample of the one before
         else:
             self.closed.append((sample, chosen))
+
+    def _forget_until(self, sample: _Message) -> None:
+        """What was forgotten of the time before a sample that has chosen matters to no later one."""
+        for by_stamp, (first, last) in list(self.forgotten.items()):
+            instant = sample.stamp if by_stamp else sample.arrival
+            if instant is not None and last <= instant:
+                del self.forgotten[by_stamp]
+            elif instant is not None:
+                self.forgotten[by_stamp] = max(first, instant + 1), last
 
     def unwrapped(self, values: list[float]) -> list[float]:
         for i in self.unwrap:
@@ -222,7 +290,9 @@ class Sampler:
             here = [signals.signals[i] for i in where]
             unwrap = [i for i, s in enumerate(here) if FieldPath(s.field).unwrap]
             steady = [0.0 if s.steady == "auto" else s.steady for s in here]
-            self._topics[topic] = _Topic(signals.time[topic] == "header", unwrap, steady)
+            self._topics[topic] = _Topic(
+                signals.time[topic] == "header", signals.time[self.clock] == "header", unwrap, steady
+            )
         self.counters: Counter[str] = Counter()
         self._open: _Message | None = None  # sample k: the clock message that opened it
         self._open_status = Status.FIRST
@@ -251,16 +321,13 @@ class Sampler:
             raise ValueError(f"{topic}: {len(message.values)} values for {len(self._where[topic])} signals")
         if topic == self.clock:
             return self._push_clock(state, message)
-        if state.steps_back(message, self.max_gap_ns):  # a looped bag: what was kept belongs to the last pass
-            state.kept.clear()
-            state.closed.clear()
-            state.ahead = True
-            state.previous = list(state.steady)
+        if state.steps_back(message, self.max_gap_ns):
+            state.start_anew(self._open)
         elif state.came_late(message):
             self.counters[f"late {topic}"] += 1
         if state.unwrap:
             state.unwrapped(message.values)
-        state.kept.append(message)
+        state.keep(message, self._open)
         return []
 
     def _push_clock(self, state: _Topic, message: _Message) -> list[Step]:
@@ -420,8 +487,13 @@ def resolve(
     Raises
     ------
     SignalError
-        The clock has fewer than two distinct instants.
+        The clock has fewer than two distinct instants, or max_skew is given and no state is on another topic.
     """
+    if signals.max_skew is not None and len({s.topic for s in signals.states}) == 1:
+        raise SignalError(
+            f"{signals.source}: max_skew limits the age of states from another topic than the clock, and all states "
+            f"are on {signals.states[0].topic}; leave it out (the age of a control is limited by max_hold)"
+        )
     min_step_ns = to_ns(signals.min_step)
     medians = {t: median_step_ns(instants[t], min_step_ns) for t in dict.fromkeys(s.topic for s in signals.states)}
     clock = signals.clock or max(medians, key=lambda t: medians[t] or 0)

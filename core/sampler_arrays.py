@@ -216,8 +216,9 @@ class _Sampling:
             raise _BackwardError
         arrived = np.searchsorted(others.order, samples.order[1:])  # how many had, when each sample closed
         chosen = _latest(time, at[:-1], arrived)
-        if (arrived - chosen > BUFFERED_MESSAGES)[chosen >= 0].any():
-            raise _BackwardError  # the Sampler may have forgotten it
+        opened = np.searchsorted(others.order, samples.order[:-1])
+        if (opened - chosen >= BUFFERED_MESSAGES // 2)[chosen >= 0].any():
+            raise _BackwardError  # the Sampler may have forgotten it before the sample opened
         self._count(f"late {name}", self._late(others, samples, time, at[:-1], chosen))
 
         values = self._unwrapped(name, others.values, np.zeros(len(others.order), dtype=bool))

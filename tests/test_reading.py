@@ -101,6 +101,8 @@ def test_recordings_become_what_the_rules_say(
 ) -> None:
     signals, messages = case
     signals = by_position(signals)
+    if len({s.topic for s in signals.states}) == 1:
+        signals = replace(signals, max_skew=None)  # else an error: it would limit nothing
     path = save(
         tmp_path_factory.getbasetemp(),
         dict.fromkeys(signals.topics, JOINT_STATE),
@@ -580,6 +582,21 @@ def test_a_recording_of_another_type_is_not_judged(tmp_path: Path) -> None:
         read_for_model(three, model_of(fitted.signals))
 
 
+@pytest.mark.parametrize("seam", [5000, -5000])
+def test_a_still_stretch_ends_where_nobody_recorded(tmp_path: Path, seam: int) -> None:
+    """12 samples at 3, a gap or a step back, 12 more at 3; and 15 in a row at 1, which is the longest then."""
+    values = [3.0] * 12 + [3.0] * 12 + list(np.linspace(2.8, 1.2, 5)) + [1.0] * 15
+    stamps = [10_000 + 10 * k + (seam if k >= 12 else 0) for k in range(len(values))]
+    messages = [
+        ("/x", k * 10 * MS, joint_state(stamp * MS, [value]))
+        for k, (stamp, value) in enumerate(zip(stamps, values, strict=True))
+    ]
+    path = save(tmp_path, {"/x": JOINT_STATE}, messages)
+    (transient,) = read_transients(path, SignalMap((Signal("x", "/x", "position[0]", "auto", "auto"),)))
+    assert transient.signals is not None
+    assert (transient.signals.states[0].steady, transient.signals.states[0].scale) == (1.0, 3.0)
+
+
 def test_a_model_of_arrays_names_no_topics(tmp_path: Path) -> None:
     model = UncertainLTI(np.eye(1), np.zeros((1, 0)), np.eye(1), np.zeros((1, 0)))
     path = float_bag(tmp_path, "a.mcap", range(0, 100 * MS, 10 * MS), [0])
@@ -597,8 +614,17 @@ def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path
     with pytest.raises(SignalError, match="zero.mcap: no message of /x has a stamp, and the model goes by them"):
         read_for_model(zero, model)
     silent = save(tmp_path, {"/x": JOINT_STATE, "/y": FLOAT64}, [("/y", 1, float64(1.0))], "silent.mcap")
-    with pytest.raises(BagError, match="silent.mcap: /x has no message; record it"):
+    with pytest.raises(BagError, match="silent.mcap: /x has no message, so nothing can be judged; record it"):
         read_for_model(silent, model)
+    driven = replace(fitted.signals, controls=(Signal("y", "/y", "data"),), time={**fitted.signals.time, "/y": "log"})
+    quiet = save(
+        tmp_path,
+        {"/x": JOINT_STATE, "/y": FLOAT64},
+        [("/x", k * MS, joint_state((k + 1) * MS, [k])) for k in range(9)],
+        "quiet.mcap",
+    )
+    with pytest.raises(BagError, match="quiet.mcap: /y has no message, so nothing can be judged; record it"):
+        read_for_model(quiet, model_of(driven))
     vague = model_of(SignalMap((Signal("x", "/x", "position[0]"),)))
     with pytest.raises(SignalError, match="does not say clock, max_gap and time of every topic"):
         read_for_model(good, vague)

@@ -170,6 +170,29 @@ class Reference:
             gone |= {i for i in arrived if self.age(sample, i) >= 0} - {sample.chosen[topic]}
         return gone
 
+    def _best(self, sample: Sample, candidates: Sequence[int]) -> tuple[int, int] | None:
+        """Age and index of the message with the greatest stamp at or before the sample, ties to the latest arrival."""
+        ages = [(self.age(sample, i), -i) for i in candidates if self.age(sample, i) >= 0]
+        return (min(ages)[0], -min(ages)[1]) if ages else None
+
+    def _left(self, sample: Sample, topic: str) -> tuple[int, int] | None:
+        """What an open sample had chosen when its topic stepped back before the clock did: of the same pass."""
+        resets = [s.index for s in self.samples if s.status is Status.RESET]
+        ahead = behind = False
+        begin = 0
+        for event in sorted({*resets, *self.jumps[topic]}):
+            if event in resets:
+                ahead, behind = False, not ahead
+                continue
+            if sample.index < event < sample.closed_by and not behind:
+                candidates = {i for i in self.by_topic[topic] if begin <= i < event}
+                if self.forgets:
+                    candidates -= self.passed_over(topic, sample)
+                if best := self._best(sample, sorted(candidates)):
+                    return best
+            ahead, behind, begin = True, False, event
+        return None
+
     def _close(self, sample: Sample) -> None:
         z = [NAN] * len(self.signals.signals)
         for topic in self.signals.topics:
@@ -181,12 +204,12 @@ class Reference:
                 if self.forgets:
                     gone = self.passed_over(topic, sample)
                     candidates = [i for i in candidates if i not in gone]
-                ages = [(self.age(sample, i), -i) for i in candidates if self.age(sample, i) >= 0]
                 sample.chosen[topic] = None
-                if not ages:
+                best = self._left(sample, topic) or self._best(sample, candidates)
+                if best is None:
                     continue
-                age, chosen = min(ages)
-                chosen = sample.chosen[topic] = -chosen
+                age, chosen = best
+                sample.chosen[topic] = chosen
             for position, value in zip(where, self.values[topic][chosen], strict=True):
                 signal = self.signals.signals[position]
                 limit = self.signals.max_skew or self.signals.max_gap
@@ -544,16 +567,74 @@ def test_latest_changes_nothing_and_is_what_would_be_fixed_now(case: tuple[Signa
     assert watched.counters == quiet.counters
 
 
-def test_memory_is_bounded_while_no_sample_closes() -> None:
+def test_the_held_value_outlives_any_number_of_messages_while_its_sample_is_open() -> None:
     signals = two_topics(max_gap=1e6)
     sampler = Sampler(signals)
-    sampler.push("/c", 1, 1, [0.0])
-    for stamp in range(2, BUFFERED_MESSAGES + 1000):
+    sampler.push("/u", 1, 1, [-7.0])
+    sampler.push("/c", 2, 2, [0.0])
+    for stamp in range(3, 3 * BUFFERED_MESSAGES):
         sampler.push("/u", stamp, stamp, [float(stamp)])
-    assert len(sampler._topics["/u"].kept) == BUFFERED_MESSAGES
-    sampler.push("/c", 10**6, 10**6, [0.0])
+        assert len(sampler._topics["/u"].kept) <= BUFFERED_MESSAGES
+    (step,) = sampler.push("/c", 10**6, 10**6, [0.0])
+    assert step.u.tolist() == [-7.0] and step.status is Status.OK
     (step,) = sampler.push("/c", 2 * 10**6, 2 * 10**6, [0.0])
-    assert step.u.tolist() == [BUFFERED_MESSAGES + 999.0]
+    assert step.u.tolist() == [3 * BUFFERED_MESSAGES - 1.0]
+
+
+def test_what_has_been_forgotten_is_missing_and_not_replaced_by_something_older() -> None:
+    """A clock so late that more messages arrive before it than are kept."""
+    signals = two_topics(max_gap=1e6)
+    sampler = Sampler(signals)
+    sampler.push("/u", 1, 1, [-7.0])
+    sampler.push("/c", 2, 2, [0.0])
+    for stamp in range(3, 3 * BUFFERED_MESSAGES):
+        sampler.push("/u", stamp, stamp, [float(stamp)])
+    end = 3 * BUFFERED_MESSAGES
+    steps = [sampler.push("/c", end + k, stamp, [0.0])[0] for k, stamp in enumerate([100, end - 5, end - 1])]
+    assert [s.u.tolist() for s in steps[:1]] == [[-7.0]]
+    assert math.isnan(steps[1].u[0]) and steps[1].status is Status.MISSING
+    assert steps[2].u.tolist() == [end - 5.0]
+    assert sampler.counters["missing u"] == 1
+
+
+@settings(max_examples=300)
+@given(case=cases() | cases(tame=True), room=st.integers(4, 8))
+def test_little_room_makes_values_missing_and_never_wrong(case: tuple[SignalMap, list[Sent]], room: int) -> None:
+    signals, messages = case
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uncertain_lti.sampler.BUFFERED_MESSAGES", room)
+        patch.setattr("uncertain_lti.sampler.KEPT_OVER_A_JUMP", 0)  # else the same messages are not kept either way
+        cramped, sampler = run(signals, messages)
+        assert all(len(topic.kept) <= room for topic in sampler._topics.values())
+        patch.setattr("uncertain_lti.sampler.BUFFERED_MESSAGES", 10_000)
+        roomy, _ = run(signals, messages)
+    for mine, theirs in zip(only(cramped), only(roomy), strict=True):
+        assert (mine.t_ns, mine.arrival_ns) == (theirs.t_ns, theirs.arrival_ns)
+        assert mine.status is theirs.status or mine.status is Status.MISSING
+        for left, right in ((mine.x, theirs.x), (mine.u, theirs.u), (mine.x_next, theirs.x_next)):
+            assert all(math.isnan(a) or a == b for a, b in zip(left, right, strict=True))
+
+
+def test_the_last_transition_of_a_pass_is_judged_though_a_state_topic_starts_the_next_pass_first() -> None:
+    signals = SignalMap(
+        (Signal("x", "/c", "data"), Signal("y", "/s", "data")),
+        clock="/c",
+        max_gap=0.05,
+        time={"/c": "header", "/s": "header"},
+    )
+    one = [m for k in range(10, 14) for m in (at("/s", k, k, float(k)), at("/c", k, k))]
+    again = [m._replace(arrival=m.arrival + 20 * TICK) for m in one]
+    far = [m._replace(stamp=m.stamp + 100 * TICK) for m in one]
+    for stream in (far + again, far + [again[0], again[2], again[1], *again[3:]]):
+        steps = only(run(signals, stream)[0])
+        assert [s.status for s in steps[:5]] == [Status.FIRST, Status.OK, Status.OK, Status.OK, Status.RESET]
+        assert steps[3].x_next.tolist() == [1.0, 13.0]
+
+
+def test_max_skew_that_limits_nothing_is_an_error() -> None:
+    signals = SignalMap((Signal("x", "/c", "data"),), (Signal("u", "/u", "data"),), max_skew=0.1)
+    with pytest.raises(SignalError, match="all states are on /c; leave it out"):
+        resolve(signals, {"/c": [np.arange(9) * TICK], "/u": [np.arange(9) * TICK]}, {"/c": "log", "/u": "log"})
 
 
 # --- what a signals file leaves open -------------------------------------------------------------------------
