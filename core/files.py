@@ -14,7 +14,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Stream to a file that takes the place of `path` when the block ends without an error, and else is removed.
 
     Whatever ends the block early, Ctrl-C included, leaves what was there before. What is no file, such as /dev/null
-    or a pipe, is written to as it stands.
+    or a pipe, is written to as it stands; a link goes on pointing where it does.
 
     Raises
     ------
@@ -25,7 +25,8 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with open(path, "wb") as stream:
             yield stream
         return
-    folder, name = os.path.split(os.path.abspath(path))
+    path = os.path.realpath(path)
+    folder, name = os.path.split(path)
     descriptor, temporary = tempfile.mkstemp(dir=folder, prefix=f".{name[:100]}-", suffix=".tmp")
     try:
         with os.fdopen(descriptor, "wb") as stream:

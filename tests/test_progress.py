@@ -164,6 +164,17 @@ def _umask():
     return mask
 
 
+def test_a_link_goes_on_pointing_where_it_does(tmp_path):
+    (tmp_path / "there").mkdir()
+    link = tmp_path / "m.json"
+    link.symlink_to("there/m.json")
+    for content in (b"one", b"two"):
+        with whole_file(link) as stream:
+            stream.write(content)
+        assert link.is_symlink() and (tmp_path / "there" / "m.json").read_bytes() == content
+    assert len(list(tmp_path.rglob("*"))) == 3
+
+
 def test_what_is_no_file_is_written_to_and_stays():
     with whole_file(os.devnull) as stream:
         stream.write(b"gone")
