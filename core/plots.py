@@ -436,6 +436,13 @@ class _Drawn:
         at = np.flatnonzero(self.after)
         return [np.insert(array, at, np.nan) for array in (self.t, *values)]
 
+    def alarms(self) -> list[tuple[float, float]]:
+        """(begin, length) of each stretch of alarm, s: from the verdict that raised it to the one that ended it."""
+        if self.binned:
+            return self.spans(self.alarm)
+        runs = np.flatnonzero(np.diff(np.concatenate([[False], self.alarm, [False]]).astype(np.int8))).reshape(-1, 2)
+        return [(float(self.t[a]), float(self.t[min(b, len(self.t) - 1)] - self.t[a])) for a, b in runs]
+
     def spans(self, which: Mask) -> list[tuple[float, float]]:
         """(begin, length) of each run, s."""
         edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8))).reshape(-1, 2)
@@ -612,7 +619,7 @@ def _shade(axis: Any, drawn: _Drawn) -> None:
         if b - a > 1e-9 * length
     ]
     for spans, colour, alpha in (
-        (drawn.spans(drawn.alarm), ALARM, 0.45),
+        (drawn.alarms(), ALARM, 0.45),
         ((drawn.spans(silent) if not drawn.binned else drawn.spans(~drawn.judged)) + holes, NO_VERDICT, 0.35),
     ):
         if spans:
