@@ -398,13 +398,13 @@ class _Move(NamedTuple):
 class _Span(NamedTuple):
     """Bytes of a segment that are copied out of each message as words of eight bytes; places count from its begin.
 
-    compared are words, what they have to be, and which bits count; parts are numbers that values are worked out
-    from.
+    compared are words, what they have to be, and which bits count (None: all); parts are numbers that values are
+    worked out from.
     """
 
     at: int
     words: int
-    compared: list[tuple[slice, NDArray[np.uint64], NDArray[np.uint64]]]
+    compared: list[tuple[slice, NDArray[np.uint64], NDArray[np.uint64] | None]]
     moves: list[_Move]
     parts: list[_Number]
 
@@ -469,8 +469,10 @@ class _Layout:
         copies = numbers_at(some.data, f"V{8 * span.words}")[some.anchor + span.at]
         words = copies.view("<u8").reshape(-1, span.words)
         for which, expected, bits in span.compared:
-            wrong = words[:, which] ^ expected
-            wrong &= bits
+            if bits is None:
+                wrong = words[:, which] != expected
+            else:
+                wrong = (words[:, which] ^ expected) & bits
             if wrong.any():
                 fit: Mask = ~np.asarray(wrong.any(axis=1))
                 some.keep(fit)
@@ -576,7 +578,10 @@ def _spans(segment: _Segment, around: bytes, plain: set[int]) -> list[_Span]:
             if begin <= at < end:
                 mask[at - begin : at - begin + len(bits)] |= np.frombuffer(bits, np.uint8)
         bits64 = mask.view("<u8")
-        compared = [(run, expected[run] & bits64[run], bits64[run]) for run in _runs(bits64 != 0)]
+        compared: list[tuple[slice, NDArray[np.uint64], NDArray[np.uint64] | None]] = []
+        for run in _runs(bits64 != 0):
+            every = bool((bits64[run] == 2**64 - 1).all())
+            compared.append((run, expected[run] & bits64[run], None if every else bits64[run]))
         numbers = [n._replace(at=n.at - begin) for n in segment.numbers if begin <= n.at < end]
         moves = _moves([n for n in numbers if n.goal[0] in plain])
         spans.append(_Span(begin, (end - begin) // 8, compared, moves, [n for n in numbers if n.goal[0] not in plain]))

@@ -12,8 +12,9 @@ import re
 import struct
 import zlib
 from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import BinaryIO, NoReturn
+from typing import BinaryIO, NamedTuple, NoReturn
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from uncertain_lti.bag_files import os_error
 from uncertain_lti.cdr_arrays import SLACK, numbers_at
 from uncertain_lti.errors import BagError
-from uncertain_lti.mcap_records import CHUNK, MESSAGE, RECORD, Block, Contents, parse, walk
+from uncertain_lti.mcap_records import MESSAGE, RECORD, Block, Contents, parse, walk
 
 Integers = NDArray[np.int64]
 
@@ -34,11 +35,14 @@ _STRIDE = 1 << 15  # bytes between two walkers in a large block
 _LOOK = 1 << 14  # bytes in which a walker looks for its first message
 _LIKE_A_MESSAGE = re.compile(rb"\x05.{4}\0{4}", re.DOTALL)
 _NEAR = 1 << 16  # bytes between blocks that are read along
+_FEW = 100  # messages in a block that one walker passes soon enough
 _LONG_INDEX = 1 << 10  # bytes per channel from which on an index is faster than looking
 _CHANNEL_AT = RECORD.size
 _LOG_TIME_AT = RECORD.size + 6
 _DATA_AT = RECORD.size + MESSAGE.size
-_LENGTH = struct.Struct("<Q")
+_CHECKSUM_AT = RECORD.size + 24
+_FEW_BLOCKS = 32
+_AHEAD = 1 << 24  # bytes; a larger batch is not read while another one is worked on
 
 
 class IndexMismatchError(Exception):
@@ -73,12 +77,11 @@ def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
     wanted = np.zeros(1 << 16, dtype=bool)
     wanted[list(channels)] = True
     missing = {channel: contents.tally[channel].count for channel in channels if channel in contents.tally}
+    groups = list(_groups([block for block in contents.blocks if not block.channels.isdisjoint(missing)]))
     try:
         with open(contents.path, "rb", buffering=0) as stream:
-            loader = _Loader(contents, stream)
-            for blocks in _groups([block for block in contents.blocks if not block.channels.isdisjoint(missing)]):
-                places = loader.load(blocks)
-                batch = _messages(loader.data, _starts(loader.data, places, contents), wanted, contents)
+            for data, places in _loaded(contents, stream, groups):
+                batch = _messages(data, _starts(data, places, contents), wanted, contents)
                 counts = np.bincount(batch.channel, minlength=1 << 16)
                 for channel in missing:
                     missing[channel] -= int(counts[channel])
@@ -102,6 +105,35 @@ def _groups(blocks: Sequence[Block]) -> Iterator[list[Block]]:
         size += block.length
     if group:
         yield group
+
+
+def _loaded(
+    contents: Contents, stream: BinaryIO, groups: Sequence[Sequence[Block]]
+) -> Iterator[tuple[bytearray, list[_Place]]]:
+    """Blocks in buffers, group after group; a thread reads the next while one is worked on, into another buffer.
+
+    Of many small blocks the thread leaves what goes block by block to its caller: two threads that take turns every
+    few microseconds only wait for each other.
+    """
+    loaders = [_Loader(contents, stream) for _ in groups[:2]]
+    if len(groups) < 2 or max(sum(block.length for block in group) for group in groups) > _AHEAD:
+        for group in groups:
+            places = loaders[0].place(loaders[0].fetch(group))
+            yield loaders[0].data, places
+        return
+
+    def begin(number: int) -> Future[tuple[list[_Run], list[_Place] | None]]:
+        return thread.submit(loaders[number % 2].work_ahead, groups[number])
+
+    with ThreadPoolExecutor(1) as thread:
+        loading = begin(0)
+        for number in range(len(groups)):
+            runs, places_there = loading.result()
+            if number + 1 < len(groups):
+                loading = begin(number + 1)
+            loader = loaders[number % 2]
+            places = loader.place(runs) if places_there is None else places_there
+            yield loader.data, places
 
 
 def _begin(block: Block) -> int:
@@ -128,14 +160,26 @@ def _runs(blocks: Sequence[Block]) -> Iterator[list[Block]]:
 # --- from the file into the buffer --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
+class _Place(NamedTuple):
     """Where the records of a block are in the buffer; offsets of its messages from begin, as its index has them."""
 
     block: Block
     begin: int
     end: int
     offsets: Integers | None
+
+
+class _Run(NamedTuple):
+    """Blocks that were read at once: the bytes of the file from the first to the last, and where their records begin.
+
+    ready says that the records are there already; direct, that they are as they stand in the file.
+    """
+
+    blocks: Sequence[Block]
+    packed: memoryview
+    at: int
+    direct: bool
+    ready: bool
 
 
 class _Loader:
@@ -145,53 +189,85 @@ class _Loader:
         self.contents, self.stream = contents, stream
         self.zstd = zstandard.ZstdDecompressor()
         self.data = bytearray()
-        self.packed = bytearray()
+        self.packed: list[bytearray] = []
 
-    def load(self, blocks: Sequence[Block]) -> list[_Place]:
-        """Put blocks into the buffer, with SLACK bytes around; raises as `batches` does."""
-        runs = list(_runs(blocks))
-        direct = [all(not block.compression for block in run) for run in runs]
+    def work_ahead(self, blocks: Sequence[Block]) -> tuple[list[_Run], list[_Place] | None]:
+        """`fetch`, and `place` as well where the blocks are few; raises as `batches` does."""
+        runs = self.fetch(blocks)
+        return runs, self.place(runs) if len(blocks) <= _FEW_BLOCKS else None
+
+    def fetch(self, blocks: Sequence[Block]) -> list[_Run]:
+        """Read blocks, and decompress what can be decompressed together."""
+        runs = []
+        at = SLACK
+        every = list(_runs(blocks))
+        as_is = [all(not block.compression for block in run) for run in every]
         sizes = [
-            _end(run[-1]) - _begin(run[0]) if as_is else sum(block.length for block in run)
-            for run, as_is in zip(runs, direct, strict=True)
+            _end(run[-1]) - _begin(run[0]) if direct else sum(block.length for block in run)
+            for run, direct in zip(every, as_is, strict=True)
         ]
         if len(self.data) < sum(sizes) + 2 * SLACK:
             self.data = bytearray(sum(sizes) + 2 * SLACK)
-        view = memoryview(self.data)
-        places = []
-        at = SLACK
-        for run, as_is, size in zip(runs, direct, sizes, strict=True):
-            if as_is:
-                packed = view[at : at + size]
-            else:
-                length = _end(run[-1]) - _begin(run[0])
-                if len(self.packed) < length:
-                    self.packed = bytearray(length)
-                packed = memoryview(self.packed)[:length]
-            self.stream.seek(_begin(run[0]))
+        for number, (run, direct, size) in enumerate(zip(every, as_is, sizes, strict=True)):
+            begin = _begin(run[0])
+            packed = memoryview(self.data)[at : at + size] if direct else self._room(number, _end(run[-1]) - begin)
+            self.stream.seek(begin)
             if self.stream.readinto(packed) != len(packed):  # type: ignore[attr-defined]
                 self._refuse()
-            for block in run:
-                offset = block.offset - _begin(run[0])
-                content = packed[offset : offset + block.size]
-                begin = at + offset if as_is else at
+            together = len(run) > 1 and all(block.compression == "zstd" for block in run)
+            ready = direct or (together and self._inflate_together(run, packed, memoryview(self.data)[at : at + size]))
+            runs.append(_Run(run, packed, at, direct, ready))
+            at += size
+        return runs
+
+    def place(self, runs: Sequence[_Run]) -> list[_Place]:
+        """Put the records of what was read into the buffer, with SLACK bytes around; raises as `batches` does."""
+        view = memoryview(self.data)
+        places: list[_Place] = []
+        for blocks, packed, at, direct, ready in runs:
+            origin = _begin(blocks[0])
+            for block in blocks:
+                offset = block.offset - origin
+                behind = offset + block.size
+                begin = at + offset if direct else at
                 end = begin + block.length
-                if not as_is:
-                    at = end
-                    if not self._inflate(block, content, view[begin:end]):
-                        self._refuse()
-                if block.unchecked and not self._as_stated(block, packed[:offset], view[begin:end]):
+                records = view[begin:end]
+                if not ready and not self._inflate(block, packed[offset:behind], records):
                     self._refuse()
-                offsets = _offsets(block, packed[offset + block.size :])
+                if block.unchecked and not self._as_stated(block, packed, offset, records):
+                    self._refuse()
+                offsets = _offsets(block, packed[behind : behind + block.indexed])
                 places.append(_Place(block, begin, end, offsets))
-            if as_is:
-                at += size
+                at = at if direct else end
         return places
+
+    def _room(self, number: int, length: int) -> memoryview:
+        """Room for a run as it is in the file; it is wanted until its blocks are placed."""
+        if number == len(self.packed):
+            self.packed.append(bytearray(length))
+        elif len(self.packed[number]) < length:
+            self.packed[number] = bytearray(length)
+        return memoryview(self.packed[number])[:length]
 
     def _refuse(self) -> NoReturn:
         if self.contents.indexed:
             raise IndexMismatchError
         raise BagError(f"{self.contents.path}: the file changed while it was read; read it again when it is written")
+
+    def _inflate_together(self, run: Sequence[Block], packed: memoryview, target: memoryview) -> bool:
+        """Decompress blocks in one call; False where that does not work, whatever the reason."""
+        origin = _begin(run[0])
+        frames = [packed[block.offset - origin : block.offset - origin + block.size] for block in run]
+        try:
+            if [zstandard.frame_content_size(frame) for frame in frames] != [block.length for block in run]:
+                return False  # else each frame gives as much as it says, or an error
+            reader = self.zstd.stream_reader(b"".join(frames), read_across_frames=True)
+            filled = 0
+            while filled < len(target) and (more := reader.readinto(target[filled:])):
+                filled += more
+        except (zstandard.ZstdError, MemoryError):
+            return False
+        return filled == len(target)
 
     def _inflate(self, block: Block, data: memoryview, target: memoryview) -> bool:
         """Decompress; False where that does not give as many bytes as the block has."""
@@ -212,15 +288,22 @@ class _Loader:
         except (zstandard.ZstdError, RuntimeError, EOFError, ValueError, MemoryError):
             return False
 
-    def _as_stated(self, block: Block, before: memoryview, records: memoryview) -> bool:
-        head = before[-block.unchecked :]
-        checksum = int.from_bytes(head[33:37], "little")
+    def _as_stated(self, block: Block, packed: memoryview, offset: int, records: memoryview) -> bool:
+        """Hold what stands before a block against it, and its records against their checksum."""
+        head = packed[offset - block.unchecked : offset]
+        checksum = int.from_bytes(head[_CHECKSUM_AT : _CHECKSUM_AT + 4], "little")
         name = block.compression.encode()
-        stated = (
-            RECORD.pack(Opcode.CHUNK, block.unchecked - RECORD.size + block.size)
-            + CHUNK.pack(block.start, block.end, block.length, checksum, len(name))
-            + name
-            + _LENGTH.pack(block.size)
+        stated = struct.pack(
+            f"<BQQQQII{len(name)}sQ",
+            Opcode.CHUNK,
+            block.unchecked - RECORD.size + block.size,
+            block.start,
+            block.end,
+            block.length,
+            checksum,
+            len(name),
+            name,
+            block.size,
         )
         return head == stated and (zlib.crc32(records) == checksum if checksum else not self.contents.summed)
 
@@ -248,18 +331,24 @@ def _starts(data: bytearray, places: Sequence[_Place], contents: Contents) -> In
 
 def _walkers(data: bytearray, places: Sequence[_Place], by_index: bool) -> tuple[Integers, Integers]:
     """Where walkers begin, and where each has to arrive."""
-    begins: list[Integers] = []
-    limits: list[Integers] = []
+    begins: list[int] = []
+    limits: list[int] = []
     for place in places:
         if place.begin == place.end:
             continue
-        if by_index and place.offsets is not None:
-            here = place.begin + place.offsets
+        if not by_index:
+            here = _likely_messages(data, place)
+        elif place.offsets is not None:
+            here = (place.begin + place.offsets).tolist()
+        elif 0 < place.block.indexed < _FEW * 16:
+            here = []
         else:
-            here = np.array(_likely_messages(data, place), dtype=np.int64)
-        begins += [np.array([place.begin]), here]
-        limits += [here, np.array([place.end])]
-    return np.concatenate(begins), np.concatenate(limits)
+            here = _likely_messages(data, place)
+        begins.append(place.begin)
+        begins += here
+        limits += here
+        limits.append(place.end)
+    return np.array(begins, dtype=np.int64), np.array(limits, dtype=np.int64)
 
 
 def _offsets(block: Block, after: memoryview) -> Integers | None:

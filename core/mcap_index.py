@@ -115,7 +115,7 @@ def _contents(path: Path, size: int, summary: bytes, data_end: int, data_crc: bo
 def _block(index: bytes, data_end: int) -> Block:
     start, end, place, chunk_length, size_of_offsets = _CHUNK_INDEX.unpack_from(index)
     rest = _CHUNK_INDEX.size + size_of_offsets
-    channels = frozenset(channel for channel, _ in _INDEX_OFFSET.iter_unpack(index[_CHUNK_INDEX.size : rest]))
+    channels = frozenset([channel for channel, _ in _INDEX_OFFSET.iter_unpack(index[_CHUNK_INDEX.size : rest])])
     index_length, name_length = _INDEX_REST.unpack_from(index, rest)
     name_at = rest + _INDEX_REST.size
     compression = index[name_at : name_at + name_length].decode()

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -47,8 +47,7 @@ FOOTER_SIZE = RECORD.size + 20
 _FIRST_CHUNK_WARNINGS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
+class Block(NamedTuple):
     """A stretch of a file that is read at once: bytes `offset` to `offset + size`.
 
     compression is "" where the bytes are records as they stand; length is the size of the records; start and

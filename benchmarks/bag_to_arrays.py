@@ -1,0 +1,374 @@
+"""Bags into arrays, side by side with rosbags and mcap-ros2-support (pip install mcap-ros2-support) in one run.
+
+python benchmarks/bag_to_arrays.py most      # a million messages, nearly all of the bag wanted, against both peers
+python benchmarks/bag_to_arrays.py images    # one small topic beside large images
+python benchmarks/bag_to_arrays.py eighth    # one topic of eight
+python benchmarks/bag_to_arrays.py memory    # peak memory of a process of its own, by size of the bag
+python benchmarks/bag_to_arrays.py samples   # the whole way to samples (t, x, u), against message by message
+python benchmarks/bag_to_arrays.py bags      # several large bags, in processes side by side and one after the other
+python benchmarks/bag_to_arrays.py all --quick    # everything, a tenth of the size
+
+Recordings are written into --folder, or into one that is thrown away. Peers decode a tenth of the messages (all with
+--whole); what opening the bag takes counts once, and each message as much as those did. What they give is held
+against ours, to the last bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+from recorded import CAMERA, COMPRESSIONS, FRAMES, JAZZY, ROBOT, Topic, imu, payloads, pictures, write
+
+from uncertain_lti import mcap_batches
+from uncertain_lti.bag import Bag
+from uncertain_lti.bag_arrays import read_columns
+from uncertain_lti.reading import read_stream, read_transients, sample, sample_by_message
+from uncertain_lti.signals import FieldPath, Signal, SignalMap
+
+PATHS = {
+    "/joint_states": [f"{part}[{i}]" for part in ("position", "velocity") for i in range(12)],
+    "/odom": ["pose.pose.position.x", "pose.pose.position.y", "twist.twist.linear.x", "twist.twist.angular.z"],
+    "/imu": [f"{part}.{axis}" for part in ("angular_velocity", "linear_acceleration") for axis in "xyz"],
+    "/commands": [f"data[{i}]" for i in range(12)],
+}
+CHUNKS = {"32 KiB": 32 << 10, "768 KiB": 768 << 10}
+
+
+def recording(folder, count, compression, chunk, frames):
+    """Bag of `count` messages of four topics; written once per folder."""
+    path = folder / f"robot_{count}_{compression}_{chunk.replace(' ', '')}_{frames}.mcap"
+    if not path.exists():
+        names = FRAMES if frames == "varies" else FRAMES[:1]
+        streams = [payloads(topic, count // len(ROBOT), names, seed) for seed, topic in enumerate(ROBOT)]
+        write(path, ROBOT, streams, compression, CHUNKS[chunk])
+    return path
+
+
+def best(function, runs=3):
+    """Least wall time of some runs, s, and the last result."""
+    times = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        result = function()
+        times.append(time.perf_counter() - began)
+    return min(times), result
+
+
+def ours(path, paths):
+    """Open a bag, and read fields of these topics."""
+    return read_columns(
+        Bag(path, indexed=True), list(paths), [[FieldPath(p) for p in every] for every in paths.values()]
+    )
+
+
+def rosbags(path, topics, most):
+    """Messages decoded by rosbags: see `counted`."""
+    from rosbags.rosbag2 import Reader
+
+    began = time.perf_counter()
+    decode = JAZZY.deserialize_cdr
+    with Reader(path) as reader:
+        wanted = [c for c in reader.connections if c.topic in topics]
+        messages = ((c.topic, decode(data, c.msgtype)) for c, _, data in reader.messages(wanted))
+        return counted(began, itertools.islice(messages, most))
+
+
+def mcap_ros2(path, topics, most):
+    """The same by mcap-ros2-support."""
+    from mcap_ros2.reader import read_ros2_messages
+
+    began = time.perf_counter()
+    messages = ((e.channel.topic, e.ros_msg) for e in read_ros2_messages(str(path), topics=list(topics)))
+    return counted(began, itertools.islice(messages, most))
+
+
+def counted(began, messages):
+    """Seconds until the first message, seconds for each further one, and the first messages."""
+    first = [next(messages)]
+    opened = time.perf_counter()
+    first += itertools.islice(messages, 2000)
+    number = len(first) - 1 + sum(1 for _ in messages)
+    return opened - began, (time.perf_counter() - opened) / number, first
+
+
+def same(columns, paths, found):
+    """Hold the first messages of each topic against what a peer decoded, to the last bit."""
+    for values, (topic, texts) in zip(columns.values, paths.items(), strict=True):
+        fields = [FieldPath(text) for text in texts]
+        theirs = np.array([[f.read(message) for f in fields] for name, message in found if name == topic])
+        assert len(theirs) and values[: len(theirs)].tobytes() == theirs.tobytes(), f"{topic}: not the same numbers"
+
+
+def against_peers(path, paths, count, peers, share):
+    """Ours, s, the columns, and per peer its time for all `count` messages, s."""
+    mine, columns = best(lambda: ours(path, paths))
+    assert len(columns.topic) == count and columns.alone < 100, (len(columns.topic), columns.alone)
+    theirs = []
+    for peer in peers:
+        opening, each, first = peer(path, paths, max(count // share, min(count, 3000)))
+        same(columns, paths, first)
+        theirs.append(opening + each * (count - 1))
+    return mine, columns, theirs
+
+
+def most(folder, scale, share):
+    """Nearly all messages of the bag are wanted."""
+    count = int(1e6 * scale)
+    rows = []
+    for compression, chunk, frames in itertools.product(COMPRESSIONS, CHUNKS, ("one", "varies")):
+        path = recording(folder, count, compression, chunk, frames)
+        size = path.stat().st_size
+        mine, columns, (first, second) = against_peers(path, PATHS, count, (rosbags, mcap_ros2), share)
+        rows.append(
+            [compression, chunk, frames, f"{size / 1e6:.0f} MB", f"{mine:.2f} s", f"{1e6 * mine / count:.2f} µs"]
+            + [f"{first / mine:.0f}", f"{second / mine:.0f}", str(columns.alone)]
+        )
+        keep_or_drop(folder, path)
+    header = ["compression", "chunks", "frame_id", "file", "ours", "a message"]
+    header += ["× faster than rosbags", "× faster than mcap-ros2-support", "decoded alone"]
+    table(f"{count} messages: JointState, Odometry, Imu, Float64MultiArray, of each all", header, rows)
+
+
+def images(folder, scale, share):
+    """One small topic beside large images: chunks are decompressed for it whole."""
+    number = max(int(1200 * scale), 40)
+    wanted = {"/imu": PATHS["/imu"]}
+    rows = []
+    for compression in COMPRESSIONS:
+        path = folder / f"images_{number}_{compression}.mcap"
+        if not path.exists():
+            topics = (Topic("/imu", "sensor_msgs/msg/Imu", imu), CAMERA)
+            inertial = payloads(topics[0], 10 * number, FRAMES[:1], 1)
+            bundled = [inertial[10 * i : 10 * i + 10] for i in range(number)]
+            write_mixed(path, topics, bundled, pictures(number, 2), compression)
+        rows.append(where_it_goes(path, wanted, 10 * number, share, [compression]))
+        keep_or_drop(folder, path)
+    table(f"{10 * number} Imu messages beside {number} images of 640 x 480", ["compression", *WHERE], rows)
+
+
+def write_mixed(path, topics, bundled, shown, compression):
+    """Ten small messages, then an image, and so on."""
+    from mcap.writer import Writer
+
+    with open(path, "wb") as stream:
+        writer = Writer(stream, chunk_size=768 << 10, compression=COMPRESSIONS[compression])
+        writer.start(profile="ros2", library="benchmark")
+        channels = []
+        for topic in topics:
+            text = JAZZY.generate_msgdef(topic.type, ros_version=2)[0]
+            schema = writer.register_schema(topic.type, "ros2msg", text.encode())
+            channels.append(writer.register_channel(topic.name, "cdr", schema))
+        at = 1_700_000_000_000_000_000
+        for several, picture in zip(bundled, shown, strict=True):
+            for data in several:
+                at += 3_000_000
+                writer.add_message(channels[0], at, data, at)
+            writer.add_message(channels[1], at, picture, at)
+        writer.finish()
+
+
+def eighth(folder, scale, share):
+    """One topic of eight that are alike."""
+    count = int(1e6 * scale) // 8
+    topics = [Topic(f"{topic.name}{more}", topic.type, topic.make) for more in ("", "_2") for topic in ROBOT]
+    wanted = {"/imu": PATHS["/imu"]}
+    rows = []
+    for compression in COMPRESSIONS:
+        path = folder / f"eight_{count}_{compression}.mcap"
+        if not path.exists():
+            streams = [payloads(topic, count, FRAMES[:1], seed) for seed, topic in enumerate(topics)]
+            write(path, topics, streams, compression)
+        rows.append(where_it_goes(path, wanted, count, share, [compression]))
+        keep_or_drop(folder, path)
+    table(f"{count} Imu messages of {8 * count} messages of eight topics", ["compression", *WHERE], rows)
+
+
+WHERE = ["file", "ours", "reading the file", "decompression", "checksums", "the rest"]
+WHERE += ["× faster than rosbags", "× faster than mcap-ros2-support"]
+
+
+def where_it_goes(path, paths, count, share, begin):
+    """A row with the parts of the time."""
+    mine, _, (first, second) = against_peers(path, paths, count, (rosbags, mcap_ros2), share)
+    with clocked() as parts:
+        began = time.perf_counter()
+        ours(path, paths)
+        whole = time.perf_counter() - began
+    rest = whole - sum(parts.values())
+    shares = [f"{100 * part / whole:.0f} %" for part in (*parts.values(), rest)]
+    return [
+        *begin,
+        f"{path.stat().st_size / 1e6:.0f} MB",
+        f"{mine:.3f} s",
+        *shares,
+        f"{first / mine:.0f}",
+        f"{second / mine:.0f}",
+    ]
+
+
+@contextlib.contextmanager
+def clocked():
+    """Time spent in the parts of loading a block, s."""
+    parts = dict.fromkeys(("read", "inflate", "sum"), 0.0)
+
+    def timed(part, function):
+        def run(*arguments):
+            began = time.perf_counter()
+            result = function(*arguments)
+            parts[part] += time.perf_counter() - began
+            return result
+
+        return run
+
+    class Sums:
+        crc32 = staticmethod(timed("sum", zlib.crc32))
+
+    class Stream:
+        def __init__(self, stream):
+            self.seek, self.readinto = stream.seek, timed("read", stream.readinto)
+
+    loader = mcap_batches._Loader
+    made, inflate = loader.__init__, loader._inflate
+
+    def make(self, contents, stream):
+        made(self, contents, Stream(stream))
+
+    loader.__init__, loader._inflate, mcap_batches.zlib = make, timed("inflate", inflate), Sums
+    try:
+        yield parts
+    finally:
+        loader.__init__, loader._inflate, mcap_batches.zlib = made, inflate, zlib
+
+
+def memory(folder, scale, share):
+    """Peak memory above that of the imports and of the result, in a process of its own."""
+    rows = []
+    for count, compression, chunk in itertools.product(
+        (int(2.5e5 * scale), int(1e6 * scale)), ("zstd", "none"), CHUNKS
+    ):
+        path = recording(folder, count, compression, chunk, "varies")
+        command = [sys.executable, __file__, "peak", str(path)]
+        before, after, result = map(
+            int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+        )
+        more = after - before - result
+        rows.append(
+            [str(count), compression, chunk, *(f"{size / 2**20:.0f} MiB" for size in (result, after - before, more))]
+        )
+        keep_or_drop(folder, path)
+    table("Memory", ["messages", "compression", "chunks", "result", "peak", "peak less result"], rows)
+
+
+def peak(path):
+    """In a process of its own: peak memory before reading and after, and size of the result, bytes."""
+    before = high_water()
+    columns = ours(Path(path), PATHS)
+    result = sum(a.nbytes for a in (columns.topic, columns.arrival, columns.stamp, *columns.values))
+    print(before, high_water(), result)
+
+
+def high_water():
+    """Peak memory of this process, bytes; getrusage would count that of the process it was forked from."""
+    (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
+    return int(line.split()[1]) * 1024
+
+
+def robot():
+    """Joints are the states, commands and what the Imu measures the controls."""
+    states = tuple(Signal(f"q{i}", "/joint_states", f"position[{i}]") for i in range(12))
+    commands = tuple(Signal(f"c{i}", "/commands", f"data[{i}]") for i in range(12))
+    return SignalMap(states, (*commands, Signal("yaw_rate", "/imu", "angular_velocity.z")))
+
+
+def samples(folder, scale, share):
+    """The whole way to samples, its halves, and the second half as the live monitor goes it."""
+    count = int(1e6 * scale)
+    rows = []
+    path = recording(folder, count, "zstd", "768 KiB", "one")
+    both, (transient,) = best(lambda: read_transients(path, robot()))
+    signals = transient.signals
+    reading, stream = best(lambda: read_stream(Bag(path, indexed=True), signals))
+    sampling, _ = best(lambda: sample(stream, signals))
+    alone, slow = best(lambda: sample_by_message(stream, signals), 1)
+    assert (slow.t_ns.tobytes(), slow.x.tobytes(), slow.u.tobytes()) == (
+        transient.t_ns.tobytes(),
+        transient.x.tobytes(),
+        transient.u.tobytes(),
+    )
+    rows.append([f"{both:.2f} s", f"{reading:.2f} s", f"{sampling:.2f} s", f"{alone:.2f} s", f"{alone / sampling:.0f}"])
+    header = ["read_transients", "reading", "sampling", "message by message", "× faster"]
+    table(f"{len(stream.topic)} messages of three topics into {len(transient)} samples", header, rows)
+    keep_or_drop(folder, path)
+
+
+def bags(folder, scale, share):
+    """Several large recordings: processes side by side."""
+    count = int(1e6 * scale)
+    source = recording(folder, count, "zstd", "768 KiB", "one")
+    paths = []
+    for number in range(4):
+        paths.append(folder / f"run{number}_of_robot.mcap")
+        if not paths[-1].exists():
+            os.link(source, paths[-1])
+    alone, one = best(lambda: read_transients(paths, robot(), processes=1), 2)
+    beside, two = best(lambda: read_transients(paths, robot()), 2)
+    assert all(a.x.tobytes() == b.x.tobytes() and a.u.tobytes() == b.u.tobytes() for a, b in zip(one, two, strict=True))
+    rows = [[f"{alone:.2f} s", f"{beside:.2f} s", f"{alone / beside:.2f}"]]
+    table(f"Four bags of {count} messages", ["one process", f"{os.cpu_count()} cores", "× faster"], rows)
+    for path in paths:
+        path.unlink()
+    keep_or_drop(folder, source)
+
+
+KEEP = False
+
+
+def keep_or_drop(folder, path):
+    """Large recordings are not left lying around."""
+    if not KEEP:
+        path.unlink(missing_ok=True)
+
+
+def table(title, header, rows):
+    """Print a table as Markdown."""
+    print(f"\n{title}\n\n| {' | '.join(header)} |\n|{'---|' * len(header)}")
+    for row in rows:
+        print(f"| {' | '.join(row)} |", flush=True)
+
+
+def main():
+    """One command per claim."""
+    if sys.argv[1:2] == ["peak"]:
+        return peak(sys.argv[2])
+    commands = {f.__name__: f for f in (most, images, eighth, memory, samples, bags)}
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("claims", nargs="+", choices=[*commands, "all"])
+    parser.add_argument("--quick", action="store_true", help="a tenth of the size")
+    parser.add_argument("--whole", action="store_true", help="peers decode every message")
+    parser.add_argument("--folder", type=Path, help="keep the recordings here, and use those that are there")
+    options = parser.parse_args()
+    global KEEP
+    KEEP = options.folder is not None
+    machine = platform.processor() or platform.machine()
+    print(f"{machine}, {os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}")
+    with contextlib.ExitStack() as stack:
+        folder = options.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in commands if "all" in options.claims else options.claims:
+            commands[name](folder, 0.1 if options.quick else 1.0, 1 if options.whole else 10)
+    return None
+
+
+if __name__ == "__main__":
+    main()
