@@ -165,6 +165,11 @@ class Bag:
         return list(self._warnings), dict(self._undecoded)
 
     @property
+    def contents(self) -> tuple[Contents, ...]:
+        """What is known of each file; `parts` of another bag may be these."""
+        return tuple(self._contents)
+
+    @property
     def parts(self) -> tuple[Path, ...]:
         """Files of the recording in order."""
         return tuple(part.path for part in self._contents)

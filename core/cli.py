@@ -311,7 +311,7 @@ def _fit(options: argparse.Namespace) -> int:
         raise BagError(f"{output}: the folder {output.parent} is not there; make it first")
     if options.cache or options.scheduler or options.workers:
         return _fit_archive(options, output)
-    transients = read_transients(options.bags, options.signals, options.progress.iterate("reading"))
+    transients = read_transients(options.bags, options.signals, options.progress.iterate("reading"), processes=None)
     for transient in transients:
         if not options.json:
             _say(options, transient.notes)

@@ -185,6 +185,7 @@ def read_transients(
     paths: Paths,
     signals: SignalMap | str | os.PathLike[str],
     progress: Progress | None = None,
+    processes: int | None = 1,
 ) -> list[Transient]:
     """Read recordings as transients, all cut by one resolved signal map.
 
@@ -201,6 +202,9 @@ def read_transients(
     progress : callable, optional
         Wraps what goes through the messages of a recording, given their number: (iterable, total) -> iterable; once
         while they are read and once while samples are cut from them.
+    processes : int or None
+        How many recordings are read at the same time, each in a process of its own; None chooses
+        (`reading_processes.processes_for`). A script that asks for more than 1 needs `if __name__ == "__main__":`.
 
     Returns
     -------
@@ -220,7 +224,7 @@ def read_transients(
     if not bags:
         raise BagError("no recording is named; give at least one MCAP file or folder")
     signals = signals.with_types(_types(bags, signals))
-    streams = [read_stream(bag, signals, progress) for bag in bags]
+    streams = _streams(bags, signals, progress, processes)
     for stream in streams:
         for position, topic in enumerate(signals.topics):
             if not (stream.topic == position).any():
@@ -244,6 +248,19 @@ def read_transients(
     numbers = ", ".join(f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals)
     note = f"operating point from {words}: {numbers}"
     return [_with_signals(t, resolved, note if t is transients[0] else None) for t in transients]
+
+
+def _streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None, processes: int | None) -> list[Stream]:
+    if processes == 1 or len(bags) == 1:
+        return [read_stream(bag, signals, progress) for bag in bags]
+    from uncertain_lti.reading_processes import processes_for, read_streams
+
+    processes = processes_for(bags) if processes is None else processes
+    if processes == 1:
+        return [read_stream(bag, signals, progress) for bag in bags]
+    for bag in bags:
+        _paths(bag, signals)  # what is wrong with the map is found before anything is started
+    return read_streams(bags, signals, progress, processes)
 
 
 def read_for_model(

@@ -1,0 +1,101 @@
+"""Recordings read side by side, each in a process of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from uncertain_lti.bag import Bag
+from uncertain_lti.bag_arrays import Progress
+from uncertain_lti.errors import BagError
+from uncertain_lti.mcap_records import Contents
+from uncertain_lti.reading import Stream, read_stream
+from uncertain_lti.signals import SignalMap
+
+WORTH_IT = 1 << 28
+"""Bytes of recordings from which on processes that have to be started first save time."""
+
+
+def processes_for(bags: Sequence[Bag]) -> int:
+    """How many processes to read these recordings with: 1 for small ones, and on few cores.
+
+    One process keeps nearly two cores busy, as it reads ahead.
+    """
+    size = sum(part.size for bag in bags for part in bag.contents)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(len(bags), cores // 2)) if size >= WORTH_IT else 1
+
+
+def read_streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None, processes: int) -> list[Stream]:
+    """`read_stream` of every bag; progress advances by whole recordings.
+
+    Raises
+    ------
+    BagError, SignalError
+        As `read_stream`, of the first recording in order that cannot be read; or a process ended before its time.
+    """
+    counts = [sum(bag.topics[topic].count for topic in signals.topics) for bag in bags]
+    with _pool(min(processes, len(bags))) as pool:
+        futures = {pool.submit(_read, bag.path, bag.contents, signals): number for number, bag in enumerate(bags)}
+
+        def messages() -> Iterator[None]:
+            for future in as_completed(futures):
+                yield from [None] * counts[futures[future]]
+
+        steps: Iterable[object] = messages()
+        for _ in steps if progress is None else progress(steps, sum(counts)):
+            pass
+        return [_stream(bag, future) for bag, future in zip(bags, futures, strict=True)]
+
+
+def _stream(bag: Bag, future: Future[tuple[Any, ...]]) -> Stream:
+    try:
+        walked, undecoded, *columns = future.result()
+    except BrokenProcessPool:
+        raise BagError(
+            f"{bag.path}: the process that read it was ended, perhaps for want of memory; "
+            f"read fewer recordings at once, or fit with --cache"
+        ) from None
+    if walked:
+        bag.walk()
+    bag.tell(bag.said[0], undecoded)
+    return Stream(bag, *columns)
+
+
+def _read(path: Path, contents: Sequence[Contents], signals: SignalMap) -> tuple[Any, ...]:
+    """In a process of its own: whether the index did not hold, messages left out by topic, and the columns."""
+    bag = Bag(path, contents)
+    indexed = any(part.indexed for part in bag.contents)
+    stream = read_stream(bag, signals)
+    walked = indexed and not any(part.indexed for part in bag.contents)
+    return walked, bag.said[1], stream.topic, stream.arrival, stream.stamp, stream.values
+
+
+@contextmanager
+def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that leave Ctrl-C to this one, which ends them where it breaks off."""
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    main = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None  # what a child is born with
+    try:
+        for _ in range(processes):
+            pool.submit(os.getpid)  # each starts a process as long as none is idle
+    finally:
+        if main:
+            signal.signal(signal.SIGINT, handler)
+    try:
+        yield pool
+    except BaseException:
+        for process in list((getattr(pool, "_processes", None) or {}).values()):
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)

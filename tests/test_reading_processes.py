@@ -1,0 +1,156 @@
+"""Recordings read in processes side by side: as one after the other, in what is read, said and refused."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from bag_writer import float64
+from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
+
+import uncertain_lti.reading_processes
+from uncertain_lti.bag import group_recordings
+from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.reading import read_transients
+from uncertain_lti.reading_processes import processes_for
+from uncertain_lti.signals import Signal, SignalMap
+
+XU = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))
+
+
+def runs(folder: Path, number: int = 3) -> list[Path]:
+    """Recordings of their own lengths and numbers; the last is damaged, and has a message that cannot be decoded."""
+    paths = []
+    for run in range(number):
+        messages = [("/u", 5 * MS, float64(0.5))]
+        for k in range(1, 200 + 10 * run):
+            messages.append(("/x", 10 * k * MS, joint_state(10 * k * MS, [k * 0.1 + run])))
+            messages.append(("/u", 10 * k * MS + run, float64(k % 7) if k != 50 or run < number - 1 else b"\0\1\0\0"))
+        paths.append(save(folder, {"/x": JOINT_STATE, "/u": FLOAT64}, messages, f"run_{'abcdef'[run]}.mcap"))
+    data = bytearray(paths[-1].read_bytes())
+    data[-30] ^= 1  # in the footer: its index does not count
+    paths[-1].write_bytes(data)
+    return paths
+
+
+@pytest.mark.slow
+def test_the_same_transients_and_remarks(tmp_path: Path) -> None:
+    paths = runs(tmp_path)
+    counted: list[int] = []
+
+    def progress(items, total):  # type: ignore[no-untyped-def]
+        number = 0
+        for item in items:
+            number += 1
+            yield item
+        counted.extend((number, total))
+
+    alone = read_transients(paths, XU)
+    beside = read_transients(paths, XU, progress, processes=2)
+    assert counted[0] == counted[1] == sum(2 * t.counters["samples"] + 1 for t in alone)
+    for one, other in zip(alone, beside, strict=True):
+        assert (one.name, one.notes, one.counters, one.sources) == (
+            other.name,
+            other.notes,
+            other.counters,
+            other.sources,
+        )
+        for name in ("t_ns", "x", "u", "segment"):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+    assert any("cannot be decoded" in note for note in beside[-1].notes)
+
+
+@pytest.mark.slow
+def test_what_a_process_refuses_is_one_error_here(tmp_path: Path) -> None:
+    paths = runs(tmp_path)
+    for process in (1, 2):
+        named = SignalMap((Signal("x", "/x", "position[arm]"),))
+        with pytest.raises(SignalError, match="run_a.mcap: there is no 'arm' in the message's names"):
+            read_transients(paths, named, processes=process)
+    late = save(tmp_path, {"/x": JOINT_STATE}, [("/x", 2**63 + 5, joint_state(1, [1.0]))], "late.mcap")
+    with pytest.raises(BagError, match="late.mcap: a message has a log time of 9223372036854775813 ns"):
+        read_transients([paths[0], late], SignalMap((Signal("x", "/x", "position[0]"),)), processes=2)
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_is_an_error_and_not_a_hang(tmp_path: Path) -> None:
+    script = SCRIPT.format(paths=[str(p) for p in runs(tmp_path)])
+    with subprocess.Popen([sys.executable, "-c", textwrap.dedent(script)], stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdout is not None
+        assert reader.stdout.readline() == "reading\n"
+        os.kill(first_child(reader.pid), signal.SIGKILL)
+        rest, _ = reader.communicate(timeout=60)
+    assert "BagError" in rest and "the process that read it was ended" in rest
+
+
+@pytest.mark.slow
+def test_interrupted_it_leaves_no_process_and_no_traceback_of_theirs(tmp_path: Path) -> None:
+    script = SCRIPT.format(paths=[str(p) for p in runs(tmp_path)])
+    reader = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    with reader:
+        assert reader.stdout is not None
+        assert reader.stdout.readline() == "reading\n"
+        child = first_child(reader.pid)
+        os.killpg(reader.pid, signal.SIGINT)  # as a terminal does
+        rest, errors = reader.communicate(timeout=60)
+    assert rest == "interrupted\n" and errors == ""
+    deadline = time.monotonic() + 10
+    while Path(f"/proc/{child}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{child}").exists()
+
+
+SCRIPT = """
+    import sys, threading, time
+    import uncertain_lti.reading_processes as side
+    from uncertain_lti.errors import BagError
+    from uncertain_lti.reading import read_transients
+    from uncertain_lti.signals import Signal, SignalMap
+
+    def progress(items, total):
+        print("reading", flush=True)
+        time.sleep(3)  # until something happens to it
+        yield from items
+
+    signals = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))
+    try:
+        read_transients({paths} , signals, progress, processes=2)
+    except BagError as error:
+        print("BagError", error)
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+
+
+def first_child(parent: int) -> int:
+    """A process that reads for it."""
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        found = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+        workers = [int(pid) for pid in found if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        if workers:
+            return workers[0]
+        time.sleep(0.01)
+    raise AssertionError("no process reads for it")
+
+
+def test_small_recordings_are_read_without_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bags = group_recordings(runs(tmp_path), indexed=True)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
+    assert processes_for(bags) == 1
+    monkeypatch.setattr(uncertain_lti.reading_processes, "WORTH_IT", 1000)
+    assert processes_for(bags) == 3
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(2), raising=False)
+    assert processes_for(bags) == 1  # which reads ahead on the other core
