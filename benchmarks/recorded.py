@@ -24,11 +24,11 @@ JOINTS = [f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint i
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic to write: `make(frame)` gives a message whose floats are then replaced by a signal."""
+    """A topic to write; for `payloads`, `make(frame)` gives a message whose floats are then replaced by a signal."""
 
     name: str
     type: str
-    make: Callable[[str], Any]
+    make: Callable[[str], Any] | None = None
 
 
 def message(kind: str, **fields: Any) -> Any:
@@ -143,6 +143,7 @@ def payloads(topic: Topic, count: int, frames: Sequence[str], seed: int) -> list
     which = noise.integers(len(frames), size=count)
     for number, frame in enumerate(frames):
         rows = np.flatnonzero(which == number)
+        assert topic.make is not None
         data = bytes(JAZZY.serialize_cdr(topic.make(frame), topic.type))
         table = np.tile(np.frombuffer(data, np.uint8), (len(rows), 1))
         places = [data.find(v.tobytes()) for v in _sentinels(36)]
@@ -165,8 +166,9 @@ def write(
     streams: Sequence[Sequence[bytes]],
     compression: str = "zstd",
     chunk_size: int = 768 << 10,
+    step_ns: int = 1_000_000,
 ) -> Path:
-    """One message of each topic in turn as long as it has some, 1 ms apart."""
+    """One message of each topic in turn as long as it has some, and a step of time until the next turn."""
     with open(path, "wb") as stream:
         writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
         writer.start(profile="ros2", library="benchmark")
@@ -175,14 +177,16 @@ def write(
             text = JAZZY.generate_msgdef(topic.type, ros_version=2)[0]
             schema = writer.register_schema(topic.type, "ros2msg", text.encode())
             channels.append(writer.register_channel(topic.name, "cdr", schema))
-        for time, channel, data in _in_turn(channels, streams):
+        for time, channel, data in _in_turn(channels, streams, step_ns):
             writer.add_message(channel, time, data, time)
         writer.finish()
     return path
 
 
-def _in_turn(channels: Sequence[int], streams: Sequence[Sequence[bytes]]) -> Iterator[tuple[int, int, bytes]]:
+def _in_turn(
+    channels: Sequence[int], streams: Sequence[Sequence[bytes]], step_ns: int
+) -> Iterator[tuple[int, int, bytes]]:
     for i in range(max(map(len, streams))):
         for number, (channel, stream) in enumerate(zip(channels, streams, strict=True)):
             if i < len(stream):
-                yield 1_700_000_000_000_000_000 + i * 1_000_000 + number * 1000, channel, stream[i]
+                yield 1_700_000_000_000_000_000 + i * step_ns + number * 1000, channel, stream[i]

@@ -67,7 +67,8 @@ def fit_archive(
     client : distributed.Client, optional
         The workers read the recordings and keep the arrays. Give cache or client.
     progress : callable, optional
-        Called with one line of text per recording and per pass.
+        Called with one line of text per recording, with its number among all (`3 of 10`), and per pass, with the
+        samples still outside and the size of the working set.
 
     Returns
     -------
@@ -91,21 +92,24 @@ def fit_archive(
             )
     say = progress or (lambda text: None)
     recordings: list[Recording] = [
-        (os.fspath(bag.path), tuple(map(str, bag.parts))) for bag in group_recordings(list(paths))
+        (os.fspath(bag.path), tuple(map(str, bag.parts))) for bag in group_recordings(list(paths), indexed=True)
     ]
     if not recordings:
         raise BagError("no recording is named; give at least one MCAP file or folder")
 
-    def visit(function: Callable[..., Any], *more: Any) -> list[Any]:
+    def told(what: str) -> Callable[[int], None]:
+        return lambda number: say(f"{what} ({number} of {len(recordings)})")
+
+    def visit(what: str, function: Callable[..., Any], *more: Any) -> list[Any]:
         if client is not None:
-            return DaskFleet.run(client, [(function, (recording, *more)) for recording in recordings])
+            return DaskFleet.run(client, [(function, (recording, *more)) for recording in recordings], told(what))
         results = []
         for number, recording in enumerate(recordings, start=1):
-            say(f"{recording[0]} ({number} of {len(recordings)})")
+            told(f"{what} {recording[0]}")(number)
             results.append(function(recording, *more))
         return results
 
-    signals = _resolve(visit(survey, signals), signals, recordings)
+    signals = _resolve(visit("looking at", survey, signals), signals, recordings)
     additive = additive or signals.additive or "none"
     structure = None
     if signals.structure:
@@ -114,16 +118,17 @@ def fit_archive(
     fleet: Fleet
     if client is not None:
         # whether Δt is constant decides what is identifiable, and must be one answer for all partitions
-        constant = additive == "both" and all(visit(_constant_dt, signals))
+        constant = additive == "both" and all(visit("steps of", _constant_dt, signals))
         columns = Columns.of(additive, constant)
-        fleet = DaskFleet(client, [(load, (recording, signals, columns)) for recording in recordings])
+        tasks = [(load, (recording, signals, columns)) for recording in recordings]
+        fleet = DaskFleet(client, tasks, told("reading"))
         counts, dt = fleet.counts, None
     else:
         assert cache is not None
         counts, steps = [], []
         with CacheWriter(cache) as writer:
             for number, recording in enumerate(recordings, start=1):
-                say(f"{recording[0]} ({number} of {len(recordings)})")
+                told(f"reading {recording[0]}")(number)
                 problem = load(recording, signals, Columns(False, False, False))
                 counts.append(problem.N)
                 steps.append(problem.dt)
@@ -160,7 +165,7 @@ def fit_archive(
 
 def survey(recording: Recording, signals: SignalMap) -> Survey:
     """First look at one recording; see `Survey`."""
-    stream = read_stream(Bag(recording[0], recording[1]), signals)
+    stream = read_stream(Bag(recording[0], recording[1], indexed=True), signals)
     states = {s.topic for s in signals.states}
     types, stamped, counted = {}, {}, {}
     header, log = {}, {}
@@ -199,7 +204,7 @@ def _resolve(surveys: Sequence[Survey], signals: SignalMap, recordings: Sequence
 
 def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     """The usable transitions of one recording, normalised."""
-    transient = sample(read_stream(Bag(recording[0], recording[1]), signals), signals)
+    transient = sample(read_stream(Bag(recording[0], recording[1], indexed=True), signals), signals)
     point = OperatingPoint.of(signals.states, signals.controls)
     return replace(assemble([transient], point, None, "none", empty=True), columns=columns)
 

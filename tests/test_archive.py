@@ -141,6 +141,26 @@ def test_on_a_cluster_as_in_memory(bags, cluster, criterion):
     equal(fit_archive(paths, signals, criterion, client=cluster[1]), model)
 
 
+def steps_of(lines, what):
+    """The numbers `k of 8` of the lines that begin with these words."""
+    return [int(line.split("(")[-1].split(" of 8")[0]) for line in lines if line.startswith(what)]
+
+
+def test_it_says_how_far_it_has_come(bags, tmp_path):
+    signals, paths = bags
+    lines = []
+    fit_archive(paths, signals, cache=tmp_path / "c", progress=lines.append)
+    assert steps_of(lines, "looking at ") == steps_of(lines, "reading ") == list(range(1, 9))
+
+
+@pytest.mark.slow
+def test_on_a_cluster_it_says_so_too(bags, cluster):
+    signals, paths = bags
+    lines = []
+    fit_archive(paths, signals, client=cluster[1], progress=lines.append)
+    assert steps_of(lines, "looking at") == steps_of(lines, "reading") == list(range(1, 9))
+
+
 @pytest.mark.slow
 def test_a_lost_worker_costs_time_and_nothing_else(bags, cluster):
     signals, paths = bags

@@ -26,6 +26,8 @@ class DaskFleet(Fleet):
     client : distributed.Client
     tasks : sequence of (callable, arguments)
         Each makes one `Problem`.
+    done : callable, optional
+        Called with the number of those made so far.
 
     Raises
     ------
@@ -33,10 +35,15 @@ class DaskFleet(Fleet):
         What a task raised.
     """
 
-    def __init__(self, client: Any, tasks: Sequence[tuple[Callable[..., Problem], tuple[Any, ...]]]) -> None:
+    def __init__(
+        self,
+        client: Any,
+        tasks: Sequence[tuple[Callable[..., Problem], tuple[Any, ...]]],
+        done: Callable[[int], None] | None = None,
+    ) -> None:
         self._client = client
         made = [client.submit(function, *arguments, pure=False, retries=3) for function, arguments in tasks]
-        facts = _gather(client, [client.submit(_facts, part, pure=False, retries=3) for part in made])
+        facts = _gather(client, [client.submit(_facts, part, pure=False, retries=3) for part in made], done)
         kept = [(part, fact[0]) for part, fact in zip(made, facts, strict=True) if fact[0][0]]
         if not kept:
             raise FitError("no usable transition in any recording; check the signals file")
@@ -50,9 +57,13 @@ class DaskFleet(Fleet):
         return self._constant_weights  # type: ignore[no-any-return]
 
     @staticmethod
-    def run(client: Any, tasks: Sequence[tuple[Callable[..., T], tuple[Any, ...]]]) -> list[T]:
-        """Results of tasks in order."""
-        return _gather(client, [client.submit(f, *arguments, pure=False, retries=3) for f, arguments in tasks])
+    def run(
+        client: Any,
+        tasks: Sequence[tuple[Callable[..., T], tuple[Any, ...]]],
+        done: Callable[[int], None] | None = None,
+    ) -> list[T]:
+        """Results of tasks in order; done is called with the number of those that are there."""
+        return _gather(client, [client.submit(f, *arguments, pure=False, retries=3) for f, arguments in tasks], done)
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
         """function(partition, *arguments) on the workers, results in order of the partitions."""
@@ -63,12 +74,16 @@ class DaskFleet(Fleet):
         return _gather(self._client, futures)
 
 
-def _gather(client: Any, futures: list[Any]) -> list[Any]:
+def _gather(client: Any, futures: list[Any], done: Callable[[int], None] | None = None) -> list[Any]:
+    from distributed import as_completed
     from distributed.client import FutureCancelledError
     from distributed.comm.core import CommClosedError
     from distributed.scheduler import KilledWorker
 
     try:
+        if done is not None:
+            for number, _ in enumerate(as_completed(futures), start=1):  # type: ignore[no-untyped-call]
+                done(number)
         results: list[Any] = client.gather(futures)
     except UncertainLTIError:
         raise
