@@ -35,8 +35,8 @@ BOUNDED_TIE_BREAK = 1e-5
 REGULARISATION = 1e-4
 """Weight of the squared widths beside δ in (11), for a solver of strictly convex programmes.
 
-With a weight that is small enough, and a small one is, the minimum of the sum is that of δ. Whether it was is seen from
-the optimum of δ alone, at the end.
+With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
+of the squared widths. Whether it was is seen from the optimum of δ alone, at the end.
 """
 MAX_ROUNDS = 200
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
@@ -368,6 +368,30 @@ class Row:
             self.limit = max(before, self.limit * (1.0 + WIDTH_SLACK))
             return solver
 
+    def polish(self) -> None:
+        """The centre anew, with the half-widths as they are: the tie-break on its own.
+
+        Beside the squared widths it weighs so little that their rounding shows in the elements.
+        """
+        if self.r == 0:
+            return
+        phi, psi = self.phi[self.pool], self.psi[self.pool]
+        half = psi @ (self.d[self.free_psi] / (self.unit_psi * self.scale)) + self.half[self.pool]
+        y = self.y[self.pool]
+        try:
+            answer = solve_qp(
+                self.centre + self.attempt[1] * np.eye(self.r),
+                -self.target,
+                np.vstack([phi, -phi]),
+                np.concatenate([y - half, -y - half]),
+                self.lower[: self.r],
+                self.upper[: self.r],
+                any_solver=False,
+            )
+        except FitError:  # the half-widths leave no room at all
+            return
+        self.theta[self.free_phi] = answer.xi * self.unit_phi * self.scale
+
     def contradiction(self) -> tuple[int, float] | None:
         """(index of a sample, distance) that no elements within the structure can contain; None where there is none."""
         simplex = self._minimax()
@@ -438,7 +462,9 @@ class WorkingSet:
     def quadratic(self) -> Solution:
         """Criterion (10)."""
         coupled = self.sums.coupled is not None
-        self._run(self._settle_coupled if coupled else lambda rows: self._settle(rows, Row.solve_quadratic))
+        self._run(
+            self._settle_coupled if coupled else lambda rows: self._settle(rows, Row.solve_quadratic, polish=True)
+        )
         gap = self._coupled_gap if coupled else self._largest_gap()
         return replace(self._solution(), gap=gap)
 
@@ -450,7 +476,7 @@ class WorkingSet:
             for row in rows:
                 if not row.exact:
                     try:
-                        self._settle([row], Row.solve_regularised)
+                        self._settle([row], Row.solve_regularised, polish=True)
                     except InfeasibleError:
                         raise
                     except FitError:
@@ -462,7 +488,8 @@ class WorkingSet:
                     row.limit = float((row.width * row.half).max(initial=0.0))
                 deltas[row.i] = row.limit * row.scale
                 row.limit *= 1.0 + WIDTH_SLACK
-            self._settle(rows, Row.solve_bounded)
+                if row.exact:
+                    self._settle([row], Row.solve_bounded, polish=True)
 
         self._start(settle)
         self._prove(settle)
@@ -602,13 +629,17 @@ class WorkingSet:
 
     # --- held samples ---
 
-    def _settle(self, rows: list[Row], solve: Callable[[Row], str]) -> None:
+    def _settle(self, rows: list[Row], solve: Callable[[Row], str], polish: bool = False) -> None:
         for row in rows:
             for _ in range(MAX_ROUNDS):
                 if row.unknown:
                     self._guarded(row, solve)
                 self.rounds += 1
-                if not row.widen_pool() or not row.unknown:
+                if row.unknown and row.widen_pool():
+                    continue
+                if polish and row.unknown:
+                    row.polish()
+                if not polish or not row.unknown or not row.widen_pool():
                     break
             else:
                 raise FitError(f"row {row.i}: no working set after {MAX_ROUNDS} rounds; scale the signals to order one")
