@@ -1,0 +1,100 @@
+"""Blocks read ahead and many at once: whole or damaged, a file reads as it does message by message."""
+
+from __future__ import annotations
+
+import random
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_writer import Layout, float64
+from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
+
+import uncertain_lti.mcap_batches
+from uncertain_lti.bag import Bag
+from uncertain_lti.bag_arrays import read_columns
+from uncertain_lti.errors import BagError
+from uncertain_lti.reading import Stream, read_stream, read_stream_by_message
+from uncertain_lti.signals import FieldPath, Signal, SignalMap
+
+XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),))
+
+
+@pytest.fixture(autouse=True)
+def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that a short file has many."""
+    monkeypatch.setattr(uncertain_lti.mcap_batches, "_BATCH", 6000)
+
+
+def recording(folder: Path, compression: str, chunk_size: int) -> Path:
+    dice = np.random.default_rng(0)
+    messages = []
+    for k in range(1, 400):
+        names = ["base_link", "odom", "map"][: k % 3]
+        messages.append(("/x", k * MS, joint_state(k * MS, [0.0, k, dice.normal()], names)))
+        messages.append(("/u", k * MS, float64(dice.normal())))
+    layout = Layout(compression, chunk_size=chunk_size)
+    return save(folder, {"/x": JOINT_STATE, "/u": FLOAT64}, messages, f"{compression}_{chunk_size}.mcap", layout)
+
+
+def plain(stream: Stream) -> tuple[bytes, ...]:
+    return (
+        stream.topic.tobytes(),
+        stream.arrival.tobytes(),
+        stream.stamp.tobytes(),
+        *(v.tobytes() for v in stream.values),
+    )
+
+
+def outcome(path: Path, by_message: bool) -> tuple[bytes, ...] | str:
+    try:
+        return plain((read_stream_by_message if by_message else read_stream)(Bag(path, indexed=not by_message), XU))
+    except BagError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("chunk_size", [300, 5000, 50_000])
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+def test_whole_files(tmp_path: Path, compression: str, chunk_size: int) -> None:
+    path = recording(tmp_path, compression, chunk_size)
+    found = outcome(path, by_message=False)
+    assert not isinstance(found, str) and found == outcome(path, by_message=True)
+
+
+@pytest.mark.parametrize("chunk_size", [300, 5000])
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+def test_damaged_files(tmp_path: Path, compression: str, chunk_size: int) -> None:
+    """Bits flipped, cut, sizes that lie, bytes missing: the same reading or the same sentence."""
+    whole = recording(tmp_path, compression, chunk_size).read_bytes()
+    dice = random.Random(chunk_size)
+    path = tmp_path / "damaged.mcap"
+    for damage in range(60):
+        data = bytearray(whole)
+        at = dice.randrange(len(data) - 8)
+        if damage % 4 == 0:
+            data[at] ^= 1 << dice.randrange(8)
+        elif damage % 4 == 1:
+            del data[at:]
+        elif damage % 4 == 2:
+            data[at : at + 8] = dice.choice([b"\xff" * 8, bytes(8), (1 << 40).to_bytes(8, "little")])
+        else:
+            del data[at : at + dice.randint(1, 300)]
+        path.write_bytes(data)
+        assert outcome(path, by_message=False) == outcome(path, by_message=True), f"damage {damage} at {at}"
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+def test_a_reading_that_is_broken_off_leaves_no_thread(tmp_path: Path, compression: str) -> None:
+    bag = Bag(recording(tmp_path, compression, 300), indexed=True)
+
+    def broken(items, total):  # type: ignore[no-untyped-def]
+        for number, item in enumerate(items):
+            if number == total // 2:
+                raise KeyboardInterrupt
+            yield item
+
+    before = threading.active_count()
+    with pytest.raises(KeyboardInterrupt):
+        read_columns(bag, ["/x"], [[FieldPath("position[2]")]], broken)
+    assert threading.active_count() == before
