@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
 from uncertain_lti.errors import FitError
-from uncertain_lti.identification import formulation, passes, solvers
+from uncertain_lti.identification import formulation, passes, solvers, working_set
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import assemble
 from uncertain_lti.identification.structure import Structure
@@ -664,3 +664,15 @@ def test_controls_that_move_together_cost_no_optimality(criterion, seed):
     problem = assemble([transient], OperatingPoint.identity(3, 3), None, "disturbance")
     _, _, objective = formulation.solve(problem, criterion, cp.CLARABEL)
     np.testing.assert_allclose(model.fit["objective"], objective, rtol=1e-5)
+
+
+@pytest.mark.parametrize("N", [300, 3 * SUBSAMPLE])
+def test_a_weight_beside_the_largest_width_that_is_too_large_is_seen(monkeypatch, N):
+    """The simplex method tells that δ is not the least, and takes over: the same optimum, ties broken alike."""
+    transient = drawn(leibov2006(), N, 4, noise=1e-3)
+    expected = fit(transient, "lp", additive="noise")
+    monkeypatch.setattr(working_set, "REGULARISATION", 100.0)
+    model = fit(transient, "lp", additive="noise")
+    np.testing.assert_allclose(model.fit["objective"], expected.fit["objective"], rtol=1e-8)
+    np.testing.assert_allclose(model.fit["mean_width"], expected.fit["mean_width"], rtol=1e-3)
+    assert model.fit["gap"] < 1e-6 and count_outside(model, [transient]) == 0
