@@ -36,6 +36,7 @@ _LOOK = 1 << 14  # bytes in which a walker looks for its first message
 _LIKE_A_MESSAGE = re.compile(rb"\x05.{4}\0{4}", re.DOTALL)
 _NEAR = 1 << 16  # bytes between blocks that are read along
 _FEW = 100  # messages in a block that one walker passes soon enough
+_EVERY = 16  # so many messages a walker passes, where an index says where they are
 _LONG_INDEX = 1 << 10  # bytes per channel from which on an index is faster than looking
 _CHANNEL_AT = RECORD.size
 _LOG_TIME_AT = RECORD.size + 6
@@ -352,7 +353,7 @@ def _walkers(data: bytearray, places: Sequence[_Place], by_index: bool) -> tuple
 
 
 def _offsets(block: Block, after: memoryview) -> Integers | None:
-    """Offsets of messages as stated behind a large block, in order, but for one at its begin; None where odd."""
+    """Offsets of some messages as stated behind a large block, in order, none at its begin; None where odd."""
     if block.indexed < _LONG_INDEX * len(block.channels):
         return None
     offsets = []
@@ -367,7 +368,7 @@ def _offsets(block: Block, after: memoryview) -> Integers | None:
     every = np.sort(np.concatenate(offsets))
     if not len(every) or every[0] < 0 or every[-1] >= block.length:
         return None
-    return every[1:] if every[0] == 0 else every
+    return every[1:][::_EVERY]
 
 
 def _together(data: bytearray, begins: Integers, limits: Integers) -> Integers | None:
