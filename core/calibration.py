@@ -23,6 +23,8 @@ MARGINS = tuple(float(m) for m in np.geomspace(4.0, 0.5, 106))
 """Margins tried, from the largest: about 2 % apart."""
 FAULT_SIZE = 1.0
 """The stated fault moves one state by so many mean widths more in every step."""
+BLIND = 0.5
+"""A rule that sees a smaller share of the stated faults on some state is warned of: it is quiet because it is deaf."""
 STARTS = 8
 """Instants per left-out part at which the stated fault is put in, with either sign."""
 
@@ -55,6 +57,8 @@ class Calibration:
     needed_hours: float
     candidates: tuple[Candidate, ...]
     words: str
+    warning: str = ""
+    """What the chosen rule does not see; empty where it sees at least BLIND of the stated faults on every state."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the model file."""
@@ -65,6 +69,7 @@ class Calibration:
             "needed_hours": self.needed_hours,
             "reached": self.alarm is not None,
             "words": self.words,
+            "warning": self.warning,
             "fault": f"one state moved by {FAULT_SIZE:g} mean width more in every step",
             "candidates": [
                 {
@@ -142,8 +147,18 @@ def calibrate(
             else f"in {best.detected[slow]:.0%} of the cases only (worst state: {names[slow]})"
         )
     )
-    return Calibration(
-        Alarm(best.violations, best.window, best.margin), wish, confidence, hours, needed, candidates, words
+    rule = Alarm(best.violations, best.window, best.margin)
+    return Calibration(rule, wish, confidence, hours, needed, candidates, words, _deaf(best.detected, names))
+
+
+def _deaf(detected: Array, names: Sequence[str]) -> str:
+    """Warning that a rule, which sees the shares `detected` (n,) of the stated faults, misses most on some states."""
+    missed = [f"{name} in {share:.0%}" for name, share in zip(names, detected, strict=True) if not share >= BLIND]
+    if not missed:
+        return ""
+    return (
+        f"this rule keeps quiet by seeing little: a fault that moves one state by {FAULT_SIZE:g} mean width more in "
+        f"every step is seen on {', '.join(missed)} of the cases; accept more false alarms per hour, or record more"
     )
 
 

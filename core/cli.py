@@ -189,7 +189,10 @@ def _parser(chosen: str) -> argparse.ArgumentParser:
         "--false-alarms", type=float, metavar="PER_HOUR", help="find the alarm rule that stays below so many per hour"
     )
     validate.add_argument(
-        "--output", metavar="MODEL", help="write the model with this validation, and the alarm rule found, to this file"
+        "--output",
+        metavar="MODEL",
+        help="write the model with this validation, and the alarm rule found, to this file; where --false-alarms "
+        "finds none, nothing is written and the exit status is 2",
     )
     validate.add_argument("--json", action="store_true", help="print JSON")
 
@@ -501,20 +504,28 @@ def _validate(options: argparse.Namespace) -> int:
             model, transients, blocks=options.blocks, gap=options.gap, confidence=options.confidence, progress=step
         )
     data = validation.to_dict()
+    refusal = ""
     if options.false_alarms is not None:
         calibration = calibrate(validation, options.false_alarms)
         data["calibration"] = calibration.to_dict()
         if calibration.alarm is not None:
             model = model.with_(alarm=calibration.alarm)
+        elif options.output is not None:
+            refusal = f"{options.output}: not written: {calibration.words}"
     model = model.with_(validation=data)
-    if options.output is not None:
-        model.save(options.output)
+    output = None if refusal else options.output
+    if output is not None:
+        model.save(output)
     if options.json:
-        _print_json({"model": options.output or options.model, "validation": model.to_dict()["validation"]})
+        _print_json({"model": output or options.model, "validation": model.to_dict()["validation"]})
     else:
         _tell(options, validation_text(data))
-        if options.output is not None:
-            _tell(options, f"model written to {options.output}")
+        if output is not None:
+            rule = f"{model.alarm.violations} of {model.alarm.window}, margin {model.alarm.margin:.3g}"
+            kept = ", unchanged" if options.false_alarms is None else ""
+            _tell(options, f"model written to {output}; its alarm rule{kept}: {rule}")
+    if refusal:  # whoever asked for a rule and deploys the file would deploy one without it
+        raise FitError(refusal)
     return DONE
 
 

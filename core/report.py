@@ -368,6 +368,8 @@ def validation_text(data: dict[str, Any]) -> str:
     lines.append(data["scenario"]["words"])
     if "calibration" in data:
         lines.append(data["calibration"]["words"])
+        if warning := data["calibration"].get("warning"):  # files written before it was stored have none
+            lines.append(f"warning: {warning}")
     return "\n".join(lines + [f"note: {note}" for note in data["notes"]])
 
 

@@ -448,6 +448,45 @@ def test_validate_then_watch_with_the_rule_found(folder, capsys):
     assert data["kind"] == "blocks" and data["parts"] == 18 and data["gap"] == 0.1
 
 
+def test_without_a_rule_nothing_is_written(folder, capsys):
+    """Whoever asks for a rule and gets none must not go on with a file that looks as if it had one."""
+    model, target = str(folder / "m.json"), folder / "none.json"
+    capsys.readouterr()
+    assert main(["validate", model, "--false-alarms", "0.001", "--output", str(target)]) == 2
+    said = capsys.readouterr()
+    assert not target.exists() and "model written" not in said.out and "inside all bounds" in said.out
+    assert said.err.count("\n") == 1 and f"{target}: not written: no alarm rule" in said.err
+    before = (folder / "m.json").read_bytes()
+    assert main(["validate", model, "--false-alarms", "0.001", "--output", model, "--json"]) == 2
+    data = json.loads(capsys.readouterr().out)
+    assert data["model"] == model and not data["validation"]["calibration"]["reached"]
+    assert (folder / "m.json").read_bytes() == before
+    assert main(["validate", model, "--false-alarms", "0.001"]) == 0  # only told, nothing was to be written
+    capsys.readouterr()
+    assert main(["validate", model, "--output", str(target)]) == 0
+    assert "its alarm rule, unchanged: 1 of 1, margin 1" in capsys.readouterr().out
+
+
+def test_a_rule_that_sees_little_is_warned_of(folder, capsys, monkeypatch):
+    """The warning stands on its own line exactly when some state's faults are mostly missed."""
+    model, target = str(folder / "m.json"), str(folder / "found.json")
+    lines = {}
+    for size in (1e-6, 1.0):  # a fault of next to nothing is not seen by a rule that keeps to the wish
+        monkeypatch.setattr("uncertain_lti.calibration.detection.__defaults__", (size,))
+        capsys.readouterr()
+        assert main(["validate", model, "--false-alarms", "2000", "--output", target]) == 0
+        lines[size] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning:")]
+        written = UncertainLTI.load(target)
+        found, rule = written.validation["calibration"], written.alarm
+        (chosen,) = [
+            c
+            for c in found["candidates"]
+            if (c["violations"], c["window"], c["margin"]) == (rule.violations, rule.window, rule.margin)
+        ]
+        assert bool(lines[size]) == (min(chosen["detected"]) < 0.5) == bool(found["warning"])
+    assert len(lines[1e-6]) == 1 and lines[1.0] == []
+
+
 def test_validate_refuses_what_it_cannot_vouch_for(folder, capsys):
     model = str(folder / "m.json")
     capsys.readouterr()
