@@ -22,7 +22,7 @@ from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
-from uncertain_lti.reading import read_stream, sample
+from uncertain_lti.reading import load_signals, read_stream, sample
 from uncertain_lti.sampler import resolve
 from uncertain_lti.signals import SignalMap
 
@@ -83,7 +83,8 @@ def fit_archive(
     if (cache is None) == (client is None):
         raise FitError("an archive is fitted from a cache or on a cluster; give one of them")
     if not isinstance(signals, SignalMap):
-        signals = SignalMap.load(signals)
+        paths = list(paths)
+        signals = load_signals(signals, paths)
     for signal in signals.signals:
         if "auto" in (signal.steady, signal.scale):
             raise SignalError(

@@ -1,4 +1,4 @@
-"""Files that bear their name only once they are whole."""
+"""Files that bear their name only once they are whole, and what a file is by its first bytes."""
 
 from __future__ import annotations
 
@@ -41,3 +41,12 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
         raise
+
+
+def is_mcap(path: str | os.PathLike[str]) -> bool:
+    """Whether a file begins as an MCAP recording does; False where it cannot be read."""
+    try:
+        with open(path, "rb") as stream:
+            return stream.read(5) == b"\x89MCAP"
+    except OSError:
+        return False

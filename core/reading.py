@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import os
 from array import array
@@ -21,7 +22,7 @@ from uncertain_lti.model import UncertainLTI
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.sampler import Sampler, Status, resolve
 from uncertain_lti.sampler_arrays import Decisions, Samples, decided, sample_arrays
-from uncertain_lti.signals import FieldPath, SignalMap
+from uncertain_lti.signals import FieldPath, SignalMap, UncarriedTopicError
 from uncertain_lti.transient import Transient
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -218,9 +219,10 @@ def read_transients(
     SignalError
         The map does not fit the recordings.
     """
+    of = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     if not isinstance(signals, SignalMap):
-        signals = SignalMap.load(signals)
-    bags = group_recordings([paths] if isinstance(paths, (str, os.PathLike)) else list(paths), indexed=True)
+        signals = load_signals(signals, of)
+    bags = group_recordings(of, indexed=True)
     if not bags:
         raise BagError("no recording is named; give at least one MCAP file or folder")
     signals = signals.with_types(_types(bags, signals))
@@ -325,13 +327,39 @@ def _stream_for_model(
     return stream, signals
 
 
+def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.PathLike[str]]) -> SignalMap:
+    """A signals file, whose topics are held against the recordings before one of them is recommended.
+
+    Raises
+    ------
+    BagError
+        A recording cannot be read, or lacks a topic of a file that contradicts itself.
+    SignalError
+        As `SignalMap.load`.
+    """
+    try:
+        return SignalMap.load(path)
+    except UncarriedTopicError as error:
+        for bag in group_recordings(list(recordings), indexed=True):
+            for topic in error.topics:
+                if topic not in bag.topics:
+                    raise BagError(no_topic(bag, topic)) from None
+        raise
+
+
+def no_topic(bag: Bag, topic: str) -> str:
+    """The sentence for a topic that a recording lacks, with the nearest names and all of them."""
+    near = difflib.get_close_matches(topic, sorted(bag.topics), n=3, cutoff=0.75)
+    meant = f" (is {' or '.join(near)} meant?)" if near else ""
+    return f"{bag.path}: there is no topic {topic}{meant}; topics there: {', '.join(sorted(bag.topics)) or 'none'}"
+
+
 def _types(bags: Sequence[Bag], signals: SignalMap) -> Mapping[str, str]:
     types: dict[str, str] = {}
     for bag in bags:
         for topic in signals.topics:
             if topic not in bag.topics:
-                there = ", ".join(sorted(bag.topics)) or "none"
-                raise BagError(f"{bag.path}: there is no topic {topic}; topics there: {there}")
+                raise BagError(no_topic(bag, topic))
             found = bag.topics[topic].type
             if types.setdefault(topic, found) != found:
                 raise BagError(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple
 
 from uncertain_lti.errors import SignalError
+from uncertain_lti.files import is_mcap
 
 LONGEST_DELAY = 1_000_000
 """Samples by which a control may be delayed at most."""
@@ -324,6 +325,14 @@ class Signal:
     delay: int = 0
 
 
+class UncarriedTopicError(SignalError):
+    """A signals file speaks of a topic that carries no signal; topics: those that do, any of which may be misspelt."""
+
+    def __init__(self, text: str, topics: tuple[str, ...]) -> None:
+        super().__init__(text)
+        self.topics = topics
+
+
 @dataclass(frozen=True)
 class SignalMap:
     """Which topic and field is which state or control, and how samples are cut from the messages.
@@ -384,15 +393,17 @@ class SignalMap:
                     f"(the age of a state is limited by max_skew)"
                 )
         if self.clock is not None and self.clock not in {s.topic for s in self.states}:
-            raise SignalError(
+            raise UncarriedTopicError(
                 f"{self.source}: clock is {self.clock}, which carries no state; choose one of "
-                f"{', '.join(dict.fromkeys(s.topic for s in self.states))}"
+                f"{', '.join(dict.fromkeys(s.topic for s in self.states))}",
+                self.topics,
             )
         for topic in self.time:
             if topic not in self.topics:
-                raise SignalError(
+                raise UncarriedTopicError(
                     f"{self.source}: 'topics' names {topic}, which carries no signal; "
-                    f"signals come from {', '.join(self.topics)}"
+                    f"signals come from {', '.join(self.topics)}",
+                    self.topics,
                 )
         for name in ("max_gap", "max_skew"):
             value = getattr(self, name)
@@ -439,6 +450,10 @@ class SignalMap:
         """
         import yaml  # the live node reads signals from the model file and needs no YAML
 
+        if is_mcap(path):
+            raise SignalError(
+                f"{path}: this is an MCAP recording, and a signals file is wanted here; are the arguments swapped?"
+            )
         try:
             with open(path, encoding="utf-8") as stream:
                 node = yaml.compose(stream, Loader=yaml.SafeLoader)
@@ -457,6 +472,10 @@ class SignalMap:
             line = f" at line {mark.line + 1}" if mark else ""
             problem = str(getattr(error, "problem", None) or error).splitlines()[0]
             raise SignalError(f"{path}: is not YAML{line}: {problem}; mend it") from None
+        if data is None:
+            raise SignalError(
+                f"{path}: nothing is in it; list the states and controls, or let `uncertain-lti init` propose them"
+            )
         return cls.from_dict(data, source=os.fspath(path))
 
     @classmethod

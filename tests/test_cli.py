@@ -148,7 +148,13 @@ def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
         (fit_with("states: []"), "at least one state"),
         (fit_with("states: [1, 2"), "is not YAML"),
         (fit_with("clock: /engine/control\n" + SIGNALS), "carries no state"),
+        (
+            fit_with("clock: /engine/state\n" + SIGNALS.replace("topic: /engine/state", "topic: /engine/stte")),
+            "no topic /engine/stte (is /engine/state meant?)",
+        ),
         (["check", str(folder / "signals.yaml"), run], "is not JSON"),
+        (["check", run, out], "this is an MCAP recording, and a model file is wanted here; are the arguments swapped?"),
+        (["fit", run, "--signals", run, "--output", out], "this is an MCAP recording, and a signals file is wanted"),
         (["check", out, run, "--margin", "-1"], "no such model file"),
     ]
     for arguments, words in cases:

@@ -416,7 +416,8 @@ def control(entry: str) -> str:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "a mapping is wanted here, not NoneType"),
+        ("", "nothing is in it; list the states and controls, or let `uncertain-lti init`"),
+        ("# only words", "nothing is in it"),
         ("- a", "a mapping is wanted here, not list"),
         ("a: b: c", "is not YAML at line 1"),
         ("a: [", "is not YAML at line 1"),
