@@ -417,6 +417,7 @@ def _check(options: argparse.Namespace) -> int:
     from uncertain_lti.bag import group_recordings
     from uncertain_lti.reading import read_with_decisions
     from uncertain_lti.report import check_data, check_text
+    from uncertain_lti.wording import plural
 
     model = _named(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
@@ -439,7 +440,10 @@ def _check(options: argparse.Namespace) -> int:
             made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, monitor.rule, writing)
             _say(options, made.notes)
             data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
-            _tell(options, f"{made.messages} messages and the verdicts below {made.topics} written to {made.path}")
+            _tell(
+                options,
+                f"{plural(made.messages, 'message')} and the verdicts below {made.topics} written to {made.path}",
+            )
     if options.json:
         _print_json({"model": options.model, "alarm": any(r["alarm"] for r in results), "recordings": results})
     return ALARM if any(r["alarm"] for r in results) else DONE

@@ -18,9 +18,12 @@ from uncertain_lti.errors import BagError
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.report import check_data, number
+from uncertain_lti.wording import plural, times
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
-"""Mean width of the one-step bounds as a share of the state's own range in the recordings."""
+"""Mean width of the one-step bounds as a share of the state's own range, in the recordings or in the fit."""
+RUNS_AWAY = 1.2
+"""Spectral radius of the nominal recursion from which on it says little of the machine even for a few steps."""
 CAUTION_INSIDE, TOO_FEW_INSIDE = 0.99, 0.9
 """Share of the verdicts on left-out recordings that lie inside all bounds."""
 OUTSIDE_DOMAIN, WITHOUT_VERDICT = 0.05, 0.2
@@ -67,6 +70,7 @@ def findings(
     validation = _validation(model)
     reasons = [
         *_fit_reasons(model),
+        *_stability_reasons(model),
         *_validation_reasons(validation, model),
         *_width_reasons(model, recordings),
         *_recording_reasons(model, recordings),
@@ -275,6 +279,16 @@ def _fit_reasons(model: UncertainLTI) -> list[dict[str, str]]:
     return found
 
 
+def _stability_reasons(model: UncertainLTI) -> list[dict[str, str]]:
+    """A nominal model that multiplies a deviation at every step is no picture of the machine."""
+    if model.sampling.dt_median is None or not math.isfinite(radius := model.spectral_radius()) or radius <= RUNS_AWAY:
+        return []
+    if any("spectral radius" in str(message) for message in _list(model.fit.get("messages"))):
+        return []  # the fit said so
+    text = f"the nominal model runs away: a deviation can grow {number(radius)} times in a step (spectral radius)"
+    return [_reason(CARE, "stability", text)]
+
+
 def _validation_reasons(validation: Mapping[str, Any] | None, model: UncertainLTI) -> list[dict[str, str]]:
     if validation is None or validation["inside"] is None:
         how = "run `uncertain-lti validate MODEL --output MODEL` where its recordings are"
@@ -284,8 +298,11 @@ def _validation_reasons(validation: Mapping[str, Any] | None, model: UncertainLT
     what = "recordings" if validation["kind"] == "transients" else "blocks"
     inside = float(validation["inside"])
     weight = NO if inside < TOO_FEW_INSIDE else CARE if inside < CAUTION_INSIDE else YES
+    if 2 * validation["parts_inside"] < validation["parts"] and weight == YES:
+        weight = CARE  # few violations, and yet nearly every run has some: an alarm on one of them would be a habit
     text = (
-        f"of {validation['verdicts']} verdicts on {what} that were left out of the fit {_percent(inside)} lay inside "
+        f"of {plural(validation['verdicts'], 'verdict')} on {what} that were left out of the fit "
+        f"{_percent(inside)} lay inside "
         f"({validation['parts_inside']} of {validation['parts']} whole {what})"
     )
     if validation["kind"] != "transients":
@@ -294,8 +311,16 @@ def _validation_reasons(validation: Mapping[str, Any] | None, model: UncertainLT
 
 
 def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Bounds about as wide as what the state does contain everything, and say nothing."""
+    """Bounds about as wide as what the state does contain everything, and say nothing.
+
+    A recording in which a state hardly moves says nothing of that: the least share counts, and so does the fit's.
+    """
     wide: dict[str, float] = {}
+    span = model.domain.x_max - model.domain.x_min
+    widths = _numbers(model.fit.get("mean_width"), model.n) or [math.nan] * model.n
+    for name, width, of in zip(model.state_names, widths, span, strict=True):
+        if math.isfinite(of) and of > 0 and math.isfinite(width):
+            wide[name] = width / float(of)
     for recording in recordings:
         for name, state in recording["states"].items():
             if (share := state["width_to_range"]) is not None:
@@ -307,9 +332,8 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
     if useless:
         listed = ", ".join(f"{shortened(name)} ({wide[name]:.0%})" for name in useless[:6])
         listed += " ..." if len(useless) > 6 else ""
-        weight = NO if len(useless) == model.n else CARE
         text = f"bounds over {TOO_WIDE:.0%} as wide as the state's own range say next to nothing: {listed}"
-        return [_reason(weight, "tightness", text)]
+        return [_reason(NO if 2 * len(useless) >= model.n else CARE, "tightness", text)]
     worst = max(wide, key=lambda name: wide[name])
     text = f"one-step bounds are at most {wide[worst]:.3g} times as wide as the state's own range ({shortened(worst)})"
     return [_reason(CARE if names else YES, "tightness", text)]
@@ -347,7 +371,7 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     judged, bad = recording["verdicts"], recording["violated"]
     if not judged:
         return {"recording": recording["recording"], "state": "unknown", "text": "no verdict was possible"}
-    over = f"{judged} verdicts over {number(recording['seconds'])} s"
+    over = f"{plural(judged, 'verdict')} over {number(recording['seconds'])} s"
     if not bad:
         return {"recording": recording["recording"], "state": "quiet", "text": f"{over}: every one inside all bounds"}
     states = {name: s["violations"] for name, s in recording["states"].items() if s["violations"]}
@@ -357,8 +381,7 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     text += f"{recording['episodes'][0]['first']['t']:.8g} s; most often {listed}"
     if recording["alarm"]:
         first = recording["alarms"][0]
-        times = "once" if len(recording["alarms"]) == 1 else f"{len(recording['alarms'])} times"
-        text += f". The alarm was raised {times}, first at {first['t']:.8g} s"
+        text += f". The alarm was raised {times(len(recording['alarms']))}, first at {first['t']:.8g} s"
         return {"recording": recording["recording"], "state": "alarm", "text": text}
     return {"recording": recording["recording"], "state": "violations", "text": f"{text}. The alarm was not raised"}
 

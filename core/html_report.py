@@ -23,7 +23,8 @@ from uncertain_lti.files import whole_file
 from uncertain_lti.findings import APART, CARE, NO, YES, shortened
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
-from uncertain_lti.report import number
+from uncertain_lti.report import beyond, number
+from uncertain_lti.wording import plural
 
 MOST_DRAWN = 8
 """Recordings with figures of their own; those with most violations."""
@@ -143,7 +144,8 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
     rule = facts["rule"]
     return (
         f"<header><h1>{_text(name)}</h1>"
-        f'<p class="soft">{_text(_summary(facts))}. Alarm: {rule["violations"]} of the last {rule["window"]} verdicts '
+        f'<p class="soft">{_text(_summary(facts))}. Alarm: {rule["violations"]} of the last '
+        f"{plural(rule['window'], 'verdict')} "
         f"violated, margin {number(rule['margin'])}.</p>"
         '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a><a href="#trust">How far to trust it'
         '</a><a href="#origin">Where it comes from</a></nav></header>\n'
@@ -156,12 +158,14 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
 
 def _summary(facts: Mapping[str, Any]) -> str:
     model = facts["model"]
-    text = f"{len(model['states'])} states, {len(model['controls'])} controls"
+    text = f"{plural(len(model['states']), 'state')}, {plural(len(model['controls']), 'control')}"
     fit = model["fit"]
     if "criterion" in fit:
         text += f"; fitted by criterion {'(11)' if fit['criterion'] == 'lp' else '(10)'}"
         if "transitions" in fit:
-            text += f" to {fit['transitions']} transitions of {_several(fit.get('transients', '?'), 'recording')}"
+            text += (
+                f" to {plural(fit['transitions'], 'transition')} of {plural(fit.get('transients', '?'), 'recording')}"
+            )
     return text
 
 
@@ -200,14 +204,15 @@ def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]
     parts = [f"<h3>{_text(os.path.basename(facts['recording']) or facts['recording'])}</h3>"]
     silent = f" Without a verdict, or not used: {', '.join(facts['no_verdict'])}." if facts["no_verdict"] else ""
     parts.append(
-        f"<p>{facts['samples']} samples over {number(facts['seconds'])} s, {facts['verdicts']} verdicts, "
+        f"<p>{plural(facts['samples'], 'sample')} over {number(facts['seconds'])} s, "
+        f"{plural(facts['verdicts'], 'verdict')}, "
         f"{facts['violated']} of them violated.{_text(silent)} "
         f"Outside the fitted ranges: {facts['outside_domain']}.</p>"
     )
     parts += [f'<p class="soft">{_text(note)}</p>' for note in facts["notes"][:5]]
     worst = sorted(model.state_names, key=lambda name: -states[name]["violations"])[:_MOST_STATES]
     shown = [name for name in model.state_names if name in worst]
-    some = f"{len(shown)} of {model.n} states, those with most violations. " if len(shown) < model.n else ""
+    some = f"{len(shown)} of {plural(model.n, 'state')}, those with most violations. " if len(shown) < model.n else ""
     parts.append(
         _figure(
             plots.envelope_figure(model, verdicts, shown),
@@ -271,7 +276,7 @@ def _episodes(facts: Mapping[str, Any]) -> str:
 
 
 def _utilisation(state: Mapping[str, Any]) -> str:
-    return "without width" if state["utilisation"] is None else f"{state['utilisation']:.3g}"
+    return "without width" if state["utilisation"] is None else beyond(state["utilisation"])
 
 
 def _tightness(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> str:
@@ -295,7 +300,7 @@ def _tightness(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[
                 f"{width / span:.1%}" if width is not None and span else "-",
                 str(bad),
                 f"{100 * bad / total:.3g} %" if total else "-",
-                "-" if not worst else "no width" if None in worst else f"{max(worst, key=abs):.3g}",
+                "-" if not worst else "no width" if None in worst else beyond(max(worst, key=abs)),
             ]
         )
     header = (
@@ -408,10 +413,6 @@ def _code(value: object) -> str:
 
 def _without_address(text: str) -> str:
     return text[:400] + (" ..." if len(text) > 400 else "")
-
-
-def _several(number_: object, what: str) -> str:
-    return f"{number_} {what}{'' if number_ == 1 else 's'}"
 
 
 def _table(

@@ -14,6 +14,7 @@ from uncertain_lti.errors import ModelError, SignalError
 from uncertain_lti.files import whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -117,7 +118,10 @@ def from_control(
         X = np.array([float(s.scale) for s in signals.states])
         U = np.array([float(s.scale) for s in signals.controls])
         if (len(X), len(U)) != (n, B.shape[1]):
-            raise ModelError(f"signals name {len(X)} states and {len(U)} controls, the system {n} and {B.shape[1]}")
+            raise ModelError(
+                f"signals name {plural(len(X), 'state')} and {plural(len(U), 'control')}, the system {n} and "
+                f"{B.shape[1]}"
+            )
         A, B, c = A * X / X[:, None], B * U / X[:, None], c / X
     zero = np.zeros
     return UncertainLTI(
@@ -239,7 +243,7 @@ def _signals(
         point.append([default] * count if given is None else _real(given, f"{letter}_{which}", path).ravel().tolist())
     for what, values in ((f"{kind}_names", names), (f"{kind}_units", units), (f"{letter}_steady", point[0])):
         if len(values) != count:
-            raise ModelError(f"{path}: '{what}' has {len(values)} entries for {count} {kind}s")
+            raise ModelError(f"{path}: '{what}' has {plural(len(values), 'entry')} for {plural(count, kind)}")
     return tuple(
         Signal(name, "", letter, steady, scale, unit)
         for name, unit, steady, scale in zip(names, units, *point, strict=True)

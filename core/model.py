@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.errors import ModelError, SignalError
-from uncertain_lti.files import whole_file
+from uncertain_lti.files import is_mcap, whole_file
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.signals import Signal, SignalMap
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -141,7 +142,7 @@ class UncertainLTI:
         if self.B.size == 0:
             self.B = np.zeros((n, 0))
         if self.B.ndim != 2 or self.B.shape[0] != n:
-            raise ModelError(f"B has shape {self.B.shape}; it must have {n} rows, one per state")
+            raise ModelError(f"B has shape {self.B.shape}; it must have {plural(n, 'row')}, one per state")
         m = self.B.shape[1]
         zeros = np.zeros(n)
         self.dA = _array(dA, "dA", (n, n), half_width=True)
@@ -159,7 +160,7 @@ class UncertainLTI:
             )
         if (len(signals.states), len(signals.controls)) != (n, m):
             raise ModelError(
-                f"{len(signals.states)} states and {len(signals.controls)} controls are named for "
+                f"{plural(len(signals.states), 'state')} and {plural(len(signals.controls), 'control')} are named for "
                 f"A {self.A.shape} and B {self.B.shape}"
             )
         self.signals = signals
@@ -198,11 +199,12 @@ class UncertainLTI:
         return tuple(s.name for s in self.signals.controls)
 
     def __repr__(self) -> str:
-        text = f"UncertainLTI({self.n} states: {', '.join(self.state_names)}; {self.m} controls"
+        text = f"UncertainLTI({plural(self.n, 'state')}: {', '.join(self.state_names)}; "
+        text += f"{plural(self.m, 'control')}"
         if self.m:
             text += f": {', '.join(self.control_names)}"
         if "criterion" in self.fit:
-            text += f"; fitted by {self.fit['criterion']} to {self.fit.get('transitions')} transitions"
+            text += f"; fitted by {self.fit['criterion']} to {plural(self.fit.get('transitions'), 'transition')}"
         return text + ")"
 
     def _repr_html_(self) -> str:
@@ -487,6 +489,10 @@ class UncertainLTI:
             The file is missing, is not JSON, has an unknown format, wrong shapes, numbers that are not finite,
             negative half-widths or scales that are not positive; names file and field.
         """
+        if is_mcap(path):
+            raise ModelError(
+                f"{path}: this is an MCAP recording, and a model file is wanted here; are the arguments swapped?"
+            )
         try:
             if os.path.getsize(path) > MAX_FILE_BYTES:
                 raise ModelError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, so not a model file; check the path")
@@ -696,7 +702,7 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _limits(value: Any, name: str, size: int) -> Array:
     """A list of numbers; null stands for no limit."""
     if not isinstance(value, list) or len(value) != size:
-        raise ModelError(f"field '{name}' must be a list of {size} numbers")
+        raise ModelError(f"field '{name}' must be a list of {plural(size, 'number')}")
     without = -math.inf if name.endswith("min") else math.inf
     limits = _array([0.0 if v is None else v for v in value], name, (size,))
     limits[[v is None for v in value]] = without

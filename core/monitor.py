@@ -18,6 +18,7 @@ from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.sampler import Status, Step
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural, times
 
 Array = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ class Verdict:
         if not self.judged:
             return f"Verdict({self.status.value}: no verdict)"
         left = int((self.flags == 1.0).sum())
-        said = f"{left} of {len(self.flags)} states violated" if left else "contained"
+        said = f"{left} of {plural(len(self.flags), 'state')} violated" if left else "contained"
         return f"Verdict({said}{', outside the fitted domain' * self.outside_domain}{', ALARM' * self.alarm})"
 
     @property
@@ -191,8 +192,8 @@ class Verdicts:
         judged, left = int(self.judged.sum()), int(self.violated.sum())
         raised = int(np.count_nonzero(np.diff(np.concatenate([[False], self.alarm]).astype(np.int8)) == 1))
         said = f"{1 - left / judged:.3%} inside all bounds" if judged else "none possible"
-        alarm = f"alarm raised {raised} times" if raised else "no alarm"
-        return f"Verdicts({self.transient.name!r}: {judged} verdicts, {said}, {alarm})"
+        alarm = f"alarm raised {times(raised)}" if raised else "no alarm"
+        return f"Verdicts({self.transient.name!r}: {plural(judged, 'verdict')}, {said}, {alarm})"
 
     def _repr_html_(self) -> str:
         from uncertain_lti.tables import verdicts_html
@@ -368,7 +369,8 @@ class EnvelopeMonitor:
         model, point = self.model, self.model.operating_point
         if transient.x.shape[1] != model.n or transient.u.shape[1] != model.m:
             raise ModelError(
-                f"{transient.name}: {transient.x.shape[1]} states and {transient.u.shape[1]} controls, and the "
+                f"{transient.name}: {plural(transient.x.shape[1], 'state')} and "
+                f"{plural(transient.u.shape[1], 'control')}, and the "
                 f"model has {model.n} and {model.m}"
             )
         steps = transient.transitions()

@@ -687,7 +687,9 @@ def _head(figure: Any, verdicts: Verdicts, handles: list[Any]) -> Any:
         else "nothing is known"
     )
     name = _short(os.path.basename(verdicts.transient.name) or verdicts.transient.name, 60)
-    figure.text(0.1 / _WIDTH, 1 - 0.22 / total, f"{name}: {_count(judged)} verdicts, {said}", fontsize=9)
+    figure.text(
+        0.1 / _WIDTH, 1 - 0.22 / total, f"{name}: {_count(judged)} verdict{'s' * (judged != 1)}, {said}", fontsize=9
+    )
     figure.legend(
         handles=handles, loc="upper right", ncols=len(handles), fontsize=7, frameon=False, borderaxespad=0.1,
         bbox_to_anchor=(0.99, 1 - 0.24 / total),

@@ -18,6 +18,7 @@ from uncertain_lti.cdr_arrays import RepeatedNamesError
 from uncertain_lti.errors import BagError, SignalError
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.signals import FieldPath, Signal
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 Iterate = Callable[[Iterable[object], int], Iterable[object]]
@@ -203,7 +204,7 @@ def _look(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
         elif source.role == "apart":
             source.reason = "no signal of a machine by its name or type"
         elif total < (3 if source.role == "control" else FEWEST):
-            source.reason = f"{total} messages only"
+            source.reason = f"{plural(total, 'message')} only"
         elif any(topic not in b.topics or not b.topics[topic].count for b in bags):
             source.reason = "not in every recording"
         elif any(b.topics[topic].type != fact.info.type for b in bags):
@@ -342,7 +343,7 @@ def _judge(candidate: Candidate, source: Source) -> None:
     elif len(finite) < 0.5 * len(values):
         candidate.reason = f"a number in {len(finite)} of {len(values)} messages only"
     elif (moved := len(finite) - int(np.unique(finite, return_counts=True)[1].max())) < max(3, len(finite) // 500):
-        candidate.reason = f"leaves its usual value in {moved} of {len(finite)} messages only"
+        candidate.reason = f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
     elif source.role == "state" and len(np.unique(finite)) < 3:
         candidate.reason = "takes two values only"
     elif source.role != "control" and _counts(values, np.concatenate(source.arrival)):

@@ -13,6 +13,7 @@ from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.reading import unused
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural, times
 
 Array = NDArray[np.float64]
 
@@ -36,11 +37,22 @@ def number(value: float | None) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.4g}"
 
 
+def beyond(utilisation: float) -> str:
+    """A violated utilisation with as many digits as show that it is beyond -1 or 1."""
+    for digits in range(3, 10):
+        text = f"{utilisation:.{digits}g}"
+        if abs(float(text)) > 1.0:
+            return text
+    return f"just beyond {math.copysign(1.0, utilisation):.0f}"
+
+
 def recording_text(transient: Transient) -> str:
     """One recording: what was read, and what of it is not used."""
     usable = int(transient.usable.sum())
     span = float(np.ptp(transient.t_ns)) * 1e-9 if len(transient) else 0.0
-    text = f"{transient.name}: {len(transient)} samples over {span:.4g} s, {usable} usable transitions"
+    text = (
+        f"{transient.name}: {plural(len(transient), 'sample')} over {span:.4g} s, {plural(usable, 'usable transition')}"
+    )
     left = unused(transient)
     return f"{text} ({', '.join(left)})" if left else text
 
@@ -66,7 +78,7 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
             ]
         )
     lines = [
-        f"criterion {criterion}; additive: {facts['additive']}; {facts['transitions']} transitions, "
+        f"criterion {criterion}; additive: {facts['additive']}; {plural(facts['transitions'], 'transition')}, "
         f"{facts['violations']} outside, gap to the optimum {facts['gap']:.1e}",
         table(("one-step envelope", "mean width", "largest", "rms step", "range", "width/range"), rows),
         f"eigenvalues of A [1/s]: {_eigenvalues(model)}",
@@ -74,7 +86,7 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
     if "discarded" in facts:
         gone, before = facts["discarded"], facts["with_discarded"]["mean_width_recorded"]
         lines.append(
-            f"discarded {len(gone)} transitions (mean width with them: {', '.join(map(number, before))}): "
+            f"discarded {plural(len(gone), 'transition')} (mean width with them: {', '.join(map(number, before))}): "
             + ", ".join(f"{d['file']} t = {d['t']:.4f} s" for d in gone[:20])
             + (f" and {len(gone) - 20} more (in the model file)" if len(gone) > 20 else "")
         )
@@ -90,9 +102,10 @@ def archive_text(model: UncertainLTI) -> str:
     ]
     return "\n".join(
         [
-            f"criterion {facts['criterion']}; additive: {facts['additive']}; {facts['transients']} recordings, "
-            f"{facts['transitions']} transitions, {facts['violations']} outside, gap {facts['gap']:.1e}, "
-            f"{facts['solver']['passes']} passes",
+            f"criterion {facts['criterion']}; additive: {facts['additive']}; "
+            f"{plural(facts['transients'], 'recording')}, "
+            f"{plural(facts['transitions'], 'transition')}, {facts['violations']} outside, gap {facts['gap']:.1e}, "
+            f"{plural(facts['solver']['passes'], 'pass')}",
             table(("one-step envelope", "mean width", "largest"), rows),
             f"eigenvalues of A [1/s]: {_eigenvalues(model)}",
         ]
@@ -198,7 +211,8 @@ def model_text(model: UncertainLTI) -> str:
         lines.append(table(("one-step envelope", "mean width", "largest"), widths))
     alarm = model.alarm
     lines.append(
-        f"alarm: {alarm.violations} of the last {alarm.window} verdicts violated; margin {number(alarm.margin)}"
+        f"alarm: {alarm.violations} of the last {plural(alarm.window, 'verdict')} violated; margin "
+        f"{number(alarm.margin)}"
     )
     return "\n".join(lines + [f"note: {message}" for message in facts.get("messages", [])])
 
@@ -279,7 +293,7 @@ def check_text(data: dict[str, Any]) -> str:
             ]
         )
     inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} inside all bounds"
-    head = f"{data['recording']}: {data['samples']} samples, {data['verdicts']} verdicts, {inside}"
+    head = f"{data['recording']}: {plural(data['samples'], 'sample')}, {plural(data['verdicts'], 'verdict')}, {inside}"
     lines = [
         head + (f"; no verdict or not used: {', '.join(data['no_verdict'])}" if data["no_verdict"] else ""),
         table(("state", "violations", "inside", "mean width", "largest", "first", "longest"), rows),
@@ -289,7 +303,7 @@ def check_text(data: dict[str, Any]) -> str:
     if data["alarm"]:
         first = data["alarms"][0]
         lines.append(
-            f"ALARM: raised {len(data['alarms'])} times, first at {first['t']:.4f} s for {number(first['seconds'])} s"
+            f"ALARM: raised {times(len(data['alarms']))}, first at {first['t']:.4f} s for {number(first['seconds'])} s"
         )
     else:
         lines.append("no alarm" if data["verdicts"] else "no verdict was possible, so nothing is known")
@@ -321,7 +335,7 @@ def validation_text(data: dict[str, Any]) -> str:
     what = "recording" if data["kind"] == "transients" else "block"
     gap = f", {number(data['gap'])} s on both sides not fitted either" if data["kind"] == "blocks" else ""
     lines = [
-        f"left out one {what} at a time ({data['parts']} {what}s{gap}): {data['verdicts']} verdicts, "
+        f"left out one {what} at a time ({plural(data['parts'], what)}{gap}): {plural(data['verdicts'], 'verdict')}, "
         f"{number(data['hours'])} h",
         table(
             ("left out", "inside", f"{what}s inside", "mean width", "largest", "fitted: mean width", "largest"),
@@ -380,7 +394,7 @@ def left_out_text(data: dict[str, Any]) -> str:
     alarm = data["false_alarms"][0]
     return (
         f"left out one {what} of {data['parts']} at a time: {data['inside']:.3%} of the verdicts inside, "
-        f"{data['parts_inside']} whole {what}s, widths at most {ratio:.3g} times those above; "
+        f"{plural(data['parts_inside'], f'whole {what}')}, widths at most {ratio:.3g} times those above; "
         f"{number(alarm['per_hour'])} false alarms per hour ({_interval(*alarm['interval'])}) at "
         f"{alarm['violations']} of {alarm['window']}; more: uncertain-lti validate"
     )

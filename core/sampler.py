@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.errors import SignalError
 from uncertain_lti.signals import FieldPath, SignalMap
+from uncertain_lti.wording import plural
 
 _TWO_PI = 2.0 * math.pi
 BUFFERED_MESSAGES = 10_000
@@ -318,7 +319,9 @@ class Sampler:
         stamp = stamp_ns if state.header and stamp_ns is not None and stamp_ns > 0 else None
         message = _Message(arrival_ns, stamp, list(values))
         if len(message.values) != len(self._where[topic]):
-            raise ValueError(f"{topic}: {len(message.values)} values for {len(self._where[topic])} signals")
+            raise ValueError(
+                f"{topic}: {plural(len(message.values), 'value')} for {plural(len(self._where[topic]), 'signal')}"
+            )
         if topic == self.clock:
             return self._push_clock(state, message)
         if state.steps_back(message, self.max_gap_ns):
@@ -501,7 +504,7 @@ def resolve(
     if step is None:
         count = sum(len(i) for i in instants[clock])
         raise SignalError(
-            f"{clock}: {count} messages without a forward step in time, so no transition; "
+            f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
             f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
         )
     max_gap = signals.max_gap if signals.max_gap is not None else 2.5 * step * 1e-9

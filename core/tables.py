@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uncertain_lti.wording import plural
+
 if TYPE_CHECKING:
     from uncertain_lti.model import UncertainLTI
     from uncertain_lti.monitor import Verdicts
@@ -67,7 +69,7 @@ def model_html(model: UncertainLTI) -> str:
         ]
         below.append(f"mean one-step width: {', '.join(widths)}" + ", …" * (model.n > MOST))
     rule = model.alarm
-    below.append(f"alarm: {rule.violations} of {rule.window} verdicts, margin {_number(rule.margin)}")
+    below.append(f"alarm: {rule.violations} of {plural(rule.window, 'verdict')}, margin {_number(rule.margin)}")
     below += [f"note: {message}" for message in facts.get("messages", [])]
     return html_table(repr(model), header, rows, below)
 
@@ -127,7 +129,7 @@ def validation_html(data: dict[str, Any], title: str) -> str:
     if data["inside"] is not None:
         low, high = data["inside_interval"]
         below.append(
-            f"inside all bounds: {data['inside']:.3%} of {data['verdicts']} verdicts "
+            f"inside all bounds: {data['inside']:.3%} of {plural(data['verdicts'], 'verdict')} "
             f"({data['confidence']:.0%} interval {low:.3%} to {high:.3%})"
         )
     for rule in data["false_alarms"][:1]:

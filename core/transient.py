@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.errors import TransientError
 from uncertain_lti.sampler import Status, median_step_ns, to_ns
 from uncertain_lti.signals import SignalMap
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -173,7 +174,8 @@ class Transient:
         n, m, usable = self.x.shape[1], self.u.shape[1], int(self.usable.sum())
         span = float(self.t[-1]) if len(self) else 0.0
         return (
-            f"Transient({self.name!r}: {len(self)} samples over {span:g} s, {n} states, {m} controls, "
+            f"Transient({self.name!r}: {plural(len(self), 'sample')} over {span:g} s, {plural(n, 'state')}, "
+            f"{plural(m, 'control')}, "
             f"{usable} usable transitions in {self.segments} segments)"
         )
 
@@ -388,7 +390,9 @@ def _names(
     if names is None:
         return tuple(f"{letter}{i + 1}" for i in range(count))
     if isinstance(given, str) or len(names) != count:
-        raise TransientError(f"{name}: {len(names)} names for {count} columns of {letter}; give a list, one for each")
+        raise TransientError(
+            f"{name}: {plural(len(names), 'name')} for {plural(count, 'column')} of {letter}; give a list, one for each"
+        )
     if len(set(names)) < count:
         raise TransientError(f"{name}: two columns of {letter} have the same name; give each its own")
     return names

@@ -24,6 +24,7 @@ from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import EnvelopeMonitor
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ class Part:
     relative_width: Array
 
     def __repr__(self) -> str:
-        return f"Part({self.name!r}: {self.judged} verdicts, {self.violated} violated)"
+        return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
 
     @property
     def judged(self) -> int:
@@ -115,7 +116,7 @@ class Validation:
 
     def __repr__(self) -> str:
         judged, violated = sum(p.judged for p in self.parts), sum(p.violated for p in self.parts)
-        inside = f"{1 - violated / judged:.3%} of {judged} verdicts inside" if judged else "no verdict"
+        inside = f"{1 - violated / judged:.3%} of {plural(judged, 'verdict')} inside" if judged else "no verdict"
         whole = sum(p.violated == 0 for p in self.parts)
         return f"Validation(left out one of {len(self.parts)} {self.kind}: {inside}, {whole} whole)"
 
@@ -270,7 +271,8 @@ def _blocks(transient: Transient, blocks: int) -> list[tuple[int, int]]:
     usable = np.flatnonzero(transient.usable)
     if len(usable) < 2 * blocks:
         raise FitError(
-            f"{transient.name}: {len(usable)} usable transitions are too few for {blocks} blocks; use fewer blocks"
+            f"{transient.name}: {plural(len(usable), 'usable transition')} "
+            f"{'is' if len(usable) == 1 else 'are'} too few for {plural(blocks, 'block')}; use fewer blocks"
         )
     edges = [int(part[0]) for part in np.array_split(usable, blocks)] + [int(usable[-1]) + 1]
     return [(a, b + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]

@@ -54,7 +54,7 @@ WORDS = {
     "frozen": "frozen sensor",
     "held": "repeats its last value",
     "ended": "commands that have ended",
-    "delay": "samples earlier",
+    "delay": "better when it is taken",
     "gain": "--additive noise",
 }
 

@@ -16,6 +16,7 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_tr
 from uncertain_lti.cli import main
 from uncertain_lti.findings import APART, CARE, MOST_EPISODES, NO, YES, findings
 from uncertain_lti.html_report import MOST_DRAWN, html_report
+from uncertain_lti.report import beyond
 from uncertain_lti.validation import validate
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;<img src=http://x/y.png onerror=alert(2)>\u202e\x07"
@@ -199,6 +200,56 @@ def test_episodes_hold_every_violation(letters):
         assert (
             between > APART or (np.diff(verdicts.transient.t_ns[one["last"]["k"] : other["first"]["k"] + 1]) < 0).any()
         )
+
+
+def judged(widths, validation=None, decay=1.0):
+    """Findings on a run of states that move between -1 and 1, by bounds of these half-widths."""
+    rng = np.random.default_rng(3)
+    n = len(widths)
+    x = np.clip(np.cumsum(rng.uniform(-0.1, 0.1, (600, n)), axis=0), -1, 1)
+    run = Transient(np.arange(600) * 0.01, x, np.zeros((600, 1)))
+    model = fit([run], additive="noise").with_(A=-decay * np.eye(n), B=np.zeros((n, 1)), v=np.array(widths))
+    model = model.with_(fit={"criterion": "qp"}, validation=validation or {})
+    return findings(model, "m", [EnvelopeMonitor(model).check(run)])
+
+
+def validated(parts_inside, parts, inside):
+    state = {"inside": inside, "mean_width_left_out": 0.1, "mean_width_full": 0.1, "parts_inside": parts_inside}
+    facts = {"kind": "transients", "parts": parts, "verdicts": 1000, "parts_inside": parts_inside, "hours": 1.0}
+    facts |= {"inside": inside, "inside_interval": [0.9, 1.0], "confidence": 0.95, "false_alarms": [], "notes": []}
+    return {**facts, "states": {"x1": state, "x2": state}, "scenario": {"words": "w"}}
+
+
+def test_bounds_half_as_wide_as_what_a_state_does_are_not_relied_on():
+    """However many verdicts lie inside; one such state among many is named, and the others may be relied on."""
+    good = validated(9, 10, 0.9999)
+    assert judged([0.15, 0.15], good)["rely"]["answer"] == YES
+    assert judged([0.9, 0.15], good)["rely"]["answer"] == NO
+    assert judged([0.9, 0.9])["rely"]["answer"] == NO
+    many = judged([0.15, 0.15, 0.9], {**good, "states": {f"x{i}": good["states"]["x1"] for i in (1, 2, 3)}})
+    assert many["rely"]["answer"] == CARE
+    assert [r["weight"] for r in many["rely"]["reasons"] if "x3 (" in r["text"]] == [CARE]
+
+
+@pytest.mark.parametrize(("inside", "parts", "weight"), [(0, 2, CARE), (4, 10, CARE), (5, 10, YES), (10, 10, YES)])
+def test_recordings_that_are_seldom_inside_as_a_whole_are_nothing_in_favour(inside, parts, weight):
+    reasons = judged([0.15, 0.15], validated(inside, parts, 0.9956))["rely"]["reasons"]
+    assert [r["weight"] for r in reasons if r["about"] == "validation"] == [weight]
+
+
+def test_a_nominal_model_that_runs_away_is_named():
+    assert not any(r["about"] == "stability" for r in judged([0.15, 0.15])["rely"]["reasons"])
+    (reason,) = [r for r in judged([0.15, 0.15], decay=1800.0)["rely"]["reasons"] if r["about"] == "stability"]
+    assert reason["weight"] == CARE and "17 times in a step" in reason["text"]
+
+
+@given(st.floats(1.0, 1e6, exclude_min=True), st.sampled_from([-1.0, 1.0]))
+def test_a_violation_reads_as_beyond_its_bound(size, sign):
+    text = beyond(sign * size)
+    if text.startswith("just beyond"):
+        assert size < 1 + 1e-8 and text.endswith("-1" if sign < 0 else " 1")
+    else:
+        assert abs(float(text)) > 1 and float(text) == pytest.approx(sign * size, rel=0.01)
 
 
 def test_endless_violations_stay_one_page():

@@ -161,7 +161,7 @@ def test_mat_files_that_are_none(tmp_path):
         ({"v": [np.nan, 0.0]}, "finite"),
         ({"model_json": "{"}, "model_json"),
         ({"model_json": "[]"}, "model"),
-        ({"model_json": None, "state_names": np.array(["one"])}, "1 entries for 2 states"),
+        ({"model_json": None, "state_names": np.array(["one"])}, "1 entry for 2 states"),
         ({"model_json": None, "x_scale": [0.0, 1.0]}, "scale"),
     ):
         model.save_mat(path)

@@ -239,7 +239,7 @@ ONE = np.ones((1, 1))
         ((np.ones((1, 2)), ONE, ONE, ONE), "A has shape"),
         ((np.ones((0, 0)), ONE, ONE, ONE), "A has shape"),
         ((np.ones((1, 1, 1)), ONE, ONE, ONE), "A has shape"),
-        ((ONE, np.ones((2, 1)), ONE, ONE), r"B has shape \(2, 1\); it must have 1 rows"),
+        ((ONE, np.ones((2, 1)), ONE, ONE), r"B has shape \(2, 1\); it must have 1 row"),
         ((ONE, ONE, np.ones((2, 2)), ONE), "field 'dA' has shape"),
         ((ONE, ONE, ONE, np.ones((1, 2))), "field 'dB' has shape"),
         ((ONE, np.ones((1, 0)), ONE, ONE), "field 'dB' has shape"),

@@ -310,7 +310,7 @@ def test_what_is_given_replaces_the_rule_of_the_model() -> None:
 
 def test_a_transient_of_other_size_is_refused() -> None:
     transient = Transient([0.0, 1.0], np.zeros((2, 2)), np.zeros((2, 1)), name="run")
-    with pytest.raises(ModelError, match="run: 2 states and 1 controls, and the model has 1 and 0"):
+    with pytest.raises(ModelError, match="run: 2 states and 1 control, and the model has 1 and 0"):
         EnvelopeMonitor(scalar()).check(transient)
 
 

@@ -193,7 +193,7 @@ def test_an_empty_run_and_a_single_sample_have_no_transition() -> None:
         (([0.0, 1.0], [1.0, 2.0], []), {"max_gap": NAN}, "max_gap is nan"),
         (([0.0, 1.0], [1.0, 2.0], []), {"min_step": -1.0}, "min_step is -1.0; it must be 0 s or more"),
         (([0.0, 1.0], [1.0, 2.0], []), {"min_step": INF}, "min_step is inf"),
-        (([0.0, 1.0], [1.0, 2.0], []), {"state_names": ["a", "b"]}, "2 names for 1 columns of x"),
+        (([0.0, 1.0], [1.0, 2.0], []), {"state_names": ["a", "b"]}, "2 names for 1 column of x"),
         (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": "ab"}, "give a list, one for each"),
         (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": ["a", "a"]}, "two columns of x have the same name"),
     ],

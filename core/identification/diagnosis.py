@@ -15,6 +15,7 @@ from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,8 @@ WORTH = 1.3
 def too_few(transitions: int, unknowns: int) -> str:
     """The sentence for fewer transitions than unknowns."""
     return (
-        f"{transitions} usable transitions for {unknowns} unknowns per row (nominal elements and half-widths); record "
+        f"{plural(transitions, 'usable transition')} for {unknowns} unknowns per row (nominal elements and "
+        "half-widths); record "
         f"at least {unknowns}, better a hundred times as many, or use fewer signals"
     )
 
@@ -58,10 +60,12 @@ def check_solvable(problem: Problem, transients: Sequence[Transient], names: Seq
         sample, state = where[0]
         transient = transients[problem.source[sample]]
         k = int(problem.k[sample])
+        others = len(np.unique(where[:, 0])) - 1
+        also = f" (so {'does' if others == 1 else 'do'} {plural(others, 'other sample')})" if others else ""
         raise FitError(
             f"{transient.name}: sample {k} (t = {transient.t[k]:.6g} s) is at rest, x = u = 0, and '{names[state]}' "
-            f"moves by {problem.x_next[sample, state]:.3g} in the next step, which no interval matrices can contain "
-            f"(so do {len(np.unique(where[:, 0])) - 1} other samples); use an additive term: --additive noise for "
+            f"moves by {problem.x_next[sample, state]:.3g} in the next step, which no interval matrices can contain"
+            f"{also}; use an additive term: --additive noise for "
             f"measurement noise, --additive disturbance for unmodelled inputs"
         )
 

@@ -25,6 +25,7 @@ from uncertain_lti.model import Alarm, Domain, Sampling, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.signals import FieldPath, Signal, SignalMap
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -107,7 +108,8 @@ def fit(
         operating_point = OperatingPoint.of(signals.states, signals.controls)
     elif (len(operating_point.x_s), len(operating_point.u_s)) != (n, m):
         raise FitError(
-            f"the operating point has {len(operating_point.x_s)} states and {len(operating_point.u_s)} controls, "
+            f"the operating point has {plural(len(operating_point.x_s), 'state')} and "
+            f"{plural(len(operating_point.u_s), 'control')}, "
             f"the transients {n} and {m}"
         )
     signals = _at(signals, operating_point)
@@ -120,7 +122,9 @@ def fit(
         )
     if structure is not None:
         if (structure.n, structure.m) != (n, m):
-            raise FitError(f"structure is for {structure.n} states and {structure.m} controls, not {n} and {m}")
+            raise FitError(
+                f"structure is for {plural(structure.n, 'state')} and {plural(structure.m, 'control')}, not {n} and {m}"
+            )
         if method == "cvxpy":
             raise FitError("method cvxpy takes no structure; use the working-set method")
     if additive is None:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.errors import FitError
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 Additive = Literal["none", "disturbance", "noise", "both"]
@@ -278,7 +279,8 @@ def assemble(
     if not len(k) and not empty:
         names = ", ".join(t.name for t in transients)
         raise FitError(
-            f"{names}: no usable transition among {sum(len(t) for t in transients)} samples; signals are missing, "
+            f"{names}: no usable transition among {plural(sum(len(t) for t in transients), 'sample')}; signals "
+            "are missing, "
             f"not finite or too old (see max_gap, max_hold, max_skew), so check the signals file"
         )
     dt = np.concatenate([s.dt for s in steps])

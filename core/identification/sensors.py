@@ -11,6 +11,7 @@ from uncertain_lti.identification.excitation import quoted, successive, unexplai
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.signals import Signal
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -174,8 +175,9 @@ def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
         if best and gain > 0.05 and gain * len(usable) > 50:
             said = signals[j].delay + best
             messages.append(
-                f"the states follow control '{signals[j].name}' better when it is taken {best} samples earlier (the "
-                f"unexplained part of a step falls by {1 - np.exp(-gain / n / 2):.0%}): try `delay: {said}` for it in "
+                f"the states follow control '{signals[j].name}' better when it is taken "
+                f"{plural(best, 'sample')} earlier (the unexplained part of a step falls by "
+                f"{1 - np.exp(-gain / n / 2):.0%}): try `delay: {said}` for it in "
                 f"the signals file"
             )
     return messages

@@ -13,6 +13,7 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Moments, Samples
 from uncertain_lti.identification.solvers import Sense, Simplex, dual_bound, solve_qp
 from uncertain_lti.identification.structure import Structure
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -575,7 +576,7 @@ class WorkingSet:
                 left += int((row.slack() < -TOLERANCE).sum())
                 if row.widen_pool():
                     todo.append(row)
-            self.progress(f"pass {self.passes}: {left} samples outside, working set {self._sizes()}")
+            self.progress(f"pass {self.passes}: {plural(left, 'sample')} outside, working set {self._sizes()}")
             if not todo:
                 return
             settle(self.rows if self.sums.coupled is not None else todo)

@@ -29,6 +29,7 @@ from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating
 from uncertain_lti.plants.turbofan_faults import KINDS, Fault
 from uncertain_lti.signals import Signal, SignalMap
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -93,7 +94,7 @@ class Run:
 
     def __post_init__(self) -> None:
         if self.samples < 2:
-            raise UncertainLTIError(f"turbofan: a run of {self.samples} samples; it must have at least 2")
+            raise UncertainLTIError(f"turbofan: a run of {plural(self.samples, 'sample')}; it must have at least 2")
         if self.noise < 0:
             raise UncertainLTIError(f"turbofan: noise is {self.noise:g}; it must be 0 or more")
 

@@ -1,0 +1,19 @@
+"""Counted things in sentences."""
+
+from __future__ import annotations
+
+
+def plural(count: object, word: str) -> str:
+    """1 state, 2 states, no state as 0 states, and 1 pass, 2 passes; `word` may be several, the last one counted."""
+    return f"{count} {word}" if count == 1 else f"{count} {_several(word)}"
+
+
+def times(count: int) -> str:
+    """Once, or how many times."""
+    return "once" if count == 1 else f"{count} times"
+
+
+def _several(word: str) -> str:
+    if word.endswith(("s", "x", "ch", "sh")):
+        return f"{word}es"
+    return f"{word[:-1]}ies" if word.endswith("y") and word[-2:-1] not in "aeiou" else f"{word}s"
