@@ -5,8 +5,10 @@ A block is run by its language. Comments above it say more:
     <!-- not run: REASON -->        it cannot be run here
     <!-- needs: FILE ... -->        files that an earlier page made
     <!-- status N -->               the exit status of a shell block
-    <!-- background -->             it runs until the end of the page; `background: TEXT`: and then has said TEXT
-    <!-- output -->                 a text block whose lines the block before printed, but for digits
+    <!-- background -->             it runs until the end of the page
+    <!-- output -->                 a text block: what the block before printed; `...` stands for what is left out
+    <!-- said -->                   a text block: lines that the last background block says, by the end of the page
+    <!-- measured -->               a text block from a benchmark, which is not run here
     <!-- file: NAME -->             a Python block that is saved
     <!-- loads: KIND -->            a YAML or JSON block that the loader of signals, model or parameters takes
     <!-- merges: NAME -->           a YAML block that belongs into the signals file config/signals/NAME
@@ -54,7 +56,9 @@ def blocks(page: Path) -> list[Block]:
     position = 0
     while position < len(lines):
         line = lines[position]
-        if mark := re.fullmatch(r"<!-- (not run|needs|status|background|output|file|loads|merges):? ?(.*?) -->", line):
+        if mark := re.fullmatch(
+            r"<!-- (not run|needs|status|background|output|said|measured|file|loads|merges):? ?(.*?) -->", line
+        ):
             marks[mark[1]] = mark[2]
         elif fence := re.fullmatch(r"( *)```(\S+)(.*)", line):
             end = next(i for i in range(position + 1, len(lines)) if lines[i].strip() == "```")
@@ -93,7 +97,7 @@ class Reader:
         }
         self.said = ""
         self.names: dict[str, object] = {"__name__": "page"}
-        self.background: list[tuple[subprocess.Popen, Path, str]] = []
+        self.background: list[tuple[subprocess.Popen, Path, list[str]]] = []
 
     @staticmethod
     def _script(path: Path, text: str) -> None:
@@ -110,12 +114,13 @@ class Reader:
             self._python(block)
         elif block.language in ("yaml", "json"):
             self._load(block)
-        elif block.language == "text" and "output" in block.marks:
-            said = {plain(line) for line in self.said.splitlines()}
-            missing = [line for line in block.text.splitlines() if plain(line) not in said]
-            assert not missing, f"not said: {missing}; said:\n{self.said}"
+        elif "output" in block.marks:
+            assert shows(block.text, self.said), f"shown:\n{block.text}\nsaid:\n{self.said}"
+        elif "said" in block.marks:
+            self.background[-1][2].extend(block.text.splitlines())
         else:
-            assert block.language in LANGUAGES - {"matlab"}, "say why it is not run"
+            known = LANGUAGES - {"matlab", "text"}
+            assert block.language in known or "measured" in block.marks, "say why it is not run"
 
     def _shell(self, block: Block) -> None:
         command = ["bash", "-euo", "pipefail", "-c", block.text]
@@ -125,12 +130,20 @@ class Reader:
                 process = subprocess.Popen(
                     command, cwd=self.folder, env=self.env, stdout=stream, stderr=stream, start_new_session=True
                 )
-            self.background.append((process, log, block.marks["background"]))
+            self.background.append((process, log, []))
             time.sleep(3.0)  # a reader needs longer to get to the next shell
             assert process.poll() is None, log.read_text()
             return
-        done = subprocess.run(command, cwd=self.folder, env=self.env, capture_output=True, text=True, timeout=300)
-        assert done.returncode == int(block.marks.get("status", 0)), done.stdout + done.stderr
+        done = subprocess.run(
+            command,
+            cwd=self.folder,
+            env=self.env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == int(block.marks.get("status", 0)), done.stdout
         self.said = done.stdout
 
     def _python(self, block: Block) -> None:
@@ -167,11 +180,12 @@ class Reader:
     def close(self) -> None:
         unsaid = []
         for process, log, words in self.background:
+            wanted = "".join(f"...\n{line}\n" for line in words)
             end = time.monotonic() + 10
-            while words not in log.read_text() and time.monotonic() < end:
+            while not (heard := shows(f"{wanted}...", log.read_text())) and time.monotonic() < end:
                 time.sleep(0.1)
-            if words not in log.read_text():
-                unsaid.append((words, log.read_text()))
+            if not heard:
+                unsaid.append(f"shown:\n{words}\nsaid:\n{log.read_text()}")
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGINT)
             try:
@@ -179,12 +193,50 @@ class Reader:
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
-        assert not unsaid
+        assert not unsaid, "\n".join(unsaid)
 
 
-def plain(line: str) -> str:
-    """Without digits, and with single blanks."""
-    return " ".join(re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", line).split())
+FIGURES = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+NUMBER = re.compile(rf"(?<![\w.]){FIGURES}")
+
+
+def shows(shown: str, said: str) -> bool:
+    """Whether a page shows what was said, line by line; `...` alone stands for any lines, within one for any words.
+
+    Blanks do not count. Whole numbers are the same; others differ by one in the last digit at most, where another
+    solver or processor may round otherwise.
+    """
+    return _lines_match(
+        [" ".join(x.split()) for x in shown.splitlines()], [" ".join(x.split()) for x in said.splitlines()]
+    )
+
+
+def _lines_match(shown: list[str], said: list[str]) -> bool:
+    if not shown:
+        return not said
+    if shown[0] == "...":
+        return any(_lines_match(shown[1:], said[start:]) for start in range(len(said) + 1))
+    return bool(said) and _same(shown[0], said[0]) and _lines_match(shown[1:], said[1:])
+
+
+def _same(shown: str, said: str) -> bool:
+    pattern = "(.*)".join(
+        f"({FIGURES})".join(map(re.escape, NUMBER.split(part))) for part in shown.split("...")
+    )  # a number may be said with more or fewer characters, and is compared by its value
+    match = re.fullmatch(pattern, said)
+    if not match:
+        return False
+    tokens = re.findall(rf"\.\.\.|{NUMBER.pattern}", shown)
+    return all(token == "..." or _near(token, found) for token, found in zip(tokens, match.groups(), strict=True))
+
+
+def _near(shown: str, said: str) -> bool:
+    """One number as shown and another as said."""
+    if re.fullmatch(r"-?\d+", shown):
+        return said == shown
+    digits, _, exponent = shown.partition("e")
+    last = 10.0 ** (int(exponent or 0) - len(digits.partition(".")[2]))
+    return abs(float(shown) - float(said)) <= 1.01 * last
 
 
 def flat(tree: dict, before: str = "") -> list[str]:
@@ -193,6 +245,18 @@ def flat(tree: dict, before: str = "") -> list[str]:
         for key, value in tree.items()
         for leaf in (flat(value, f"{before}{key}.") if isinstance(value, dict) else [before + key])
     ]
+
+
+def test_what_is_shown_is_compared_number_by_number():
+    said = "first at 24.0500 s\nraised 9 times, gap 1.1e-09, widths 10.77 0.53%, speed_2 a1b\nbye\n"
+    assert shows(said, said) and shows("...", said) and shows("first at 24.0501 s\n...", said)
+    assert shows("...\nraised 9 times, gap ..., widths 10.76   0.53%, speed_2 ...\n...\nbye", said)
+    for wrong in ("24.0502", "24.2", "24.0500 ms", "24"):
+        assert not shows(said.replace("24.0500", wrong), said)
+    for old, new in (("9 times", "8 times"), ("9 times", "9.5 times"), ("10.77", "10.75"), ("1.1e-09", "1.3e-09")):
+        assert not shows(said.replace(old, new), said)
+    assert not shows(said.replace("speed_2", "speed_3"), said) and not shows("bye", said)
+    assert not shows("first at 24.0500 s", said) and not shows("...\nfirst", said) and not shows("", said)
 
 
 @pytest.fixture(scope="module")
