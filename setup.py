@@ -56,7 +56,7 @@ setup(
     python_requires=">=3.11",
     packages=[*CORE, NAME],
     package_dir=CORE,
-    package_data={"uncertain_lti": ["py.typed"], "uncertain_lti.plants": ["*.json"]},
+    package_data={"uncertain_lti": ["py.typed"], "uncertain_lti.plants": ["*.json"], NAME: ["*.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

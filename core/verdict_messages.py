@@ -77,14 +77,19 @@ class NamedVector:
         self._names = self.template[_ENCAPSULATION + _STAMP.size : self.position]
         self._between = self.template[self.position + width : self.velocity]
         self._end = self.template[self.velocity + width * velocities :]
-        self._t_ns, self._stamp = 0, _STAMP.pack(0, 0)
+        # Several vectors bear the same stamp one after another.
+        self._t_ns, self._head = 0, self._headed(0)
 
     def __call__(self, t_ns: int, position: bytes, velocity: bytes = b"") -> bytes:
         """The message; position, and velocity where there is one, as little-endian doubles, all of them."""
         if t_ns != self._t_ns:
-            seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
-            self._t_ns, self._stamp = t_ns, _STAMP.pack(max(_FIRST_S, min(seconds, _LAST_S)), nanoseconds)
-        return b"".join((self._start, self._stamp, self._names, position, self._between, velocity, self._end))
+            self._t_ns, self._head = t_ns, self._headed(t_ns)
+        return b"".join((self._head, position, self._between, velocity, self._end))
+
+    def _headed(self, t_ns: int) -> bytes:
+        """Everything before the numbers."""
+        seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
+        return self._start + _STAMP.pack(max(_FIRST_S, min(seconds, _LAST_S)), nanoseconds) + self._names
 
 
 class VerdictRecords:

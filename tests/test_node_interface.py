@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -28,6 +29,7 @@ from test_live import ERROR, STATE, STEP_NS, Outputs, Plant, by_hand, header_bag
 from test_monitor_faults import ever
 
 from uncertain_lti_ros.parameters import PARAMETERS
+from uncertain_lti_ros.process import spare_the_middleware
 
 NODE = "/envelope_monitor"
 
@@ -36,6 +38,35 @@ NODE = "/envelope_monitor"
 def world(tmp_path: Path) -> Iterator[World]:
     with open_world(tmp_path) as world:
         yield world
+
+
+# --- middleware ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("own", ["", "FASTRTPS_DEFAULT_PROFILES_FILE", "DEFAULT_FASTRTPS_PROFILES.xml"])
+def test_writers_wake_the_middleware_seldom_unless_the_user_says_otherwise(
+    own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "")
+    monkeypatch.delenv("FASTDDS_DEFAULT_PROFILES_FILE", raising=False)
+    if own.endswith(".xml"):
+        (tmp_path / own).write_text("<profiles/>")
+    elif own:
+        monkeypatch.setenv(own, "mine.xml")
+    spare_the_middleware()
+    chosen = os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"]
+    assert chosen == ("mine.xml" if own.startswith("FAST") else "") if own else Path(chosen).is_file()
+
+
+def test_the_middleware_reads_the_profile(world: World, tmp_path: Path) -> None:
+    """It complains of a profile that it cannot read, on the standard error, and goes on without."""
+    good = world.monitor(saved(by_hand(), tmp_path))
+    broken = tmp_path / "broken.xml"
+    broken.write_text((ROOT / "uncertain_lti_ros" / "fastdds_writers.xml").read_text().replace("Supression", "Other"))
+    world.env["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(broken)
+    bad = world.monitor(saved(by_hand(), tmp_path), "-r", "__node:=other", name="/other")
+    assert "XMLPARSER" not in good.output and "XMLPARSER" in bad.output
 
 
 # --- parameters ---------------------------------------------------------------------------------------------

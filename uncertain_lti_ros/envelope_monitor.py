@@ -37,7 +37,7 @@ from uncertain_lti_ros.layout import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
-from uncertain_lti_ros.process import living
+from uncertain_lti_ros.process import living, spare_the_middleware
 from uncertain_lti_ros.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, MatchedSubscription, Wish
 from uncertain_lti_ros.watch import ERROR, STALE, Report, Rule, Watch, topic_types
@@ -610,6 +610,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until a signal ends it."""
+    spare_the_middleware()
     with living(EnvelopeMonitorNode, args) as life:
         node = life.node
         assert isinstance(node, EnvelopeMonitorNode)
