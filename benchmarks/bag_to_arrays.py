@@ -24,7 +24,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +32,7 @@ from recorded import CAMERA, COMPRESSIONS, FRAMES, JAZZY, ROBOT, Topic, imu, pay
 from uncertain_lti import mcap_batches
 from uncertain_lti.bag import Bag
 from uncertain_lti.bag_arrays import read_columns
+from uncertain_lti.mcap_records import crc32
 from uncertain_lti.reading import read_stream, read_transients, sample, sample_by_message
 from uncertain_lti.signals import FieldPath, Signal, SignalMap
 
@@ -231,9 +231,6 @@ def clocked():
 
         return run
 
-    class Sums:
-        crc32 = staticmethod(timed("sum", zlib.crc32))
-
     class Stream:
         def __init__(self, stream):
             self.seek, self.readinto = stream.seek, timed("read", stream.readinto)
@@ -244,12 +241,12 @@ def clocked():
     def make(self, contents, stream):
         made(self, contents, Stream(stream))
 
-    loader.__init__, loader._inflate, mcap_batches.zlib = make, timed("inflate", inflate), Sums
+    loader.__init__, loader._inflate, mcap_batches.crc32 = make, timed("inflate", inflate), timed("sum", crc32)
     loader._inflate_together, mcap_batches._AHEAD = timed("inflate", together), 0
     try:
         yield parts
     finally:
-        loader.__init__, loader._inflate, mcap_batches.zlib = made, inflate, zlib
+        loader.__init__, loader._inflate, mcap_batches.crc32 = made, inflate, crc32
         loader._inflate_together, mcap_batches._AHEAD = together, ahead
 
 
@@ -364,6 +361,7 @@ def main():
     KEEP = options.folder is not None
     machine = platform.processor() or platform.machine()
     print(f"{machine}, {os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}")
+    print(f"checksums by {crc32.__module__}; load {os.getloadavg()[0]:.1f}")
     with contextlib.ExitStack() as stack:
         folder = options.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         folder.mkdir(parents=True, exist_ok=True)

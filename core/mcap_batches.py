@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from numpy.typing import NDArray
 from uncertain_lti.bag_files import os_error
 from uncertain_lti.cdr_arrays import SLACK, numbers_at
 from uncertain_lti.errors import BagError
-from uncertain_lti.mcap_records import MESSAGE, RECORD, Block, Contents, parse, walk
+from uncertain_lti.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, parse, walk
 
 Integers = NDArray[np.int64]
 
@@ -306,7 +305,7 @@ class _Loader:
             name,
             block.size,
         )
-        return head == stated and (zlib.crc32(records) == checksum if checksum else not self.contents.summed)
+        return head == stated and (crc32(records) == checksum if checksum else not self.contents.summed)
 
 
 # --- records in the buffer ----------------------------------------------------------------------------------

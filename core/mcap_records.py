@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import bisect
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -36,6 +35,11 @@ from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistic
 
 from uncertain_lti.bag_files import MAGIC, not_mcap, os_error
 from uncertain_lti.errors import BagError
+
+try:
+    from isal.isal_zlib import crc32 as crc32
+except ImportError:
+    from zlib import crc32 as crc32
 
 LARGEST_CHUNK = 1 << 28  # bytes, decompressed; recorders write chunks of 1 to 10 MB
 _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
@@ -257,7 +261,7 @@ class _Scanner:
         """Walk all records up to the end of the data section; False where the file ends before."""
         size, offsets = self.found.size, [index.chunk_start_offset for index in self.known]
         position = len(MAGIC)
-        self.sums = zlib.crc32(MAGIC)
+        self.sums = crc32(MAGIC)
         self.stream.seek(position)
         while True:
             header = self.stream.read(RECORD.size)
@@ -280,19 +284,19 @@ class _Scanner:
             if opcode == Opcode.DATA_END or opcode == Opcode.FOOTER:
                 self._data_end(parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None)
                 return True
-            self.sums = zlib.crc32(header, self.sums)
+            self.sums = crc32(header, self.sums)
             if opcode == Opcode.MESSAGE or opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
                 content = self.stream.read(length)
-                self.sums = zlib.crc32(content, self.sums)
+                self.sums = crc32(content, self.sums)
                 self._bare(position, opcode, content)
             elif opcode == Opcode.CHUNK:
                 content = self.stream.read(length)
-                self.sums = zlib.crc32(content, self.sums)
+                self.sums = crc32(content, self.sums)
                 self._chunk(position, begin, content)
             else:  # attachments, metadata, indexes, private records: only their bytes count
                 left = length
                 while left and (piece := self.stream.read(min(left, _PIECE))):
-                    self.sums = zlib.crc32(piece, self.sums)
+                    self.sums = crc32(piece, self.sums)
                     left -= len(piece)
             position = end
 
@@ -359,7 +363,7 @@ class _Scanner:
         else:
             if not trouble and len(records) != stated:
                 trouble = f"it holds {'more' if len(records) > stated else 'less'} than it states"
-            if not trouble and checksum not in (0, zlib.crc32(records)):
+            if not trouble and checksum not in (0, crc32(records)):
                 trouble = "its checksum is wrong"
             if trouble:
                 self._leave_out(where, trouble)
@@ -443,7 +447,7 @@ class _Scanner:
         if not footer or not len(MAGIC) <= footer.summary_start < footer_at:
             return
         records = self._at(footer.summary_start, footer_at - footer.summary_start)
-        if footer.summary_crc not in (0, zlib.crc32(tail[:-4], zlib.crc32(records))):
+        if footer.summary_crc not in (0, crc32(tail[:-4], crc32(records))):
             self.found.warnings.append(f"{self.found.path}: the checksum of its summary is wrong; read without it")
             return
         for opcode, begin, end in walk(records):
