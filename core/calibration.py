@@ -134,7 +134,7 @@ def calibrate(
     best = max(found, key=lambda c: (float(c.detected.min()), -float(c.delay.max()), -(c.margin or 0.0)))
     assert best.margin is not None
     names = validation.model.state_names
-    slow = int(np.argmax(best.delay))
+    slow = int(np.lexsort((-best.detected, best.delay))[-1])  # of those never seen by half, the least seen
     missed = 1.0 - float(best.detected[slow])
     words = (
         f"alarm at {best.violations} of {best.window} verdicts outside {best.margin:.3g} times the half-widths: at "

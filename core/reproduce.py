@@ -328,15 +328,16 @@ def check_figure(case: Case, path: str | os.PathLike[str]) -> None:
         low, high = (lower - centre) * scale, (upper - centre) * scale
         right.fill_between(t, low, high, color=ENVELOPE, alpha=0.6, linewidth=0)
         right.plot(t, (x[:, i] - centre) * scale, color=RECORDED, linewidth=1.0)
-        right.plot(t[bad], (x[bad, i] - centre[bad]) * scale, ".", color=VIOLATED, label=f"outside ({int(bad.sum())})")
+        right.plot(t[bad], (x[bad, i] - centre[bad]) * scale, ".", color=VIOLATED)
         right.set_ylabel("from the centre\n[1e-3 of the scale]")
         right.set_title(f"{case.inside[i]:.0%} inside", loc="right", fontsize="small")
         for axis in (left, right):
             axis.grid(alpha=0.25)
             axis.margins(x=0.01)
         if bad.any():
-            left.plot(t[bad], x[bad, i], ".", color=VIOLATED)
-    axes[0][0].legend(loc="upper right", fontsize="small")
+            left.plot(t[bad], x[bad, i], ".", color=VIOLATED, label="violated")
+    shown = {label: handle for row in axes for handle, label in zip(*row[0].get_legend_handles_labels(), strict=True)}
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), frameon=False)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
     figure.suptitle(
