@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from typing import BinaryIO, NamedTuple, NoReturn
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -293,8 +294,7 @@ class _Loader:
         head = packed[offset - block.unchecked : offset]
         checksum = int.from_bytes(head[_CHECKSUM_AT : _CHECKSUM_AT + 4], "little")
         name = block.compression.encode()
-        stated = struct.pack(
-            f"<BQQQQII{len(name)}sQ",
+        stated = _chunk_head(len(name))(
             Opcode.CHUNK,
             block.unchecked - RECORD.size + block.size,
             block.start,
@@ -306,6 +306,11 @@ class _Loader:
             block.size,
         )
         return head == stated and (crc32(records) == checksum if checksum else not self.contents.summed)
+
+
+@cache
+def _chunk_head(name_length: int) -> Callable[..., bytes]:
+    return struct.Struct(f"<BQQQQII{name_length}sQ").pack
 
 
 # --- records in the buffer ----------------------------------------------------------------------------------

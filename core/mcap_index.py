@@ -8,7 +8,7 @@ number of messages of every channel. Where anything is not as stated, the file i
 from __future__ import annotations
 
 import struct
-import zlib
+from functools import lru_cache
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -24,6 +24,7 @@ from uncertain_lti.mcap_records import (
     Block,
     Contents,
     Tally,
+    crc32,
     parse,
     walk,
 )
@@ -71,7 +72,7 @@ def outline(path: Path) -> Contents | None:
         return None
     data_crc = records[9:_DATA_END_SIZE] != bytes(4)
     summary = records[_DATA_END_SIZE:]
-    if checksum not in (0, zlib.crc32(tail[: FOOTER_SIZE - 4], zlib.crc32(summary))):
+    if checksum not in (0, crc32(tail[: FOOTER_SIZE - 4], crc32(summary))):
         return None
     try:
         return _contents(path, size, summary, begin - _DATA_END_SIZE, data_crc)
@@ -112,10 +113,19 @@ def _contents(path: Path, size: int, summary: bytes, data_end: int, data_crc: bo
     return found
 
 
+@lru_cache(maxsize=256)
+def _channels(low: bytes, high: bytes) -> frozenset[int]:
+    """Numbers from their low and high bytes; most chunks hold the same channels."""
+    return frozenset(a + 256 * b for a, b in zip(low, high, strict=True))
+
+
 def _block(index: bytes, data_end: int) -> Block:
     start, end, place, chunk_length, size_of_offsets = _CHUNK_INDEX.unpack_from(index)
     rest = _CHUNK_INDEX.size + size_of_offsets
-    channels = frozenset([channel for channel, _ in _INDEX_OFFSET.iter_unpack(index[_CHUNK_INDEX.size : rest])])
+    listed, pair = index[_CHUNK_INDEX.size : rest], _INDEX_OFFSET.size
+    if len(listed) % pair:
+        raise _NoIndexError
+    channels = _channels(listed[::pair], listed[1::pair])
     index_length, name_length = _INDEX_REST.unpack_from(index, rest)
     name_at = rest + _INDEX_REST.size
     compression = index[name_at : name_at + name_length].decode()
