@@ -273,7 +273,9 @@ def _reason(weight: str, about: str, text: str) -> dict[str, str]:
 
 
 def _fit_reasons(model: UncertainLTI) -> list[dict[str, str]]:
-    found = [_reason(CARE, "fit", str(message)) for message in _list(model.fit.get("messages"))]
+    messages = [str(message) for message in _list(model.fit.get("messages"))]
+    # of widths it is said below, from the recordings at hand too
+    found = [_reason(CARE, "fit", message) for message in messages if not message.startswith("the bounds are over")]
     if not model.fit:
         found.append(_reason(CARE, "fit", "the model file does not say how it was fitted"))
     return found

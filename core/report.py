@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.reading import unused
@@ -141,7 +142,11 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
     if share[widest] > WIDE:
         worry = (
             f"the bounds of '{model.state_names[widest]}' are {share[widest]:.0%} as wide as its range, so only gross "
-            f"faults would be seen: more excitation, another additive term, a delay, or faster samples"
+            f"faults would be seen: "
+        )
+        worry += (
+            remedies(facts.get("messages", []), facts["additive"], model.state_names[widest])
+            or "what moves it may be missing among the controls"
         )
     elif inside is not None and inside < 0.99:
         worry = (

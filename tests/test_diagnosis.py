@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from uncertain_lti import OperatingPoint, SignalMap, Transient, fit
+from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.signals import Signal
 
 A = np.array([[-1.0, 0.4], [0.3, -2.5]])
@@ -56,6 +57,9 @@ WORDS = {
     "ended": "commands that have ended",
     "delay": "better when it is taken",
     "gain": "--additive noise",
+    "few": "as wide as the rest needs",
+    "noise": "like noise from sample to sample",
+    "no machine": "read no time constants",
 }
 
 
@@ -284,3 +288,112 @@ def test_hunter_steering_is_named_as_not_identifiable(recordings, signals_folder
     bag = recordings / "hunter_se/straight_odd_t_0_5_run_01.mcap"
     found = fit(read_transients(bag, tmp_path / "s.yaml")).fit["messages"]
     assert any("'steering' leaves its usual value in 1 of 2512 transitions only" in m for m in found)
+
+
+# --- few samples, and noise ---
+
+
+def spiked(at, size=0.5):
+    def change(x, u):
+        x = x.copy()
+        x[list(at), 0] += size
+        return x, u
+
+    return change
+
+
+@pytest.mark.parametrize("at", [(400,), (400, 900), (400, 700, 701, 1100)])
+def test_few_samples_that_carry_a_width_are_named_and_discarding_them_does_what_is_said(at):
+    spoiled = run(change=spiked(at))
+    (message,) = [m for m in messages(spoiled) if WORDS["few"] in m]
+    assert "'speed'" in message and "run at 19.95 s, 20 s" in message  # into the first spike, and out of it
+    count = int(message.split("--discard ")[1].split()[0])
+    assert count == 2 * len(at) - (701 in at)
+    wide, narrow = fit([spoiled], additive="noise"), fit([spoiled], additive="noise", discard=count)
+    said_factor = float(message.split("'speed' ")[1].split(" times")[0])
+    assert wide.fit["mean_width"][0] / narrow.fit["mean_width"][0] == pytest.approx(said_factor, rel=0.01)
+    assert not any(WORDS["few"] in m for m in narrow.fit["messages"])
+
+
+def test_discards_that_are_too_few_are_added_to():
+    (message,) = [m for m in messages(run(change=spiked((400, 900))), discard=2) if WORDS["few"] in m]
+    assert "--discard 4 " in message
+
+
+def test_rare_steps_of_a_control_are_to_be_recorded_more_often_and_not_left_out():
+    u = np.zeros((1501, 2))
+    u[:, 0] = steps(np.random.default_rng(7), 1501)[:, 0]
+    u[700:, 1] = 1.0
+
+    def kick(x, u):  # what the linear plant does not know of: a kick as the pump starts
+        x = x.copy()
+        x[701:704, 1] += 0.4
+        return x, u
+
+    (message,) = [m for m in messages(run(u=u, change=kick)) if WORDS["few"] in m]
+    assert "where 'pump' steps: record more such steps" in message and "--discard" not in message
+
+
+def test_criterion_whose_discards_take_long_names_the_stretch():
+    (message,) = [m for m in messages(run(change=spiked((400,))), criterion="lp") if WORDS["few"] in m]
+    assert "leave that stretch out" in message and "--discard" not in message
+
+
+def white(x, u):
+    x = x.copy()
+    x[:, 1] = 2.0 + 0.05 * np.random.default_rng(9).standard_normal(len(x))
+    return x, u
+
+
+def test_a_state_that_is_noise_is_named():
+    found = messages(run(change=white))
+    assert "slow" not in said(found)
+    (message,) = [m for m in found if WORDS["noise"] in m]
+    assert message.startswith("'flow' moves like noise")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_is_no_fast_machine(seed):
+    """No advice on the rate of sampling where there is no memory that a faster rate would show."""
+
+    def still(x, u):
+        return 1.0 + 0.05 * np.random.default_rng(seed).standard_normal(x.shape), u
+
+    found = messages(run(seed, count=400, change=still))
+    assert {"noise", "no machine"} <= said(found) and "slow" not in said(found)
+
+
+def test_noise_on_a_slow_state_is_no_fast_machine():
+    rng = np.random.default_rng(11)
+    slow = (np.diag([-0.05, -0.1]), np.diag([0.05, 0.1]))
+    u = np.repeat(rng.uniform(-1, 1, (60, 2)), 100, axis=0)[:4001]
+    found = messages(run(count=4000, u=u, plant=slow, noise=0.2))
+    assert "slow" not in said(found), found
+
+
+def test_columns_that_are_not_told_apart_are_no_fast_machine():
+    def copied(x, u):
+        x = x.copy()
+        x[:, 1] = 3.0 * x[:, 0] + 1e-3 * np.random.default_rng(3).standard_normal(len(x))
+        return x, u
+
+    found = messages(run(change=copied, noise=1e-3))
+    assert "collinear" in said(found) and "slow" not in said(found)
+
+
+def test_what_is_set_is_not_recommended():
+    coarse = run(noise=0.0, change=lambda x, u: (np.round(x / 0.05) * 0.05, u))
+    for additive in ("noise", "both"):
+        found = messages(coarse, additive=additive)
+        assert "quantised" in said(found) and not any("noise term" in m or "--additive" in m for m in found)
+        assert "--additive" not in remedies(found, additive, "speed")
+    assert any("use the noise term" in m for m in messages(coarse, additive="disturbance"))
+
+
+def test_remedies_go_by_what_was_found():
+    assert "missing" not in remedies([], "noise", "flow")
+    assert remedies([], "none", "flow") == "try --additive noise"
+    assert "leave it out" in remedies(messages(run(change=white)), "noise", "flow")
+    assert "sample faster" in remedies(messages(run(dt=0.5, noise=1e-5)), "noise", "flow")
+    few = remedies(messages(run(change=spiked((400,)))), "noise", "speed")
+    assert "few samples" in few and "faster" not in few

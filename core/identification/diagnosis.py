@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from uncertain_lti.errors import FitError
 from uncertain_lti.identification import excitation, sensors
+from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.excitation import quoted as _list
+from uncertain_lti.identification.noise import Memory, memory
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem
 from uncertain_lti.model import UncertainLTI
@@ -25,6 +27,12 @@ FAST = 0.7
 """|eigenvalue| x dt above which a step of forward Euler is long for the mode."""
 TRIED = 4000
 """Samples on which the gain of an additive term is tried."""
+WIDE = 0.5
+"""Mean width, as a share of the state's own range, above which few faults can show."""
+SLOW, DISCARD = "sampling is slow", "--discard"
+"""Words by which a message is known again."""
+AFTER_STEP = 5
+"""Samples after a step of a control that still belong to it."""
 WORTH = 1.3
 """Gain in mean width from which on the additive term is suggested."""
 
@@ -108,16 +116,26 @@ def describe(
     mean_width: Array,
     max_width: Array,
     transients: Sequence[Transient] = (),
+    few: Carriers | None = None,
+    discarded: int | None = None,
 ) -> tuple[int, list[str]]:
     """Rank, and what the user must be told of a fitted model and of the recordings it was fitted to.
 
-    transients name the recordings, and say how many controls were stale.
+    transients name the recordings, and say how many controls were stale; few: transitions that carry the width
+    of a state; discarded: transitions that were left out already, None where leaving out more takes long.
     """
     states = model.state_names
     names = [*states, *model.control_names]
     found, messages = _rank(problem, sums, names)
-    messages += _recordings(model, problem, sums, names, transients)
-    messages += _slow(model)
+    apart = not messages
+    part = _stretches(problem)
+    alike = excitation.collinear(problem, sums, names, 1e-12 * problem.p)
+    messages += [*_carried(few, discarded, problem, names, transients), *alike]
+    messages += _recordings(model, problem, part, sums, names, transients)
+    known = memory(part)
+    messages += _noise_like(known, part, states)
+    slow = _slow(model, known, apart and not alike)
+    messages += slow
     unstable = [v for v in model.eigenvalues() if v.real > 0]
     if unstable:
         values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
@@ -128,7 +146,7 @@ def describe(
     elif model.spectral_radius() > 1.0 + 1e-9:
         messages.append(
             f"the nominal recursion runs away at the recorded step (spectral radius {model.spectral_radius():.4g}): "
-            f"the sampling is slow for the fastest mode"
+            f"one-step bounds restart from the measured state and stay valid, a free run does not"
         )
     nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
     wide = np.argwhere(half > np.abs(nominal))
@@ -141,27 +159,24 @@ def describe(
     columns = problem.columns
     if not columns.noise and not columns.disturbance:
         messages += _near_rest(problem, sums, mean_width, states)
-    span = np.ptp(problem.z[:, : problem.n], axis=0)
-    for i in np.flatnonzero((span > 0) & (mean_width > 0.5 * span)).tolist():
-        messages.append(
-            f"the envelope of '{states[i]}' is {mean_width[i] / span[i]:.0%} as wide as the state's own range, so few "
-            f"faults can show in it: one step is long for this state, or what moves it is not among the controls"
-        )
+    messages += _wide(problem, mean_width, states, known, few, bool(slow) and SLOW in slow[0])
     if columns.drift and columns.noise and not columns.disturbance:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return found, messages
 
 
 def _recordings(
-    model: UncertainLTI, problem: Problem, sums: Moments, names: Sequence[str], transients: Sequence[Transient]
+    model: UncertainLTI,
+    problem: Problem,
+    part: Problem,
+    sums: Moments,
+    names: Sequence[str],
+    transients: Sequence[Transient],
 ) -> list[str]:
     """What the recordings themselves say: excitation, sensors, topics."""
     signals = model.signals.signals
-    limit = 1e-12 * problem.p
-    messages = excitation.collinear(problem, sums, names, limit)
-    part = _stretches(problem)
     rare = excitation.rare(part, names)
-    messages += rare.values()
+    messages = [*rare.values()]
     messages += excitation.weak(problem, sums, names, rare)
     messages += excitation.one_sided(part, names, rare)
     messages += excitation.fed_back(part, names)
@@ -183,8 +198,82 @@ def _stretches(problem: Problem) -> Problem:
     )
 
 
-def _slow(model: UncertainLTI) -> list[str]:
-    """Modes that a step of forward Euler is too long for."""
+def _carried(
+    few: Carriers | None,
+    discarded: int | None,
+    problem: Problem,
+    names: Sequence[str],
+    transients: Sequence[Transient],
+) -> list[str]:
+    """States whose width a few samples carry."""
+    if few is None:
+        return []
+    indices = sorted(few.transitions)
+    places: dict[str, list[str]] = {}
+    for index in indices[:4]:
+        source, k = int(problem.source[index]), int(problem.k[index])
+        if source < len(transients):
+            places.setdefault(transients[source].name, []).append(f"{transients[source].t[k]:.6g} s")
+        else:
+            places.setdefault(f"recording {source + 1}", []).append(f"sample {k}")
+    where = "; ".join(f"{name} at {', '.join(at)}" for name, at in places.items())
+    where += f"; and {len(indices) - 4} more" if len(indices) > 4 else ""
+    wide = sorted((i for i in range(problem.n) if few.carry(i)), key=lambda i: -few.factor[i])
+    widths = [f"'{names[i]}' {few.factor[i]:.3g} times" for i in wide[:4]]
+    widths += [f"{len(wide) - 4} other states"] if len(wide) > 4 else []
+    listed = widths[0] if len(widths) == 1 else ", ".join(widths[:-1]) + " and of " + widths[-1]
+    if steps := _at_steps(problem, indices):
+        cure = (
+            f"they are the few where {_list([names[j] for j in steps])} {'steps' if len(steps) == 1 else 'step'}: "
+            f"record more such steps, or find the delay between them and the answer"
+        )
+    else:
+        cure = "look at what happened there; if it is no part of healthy use, "
+        cure += (
+            "leave that stretch out of the recording"
+            if discarded is None
+            else f"{DISCARD} {discarded + len(indices)} leaves them out and lists them"
+        )
+    one = len(indices) == 1
+    return [
+        f"{plural(len(indices), 'transition')} of {problem.N} ({where}) {'makes' if one else 'make'} the envelope of "
+        f"{listed} as wide as the rest needs: {cure}"
+    ]
+
+
+def _at_steps(problem: Problem, indices: Sequence[int]) -> list[int]:
+    """Columns of controls that seldom change, and do so at most of these transitions."""
+    found = []
+    for j in range(problem.n, problem.p):
+        changes = np.flatnonzero(np.diff(problem.z[:, j]) != 0) + 1
+        near = np.zeros(problem.N, dtype=bool)
+        for shift in range(-2, AFTER_STEP + 1):
+            near[np.clip(changes + shift, 0, problem.N - 1)] = True
+        if len(changes) and near.mean() < 0.1 and near[list(indices)].mean() >= 0.5:
+            found.append(j)
+    return found
+
+
+def _noise_like(known: Memory, problem: Problem, states: Sequence[str]) -> list[str]:
+    """States whose next sample cannot be told from the one before."""
+    moving = np.ptp(problem.z[:, : problem.n], axis=0) > 0
+    like = [i for i in range(problem.n) if moving[i] and known.like_noise(i)]
+    if not like:
+        return []
+    worst = min(like, key=lambda i: float(known.predicted[i]))
+    one = len(like) == 1
+    return [
+        f"{_list([states[i] for i in like])} {'moves' if one else 'move'} like noise from sample to sample: signals "
+        f"and controls at one instant predict {max(0.0, known.predicted[worst]):.0%} of the variance of "
+        f"'{states[worst]}' at the next; leave {'it' if one else 'them'} out, or record the machine at work"
+    ]
+
+
+def _slow(model: UncertainLTI, known: Memory, apart: bool) -> list[str]:
+    """Modes that a step of forward Euler is too long for, where the recordings bear them out.
+
+    apart: the columns can be told apart, so that the eigenvalues mean something.
+    """
     dt = model.sampling.dt_median
     if dt is None:
         return []
@@ -192,11 +281,64 @@ def _slow(model: UncertainLTI) -> list[str]:
     turn = abs(fastest) * dt
     if turn <= FAST:
         return []
+    mode = f"{fastest.real:.3g}{fastest.imag:+.3g}j" if fastest.imag else f"{fastest.real:.3g}"
+    if not apart or known.fastest <= FAST:
+        cause = "noise" if apart else "columns that the recordings do not tell apart"
+        return [
+            f"the fastest mode of the nominal model ({mode} 1/s) comes from {cause}, not from the machine: the bounds "
+            f"hold, but read no time constants from A"
+        ]
     return [
-        f"sampling is slow for the fastest mode ({fastest.real:.3g}{fastest.imag:+.3g}j 1/s, {turn:.2g} in a step of "
+        f"{SLOW} for the fastest mode ({mode} 1/s, {turn:.2g} in a step of "
         f"{dt:.3g} s): A is then the matrix of this step length rather than of the machine, and holds for no other; "
         f"sample {np.ceil(turn / 0.2):.0f} times as fast, or leave the fast state out"
     ]
+
+
+def _wide(
+    problem: Problem, mean_width: Array, states: Sequence[str], known: Memory, few: Carriers | None, slow: bool
+) -> list[str]:
+    """States whose envelope is as wide as what they do, and why where something is known."""
+    span = np.ptp(problem.z[:, : problem.n], axis=0)
+    wide = np.flatnonzero((span > 0) & (mean_width > WIDE * span)).tolist()
+    groups: dict[str, list[int]] = {}
+    for i in wide:
+        if few is not None and few.carry(i):
+            cause = "a few samples carry the width (see above)"
+        elif known.like_noise(i):
+            cause = "noise is most of what the recordings show of it"
+        elif slow:
+            cause = "one step is long for it, or what moves it is not among the controls"
+        else:
+            cause = "what moves it is not among the controls, or the noise is as large"
+        groups.setdefault(cause, []).append(i)
+    messages = []
+    for cause, those in groups.items():
+        listed = ", ".join(f"'{states[i]}' ({mean_width[i] / span[i]:.0%})" for i in those)
+        messages.append(
+            f"the bounds are over {WIDE:.0%} as wide as the state's own range for {listed}, so few faults can show "
+            f"there: {cause}"
+        )
+    return messages
+
+
+def remedies(messages: Sequence[str], additive: str, state: str) -> str:
+    """What of a fit's messages would narrow the bounds of a state; "" where they name nothing."""
+    named = [m for m in messages if f"'{state}'" in m]
+    found = []
+    if any("as wide as the rest needs" in m for m in named):
+        found.append("look at the few samples that carry the width, named above")
+    if any("like noise from sample to sample" in m for m in named):
+        return "it moves like noise: leave it out, or record the machine at work"
+    if additive == "none":
+        found.append("try --additive noise")
+    if any("`delay:" in m for m in messages):
+        found.append("set the delay that the notes propose")
+    if any(m.startswith(SLOW) for m in messages):
+        found.append("sample faster")
+    if any("moves too little" in m or "is not identifiable" in m for m in messages):
+        found.append("record the controls moving more")
+    return ", or ".join(found)
 
 
 def _near_rest(problem: Problem, sums: Moments, mean_width: Array, states: Sequence[str]) -> list[str]:

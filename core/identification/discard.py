@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,24 @@ Array = NDArray[np.float64]
 
 _ACTIVE = 1e-7
 """Slack, in scaled units, below which a sample carries the envelope."""
+FEW, FEW_SHARE = 12, 0.005
+"""At most so many transitions, and such a share of all, are few."""
+MUCH, ENOUGH = 2.0, 1.2
+"""Mean width with the few over that without them, from which on they are worth a word; what is left of the latter."""
+LARGEST = 200_000
+"""Transitions up to which the few are sought."""
+
+
+@dataclass(frozen=True)
+class Carriers:
+    """Transitions, and for each state (n,) its mean width with them over its mean width without."""
+
+    transitions: tuple[int, ...]
+    factor: Array
+
+    def carry(self, state: int) -> bool:
+        """Whether they make the envelope of this state much wider."""
+        return bool(self.factor[state] >= MUCH)
 
 
 def choose_discards(
@@ -47,16 +66,64 @@ def choose_discards(
     list of (int, float)
         Transition, and the share of the objective that it cost, in order of choice.
     """
+    chosen: list[tuple[int, float]] = []
+    if progress is not None:
+        progress(f"discard 1 of {budget}")
+    for index, effect in _greedy(WorkingSet(Fleet([problem]), structure), criterion):
+        chosen.append((index, effect))
+        if len(chosen) == budget:
+            break
+        if progress is not None:
+            progress(f"discard {len(chosen) + 1} of {budget}")
+    return chosen
+
+
+def carriers(problem: Problem, structure: Structure | None) -> Carriers | None:
+    """The few transitions that make the envelope of some state much wider than the others need: what discards choose.
+
+    By criterion (10), which tells it in a moment. None where there are none such, where the problem is large, or where
+    its weights couple the rows.
+    """
+    budget = min(FEW, int(FEW_SHARE * problem.N))
+    if not budget or problem.N > LARGEST or problem.weights.ndim == 3:
+        return None
     engine = WorkingSet(Fleet([problem]), structure)
+    chosen: list[int] = []
+    widths = []
+    for index, _ in _greedy(engine, "qp"):
+        widths.append(_mean_widths(engine))
+        if len(chosen) == budget:
+            break
+        chosen.append(index)
+    else:
+        widths.append(_mean_widths(engine))
+    width = np.array(widths)
+    much = (width[0] > 0) & (width[0] >= MUCH * width[-1])
+    enough = [int(np.argmax(width[:, i] <= ENOUGH * width[-1, i])) for i in np.flatnonzero(much)]
+    if not enough:
+        return None
+    few = np.array(chosen[: max(enough)])
+    rest = WorkingSet(Fleet([problem.without(few)]), structure)  # the rows above held some transitions only
+    rest.quadratic()
+    factor = width[0] / np.maximum(_mean_widths(rest), 1e-6 * width[0])
+    return Carriers(tuple(few.tolist()), factor) if (factor >= MUCH).any() else None
+
+
+def _mean_widths(engine: WorkingSet) -> Array:
+    return np.array([float(engine.sums.width_sum @ row.d) for row in engine.rows]) / engine.sums.count
+
+
+def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
+    """Again and again the transition whose absence lowers the objective most: its number, its share of the objective.
+
+    It is taken out once the next is asked for. It ends when none has an effect.
+    """
     engine.quadratic() if criterion == "qp" else engine.linear()
     first = np.array([_value(row, criterion, engine.weights) for row in engine.rows])
     unit = np.full(len(first), max(float(first.sum()), 1e-300)) if criterion == "qp" else np.maximum(first, 1e-300)
-    chosen: list[tuple[int, float]] = []
     gains: list[dict[int, float]] = [{} for _ in engine.rows]
     stale = set(range(len(engine.rows)))
-    while len(chosen) < budget:
-        if progress is not None:
-            progress(f"discard {len(chosen) + 1} of {budget}")
+    while True:
         for i in stale:
             gains[i] = _gains(engine, engine.rows[i], criterion)
         total: dict[int, float] = {}
@@ -64,16 +131,15 @@ def choose_discards(
             for index, gain in row_gains.items():
                 total[index] = total.get(index, 0.0) + gain / unit[i]
         if not total or max(total.values()) <= 1e-12:
-            break
+            return
         index = max(total, key=lambda k: (total[k], -k))
-        chosen.append((index, total[index]))
+        yield index, total[index]
         stale = set()
         for row, row_gains in zip(engine.rows, gains, strict=True):
             _drop(row, index)
             if index in row_gains:
                 _solve(engine, row, criterion)
                 stale.add(row.i)
-    return chosen
 
 
 def _value(row: Row, criterion: str, weights: Array | None) -> float:

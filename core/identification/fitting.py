@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.errors import FitError, SignalError
 from uncertain_lti.identification import formulation
 from uncertain_lti.identification.diagnosis import check_solvable, describe
-from uncertain_lti.identification.discard import choose_discards
+from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble
@@ -163,6 +163,7 @@ def fit(
             dt_median=float(np.median(problem.dt)),
             describe_on=problem if describe_data else None,
             transients=transients,
+            discarded=len(discarded),
         )
     except InfeasibleError as error:
         raise name(error) from None
@@ -200,6 +201,7 @@ def fit_fleet(
     dt_median: float | None = None,
     describe_on: Problem | None = None,
     transients: Sequence[Transient] = (),
+    discarded: int = 0,
 ) -> UncertainLTI:
     """`fit` on transitions that are already normalised, wherever they lie.
 
@@ -216,6 +218,8 @@ def fit_fleet(
         What the messages in words are made from: the data, or a part of it.
     transients : sequence of Transient
         The recordings, for the same messages.
+    discarded : int
+        Transitions of them that were left out already, for the same messages.
 
     Raises
     ------
@@ -267,7 +271,11 @@ def fit_fleet(
         "versions": dict(_versions()),
     }
     if describe_on is not None:
-        facts["rank"], facts["messages"] = describe(model, describe_on, sums, mean_width, max_width, transients)
+        whole = describe_on.N == sums.count and method == "working-set"
+        few = carriers(describe_on, structure) if whole else None
+        facts["rank"], facts["messages"] = describe(
+            model, describe_on, sums, mean_width, max_width, transients, few, discarded if criterion == "qp" else None
+        )
     return model.with_(fit=facts)
 
 

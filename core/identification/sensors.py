@@ -45,7 +45,8 @@ def quantised(problem: Problem, signals: Sequence[Signal]) -> list[str]:
             messages.append(
                 f"'{signal.name}' is recorded in steps of {size:.3g}{' ' + signal.unit if signal.unit else ''}, "
                 f"{step / move:.2g} times what it moves by from sample to sample (root mean square): no envelope is "
-                f"narrower than such a step; use the noise term, a finer field, or fewer samples per second"
+                f"narrower than such a step; use {'' if problem.columns.noise else 'the noise term, '}a finer field, "
+                f"or fewer samples per second"
             )
     return messages
 
@@ -150,12 +151,30 @@ def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
     usable = np.flatnonzero(run >= LONGEST_DELAY)
     if len(usable) < 20 * p:
         return []
-    dt = problem.dt[usable]
-    now = problem.z_columns[:, usable]
-    increment = problem.next_columns[:, usable] - now[:n]
-    movers = [j for j in range(n, p) if np.ptp(now[j]) > 0]
-    lagged = [problem.z_columns[j, usable - lag] for j in movers for lag in range(1, LONGEST_DELAY + 1)]
-    regressors = np.vstack([now, np.ones(len(usable)), *lagged]) * dt  # all at once: one product of all with all
+    lagged = np.stack([problem.z_columns[n:, usable - lag] for lag in range(LONGEST_DELAY + 1)])
+    now = problem.z_columns[:n, usable]
+    messages = []
+    for j, (best, share) in lags(now, lagged, problem.next_columns[:, usable] - now, problem.dt[usable]).items():
+        said = signals[n + j].delay + best
+        messages.append(
+            f"the states follow control '{signals[n + j].name}' better when it is taken "
+            f"{plural(best, 'sample')} earlier "
+            f"(the unexplained part of a step falls by {share:.0%}): try `delay: {said}` for it in the signals file"
+        )
+    return messages
+
+
+def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int, float]]:
+    """Controls by number that explain the states clearly better some samples earlier: by how many, and how much.
+
+    x, increment (n, N): states and what they change by in a step of dt (N,); u (lags + 1, m, N): the controls so many
+    samples before. The share is by how much less of an increment is left unexplained (root mean square).
+    """
+    n, N = x.shape
+    longest, m = len(u) - 1, u.shape[1]
+    movers = [j for j in range(m) if np.ptp(u[0, j]) > 0]
+    late = [u[lag, j] for j in movers for lag in range(1, longest + 1)]
+    regressors = np.vstack([x, u[0], np.ones(N), *late]) * dt  # all at once: one product of all with all
     gram, cross = regressors @ regressors.T, regressors @ increment.T
     total = np.einsum("nk,nk->n", increment, increment)
 
@@ -163,21 +182,15 @@ def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
         left = unexplained(gram[np.ix_(chosen, chosen)], cross[chosen], total)
         return float(np.log(np.maximum(left, 1e-300)).sum())
 
-    messages = []
-    undelayed = [*range(p), p]
+    found = {}
+    undelayed = [*range(n + m), n + m]
     for position, j in enumerate(movers):
+        first = n + m + 1 + position * longest
         scores = [score(undelayed)]
-        for lag in range(LONGEST_DELAY):
-            scores.append(score([position * LONGEST_DELAY + p + 1 + lag if c == j else c for c in undelayed]))
+        scores += [score([first + lag if c == n + j else c for c in undelayed]) for lag in range(longest)]
         best = int(np.argmin(scores))
         gain = scores[0] - scores[best]
         # 5 % less unexplained, and far more than chance: N log-likelihood units per row
-        if best and gain > 0.05 and gain * len(usable) > 50:
-            said = signals[j].delay + best
-            messages.append(
-                f"the states follow control '{signals[j].name}' better when it is taken "
-                f"{plural(best, 'sample')} earlier (the unexplained part of a step falls by "
-                f"{1 - np.exp(-gain / n / 2):.0%}): try `delay: {said}` for it in "
-                f"the signals file"
-            )
-    return messages
+        if best and gain > 0.05 and gain * N > 50:
+            found[j] = (best, float(1 - np.exp(-gain / n / 2)))
+    return found

@@ -1,0 +1,70 @@
+"""What the recordings themselves know of a state's next sample: a memory and its controls, or noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.identification.excitation import successive
+from uncertain_lti.identification.problem import Problem
+
+Array = NDArray[np.float64]
+
+NOISE = 0.5
+"""A state of whose variance less than this share is predicted from one sample to the next moves like noise."""
+_OWN = 0.3
+"""Share of a mode's largest component from which on a state has part in the mode."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Shares of variance predicted one sample ahead, and the fastest mode that does not come from measurement noise.
+
+    predicted (n,): by least squares on the sample before and its control; fastest: |1 - eigenvalue| of the step.
+    """
+
+    predicted: Array
+    fastest: float
+
+    def like_noise(self, state: int) -> bool:
+        """Whether the state moves like noise."""
+        return bool(self.predicted[state] < NOISE)
+
+
+def predicted(X: Array, U: Array, after: Array) -> Array:
+    """Share of the variance of `after` (N, k) that least squares on [X (N, n), U (N, m), 1] predicts, (k,)."""
+    design = np.column_stack([X, U, np.ones(len(X))])
+    design = design / np.maximum(np.abs(design).max(axis=0), 1e-300)
+    rest = after - design @ np.linalg.lstsq(design, after, rcond=None)[0]
+    total = ((after - after.mean(axis=0)) ** 2).sum(axis=0)
+    freedom = max(len(X) - np.linalg.matrix_rank(design), 1)
+    left = (rest**2).sum(axis=0) * (len(X) - 1) / freedom  # without the share that any regressor explains by chance
+    return np.asarray(1.0 - left / np.maximum(total, 1e-300))
+
+
+def memory(problem: Problem) -> Memory:
+    """What a problem's own samples say of its states' memory.
+
+    Noise on a measured state makes least squares believe that it decays within a step. The sample before, as an
+    instrument, carries the state and none of that noise; a mode is fast where both ways say so of a state that is
+    predicted at all.
+    """
+    n, p = problem.n, problem.p
+    share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
+    follows = successive(problem)
+    if len(follows) < 20 * p:
+        return Memory(share, np.inf)
+    before, now, after = problem.z[follows, :n], problem.z[follows + 1], problem.x_next[follows + 1]
+    one = np.ones((len(now), 1))
+    regressors = np.hstack([now, one])
+    instruments = np.hstack([before, problem.z[follows, n:], now[:, n:], one])
+    projected = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
+    speeds = []
+    for design in (regressors, projected):
+        values, vectors = np.linalg.eig(np.linalg.lstsq(design, after, rcond=None)[0][:n].T)
+        parts = np.abs(vectors)
+        seen = [(share[parts[:, j] >= _OWN * parts[:, j].max()] >= NOISE).all() for j in range(n)]
+        speeds.append(float(np.max(np.abs(1.0 - values[seen]), initial=0.0)))
+    return Memory(share, min(speeds))
