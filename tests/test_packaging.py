@@ -8,11 +8,13 @@ import sys
 import textwrap
 from collections.abc import Iterable
 from distutils.core import run_setup  # setuptools brings it where Python no longer does
+from importlib import metadata
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 import uncertain_lti
@@ -188,3 +190,21 @@ def test_constraints_pin_every_requirement_to_a_version_it_allows(distribution):
     for text in [*distribution.install_requires, *sum(distribution.extras_require.values(), [])]:
         requirement = Requirement(text)
         assert requirement.specifier.contains(pins[canonicalize_name(requirement.name)]), text
+
+
+def test_pinned_versions_run_on_the_python_of_debian_12_and_ubuntu_24_04():
+    """A pip that is asked for a version which wants a newer Python says that the requirements conflict."""
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    looked = 0
+    for name, version in pins.items():
+        try:
+            found = metadata.metadata(name)
+        except metadata.PackageNotFoundError:
+            continue
+        wanted = found.get("Requires-Python")
+        if found["Version"] == version and wanted:
+            looked += 1
+            for python in ("3.11.2", "3.12.3"):
+                assert SpecifierSet(wanted).contains(python), f"{name} {version} wants Python {wanted}"
+    assert looked > 20
