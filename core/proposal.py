@@ -16,6 +16,8 @@ from uncertain_lti.bag import Bag, TopicFacts, describe, group_recordings
 from uncertain_lti.bag_arrays import read_columns
 from uncertain_lti.cdr_arrays import RepeatedNamesError
 from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.identification.noise import NOISE, predicted
+from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.signals import FieldPath, Signal
 from uncertain_lti.wording import plural
@@ -36,6 +38,8 @@ FAINT = 5.0
 PER_UNKNOWN = 20
 """Transitions per signal below which further signals are only listed."""
 MOST_STATES, MOST_CONTROLS = 8, 6
+SHORT_DELAY = 3
+"""Samples within which a control shows that keeps a state from being noise."""
 
 # Words in the name of a topic or of its type; the last word of a name counts most.
 _COMMAND = re.compile(r"(cmd|command|contr|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory)")
@@ -74,7 +78,8 @@ class Candidate:
     """One number of a topic that could be a signal.
 
     values, one array (messages,) per recording, NaN where there is none; reason says why it is not proposed ("" where
-    it is, or nothing speaks against it); ready is "state" or "control" for one that a person may well want back.
+    it is, or nothing speaks against it); ready is "state" or "control" for one that a person may well want back; delay
+    is by how many samples the states follow a control later.
     """
 
     topic: str
@@ -86,6 +91,7 @@ class Candidate:
     ready: str = ""
     steady: float = 0.0
     scale: float = 1.0
+    delay: int = 0
 
     @property
     def element(self) -> str:
@@ -101,7 +107,7 @@ class Candidate:
 
 @dataclass
 class Source:
-    """One topic: times of arrival in ns per recording, what it seems to be, and its numbers.
+    """One topic: times of arrival and stamps in ns per recording, what it seems to be, and its numbers.
 
     role is "control", "wish" (a reference of some controller), "state", "" (unknown) or "apart" (neither). halting: its
     header stamps mostly stand still.
@@ -113,6 +119,7 @@ class Source:
     stamped: bool
     offset: float | None
     arrival: list[NDArray[np.int64]] = field(default_factory=list, repr=False)
+    stamp: list[NDArray[np.int64]] = field(default_factory=list, repr=False)
     candidates: list[Candidate] = field(default_factory=list)
     reason: str = ""
     halting: bool = False
@@ -127,6 +134,14 @@ class Source:
         """Messages per second while there are any, 1/s."""
         span = sum(float(a[-1] - a[0]) for a in self.arrival if len(a) > 1) * 1e-9
         return sum(len(a) - 1 for a in self.arrival if len(a) > 1) / span if span > 0 else 0.0
+
+    def instants(self, clock: Source, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Times of this topic's messages and another one's by one clock: stamps where both have them, else arrival."""
+        if self.stamped and clock.stamped and abs((self.offset or 0.0) - (clock.offset or 0.0)) <= 1.0:
+            mine, theirs = self.stamp[number], clock.stamp[number]
+            if all(len(s) and s[0] >= 0 and (np.diff(s) >= 0).all() for s in (mine, theirs)):
+                return mine, theirs
+        return self.arrival[number], clock.arrival[number]
 
     @property
     def free(self) -> list[Candidate]:
@@ -171,15 +186,15 @@ def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = 
     if not states:
         said = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])
         raise BagError(f"{bags[0].path}: nothing in it looks like the state of a machine ({said or 'no topics'})")
-    chosen, delay = _choose(states, controls)
+    chosen, doubt = _choose(states, controls)
     used = [c for s in controls for c in s.free]
     ready = [c for s in sources for c in s.candidates if c.ready]
     _name([*chosen, *(c for c in ready if c.ready == "state")], [*used, *(c for c in ready if c.ready == "control")])
     _operating_point(chosen, used, sources)
     for candidate in ready:
         _own_scale(candidate)
-    warnings = tuple(warning for bag in bags for warning in bag.warnings)
-    return Proposal(tuple(chosen), tuple(used), _text(bags, sources, chosen, used, delay), warnings)
+    warnings = (*(warning for bag in bags for warning in bag.warnings), *([doubt] if doubt else []))
+    return Proposal(tuple(chosen), tuple(used), _text(bags, sources, chosen, used, doubt), warnings)
 
 
 # --- looking ----------------------------------------------------------------------------------------------------
@@ -291,7 +306,7 @@ def _read(bag: Bag, sources: Sequence[Source], progress: Iterate | None) -> None
         paths = [FieldPath(c.path) for c in readable]
         try:
             columns = read_columns(bag, [source.topic], [paths], progress)
-            arrival, values = columns.arrival, columns.values[0]
+            arrival, stamp, values = columns.arrival, columns.stamp, columns.values[0]
             stamps = columns.stamp[columns.stamp >= 0]
             if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(arrival) - 1):
                 source.halting = True
@@ -299,7 +314,9 @@ def _read(bag: Bag, sources: Sequence[Source], progress: Iterate | None) -> None
             read = [(t, [path.read(message) for path in paths]) for _, t, message in bag.messages([source.topic])]
             arrival = np.array([t for t, _ in read], dtype=np.int64)
             values = np.array([row for _, row in read], dtype=np.float64).reshape(len(read), len(paths))
+            stamp = np.full(len(arrival), -1, dtype=np.int64)
         source.arrival.append(arrival)
+        source.stamp.append(stamp)
         for column, candidate in zip(values.T, readable, strict=True):
             candidate.values.append(column)
 
@@ -458,24 +475,32 @@ def _residual(Z: Array, Y: Array) -> Array:
     return np.asarray((rest**2).sum(axis=0))
 
 
-def _steps(state: Sequence[Candidate], of: dict[str, Source], controls: Sequence[Candidate], lag: int = 0) -> _Steps:
-    """Samples on the messages of the slowest of the states' topics; of the others, the latest message before."""
+def _steps(
+    state: Sequence[Candidate], of: dict[str, Source], controls: Sequence[Candidate], lags: Sequence[int] = ()
+) -> _Steps:
+    """Samples on the messages of the slowest of the states' topics; of the others, the latest message before.
+
+    lags: by how many samples each control is taken earlier; none by default.
+    """
+    lags = lags or [0] * len(controls)
+    longest = max(lags, default=0)
     topics = list(dict.fromkeys(c.topic for c in state))
     clock = min(topics, key=lambda t: of[t].rate)
     X, U, dX = [], [], []
     for number, arrival in enumerate(of[clock].arrival):
-        x = np.column_stack([_held(c, of[c.topic], number, arrival) for c in state])
+        x = np.column_stack([_held(c, of[c.topic], number, of[clock]) for c in state])
         u = (
-            np.column_stack([_held(c, of[c.topic], number, arrival) for c in controls])
+            np.column_stack([_held(c, of[c.topic], number, of[clock]) for c in controls])
             if controls
             else np.empty((len(arrival), 0))
         )
         step = np.diff(arrival)
-        if len(step) < 2 + lag:
+        if len(step) < 2 + longest:
             continue
         positive = step[step > 0]
         limit = 2.5 * float(np.median(positive)) if len(positive) else 0.0
-        u = np.vstack([np.full((lag, u.shape[1]), np.nan), u[: len(u) - lag]])
+        for j, lag in enumerate(lags):
+            u[:, j] = np.concatenate([np.full(lag, np.nan), u[: len(u) - lag, j]])
         good = (step > 0) & (step <= limit)
         good &= np.isfinite(x[:-1]).all(axis=1) & np.isfinite(x[1:]).all(axis=1) & np.isfinite(u[:-1]).all(axis=1)
         if len(good) > 200_000:  # enough to tell
@@ -491,15 +516,14 @@ def _steps(state: Sequence[Candidate], of: dict[str, Source], controls: Sequence
     )
 
 
-def _held(
-    candidate: Candidate, source: Source, number: int, at: NDArray[np.int64], oldest: float | None = None
-) -> Array:
-    """Latest value at these instants of arrival; NaN before the first, and where it is older than `oldest` s."""
+def _held(candidate: Candidate, source: Source, number: int, clock: Source, oldest: float | None = None) -> Array:
+    """Latest value at each message of the clock; NaN before the first, and where it is older than `oldest` s."""
     if number >= len(source.arrival) or not len(source.arrival[number]) or number >= len(candidate.values):
-        return np.full(len(at), np.nan)
-    position = np.searchsorted(source.arrival[number], at, side="right") - 1
+        return np.full(len(clock.arrival[number]), np.nan)
+    mine, at = source.instants(clock, number)
+    position = np.searchsorted(mine, at, side="right") - 1
     values = candidate.values[number][np.maximum(position, 0)]
-    age = (at - source.arrival[number][np.maximum(position, 0)]) * 1e-9
+    age = (at - mine[np.maximum(position, 0)]) * 1e-9
     gone = position < 0 if oldest is None else (position < 0) | (age > oldest)
     return np.where(gone, np.nan, values)
 
@@ -513,8 +537,8 @@ def _explained(state: Source, controls: Sequence[Source]) -> float:
     return float(np.max(steps.effect(range(len(state.free))), initial=0.0))
 
 
-def _choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[Candidate], int]:
-    """States of the model, and by how many samples they follow the controls; reasons go to what is left out."""
+def _choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[Candidate], str]:
+    """States of the model, and a sentence where they look like none; reasons go to what is left out."""
     every = {s.topic: s for s in [*states, *controls]}
     for source in states:
         _prefer_rates(source)
@@ -539,15 +563,97 @@ def _choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[
     _same(used)
     used = [c for c in used if not c.reason]
     steps = _steps(pool, every, used)
+    pool = _distinct(steps, pool)
+    pool, doubt = _remembering(pool, every, used)
+    steps = _steps(pool, every, used)
     N = len(steps.X)
     room = max(2, N // PER_UNKNOWN)
     used = _strongest(steps, used, max(1, min(MOST_CONTROLS, room // 2)))
     steps = _steps(pool, every, used)
     most = max(1, min(MOST_STATES, room - len(used)))
-    keep = _coupled(steps, pool, most, _is_pose(pool)) if N >= FEWEST else pool[:MOST_STATES]
+    driven = _driven(pool, every, used)
+    keep = _coupled(steps, pool, most, _is_pose(pool), driven) if N >= FEWEST else pool[:MOST_STATES]
     _effective(_steps(keep, every, used), used)
     used = [c for c in used if not c.reason]
-    return keep, _delay(keep, every, used)
+    _delay(keep, every, used)
+    return keep, doubt
+
+
+def _driven(pool: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> Array:
+    """How clearly the controls show in the next step of each candidate (n,), at the delay at which they show most."""
+    found = np.zeros(len(pool))
+    for lag in range(LONGEST_DELAY + 1):
+        steps = _steps(pool, every, used, [lag] * len(used))
+        if used and len(steps.X) >= FEWEST:
+            found = np.maximum(found, steps.effect(range(len(pool))))
+    return found
+
+
+def _distinct(steps: _Steps, pool: list[Candidate]) -> list[Candidate]:
+    """Without candidates that are functions of another one, whatever their topics: copies, other units, squares.
+
+    Such a function leaves next to nothing of a candidate, or nothing but noise. Of two that are functions of each
+    other, the one in which the controls show more stays.
+    """
+    if len(steps.X) < FEWEST:
+        return pool
+    n = len(pool)
+    shows = steps.effect(range(n)) if steps.U.shape[1] else np.zeros(n)
+    kept: list[int] = []
+    for i in np.argsort(-shows, kind="stable").tolist():
+        source = next((j for j in kept if _function(steps.X[:, j], steps.X[:, i])), None)
+        if source is not None:
+            pool[i].reason = f"says what {_place(pool[source], pool[i])} says already"
+            continue
+        for j in [j for j in kept if _function(steps.X[:, i], steps.X[:, j])]:  # x stays, its square goes
+            kept.remove(j)
+            pool[j].reason = f"says what {_place(pool[i], pool[j])} says already"
+        kept.append(i)
+    return [pool[i] for i in sorted(kept)]
+
+
+def _place(candidate: Candidate, beside: Candidate) -> str:
+    return candidate.path if candidate.topic == beside.topic else f"{candidate.topic} {candidate.path}"
+
+
+def _function(of: Array, values: Array) -> bool:
+    """Whether these values (N,) are a smooth function of others at the same instants, or one sample off, but noise."""
+    for shift in (0, 1, -1):
+        a, b = of[max(shift, 0) : len(of) + min(shift, 0)], values[max(-shift, 0) : len(values) - max(shift, 0)]
+        if np.ptp(a) == 0 or np.ptp(b) == 0:
+            return False
+        a = (a - a.mean()) / a.std()
+        basis = np.column_stack([np.ones_like(a), a, a**2, a**3])
+        rest = b - basis @ np.linalg.lstsq(basis, b, rcond=None)[0]
+        share = float(rest.std() / b.std())
+        memory = float(np.corrcoef(rest[1:], rest[:-1])[0, 1]) if rest.std() > 0 else 0.0
+        moves = float(np.diff(b).std() / b.std())
+        if share < 0.02 or (share < 0.15 and memory < 0.3 and moves < 0.7):  # white beside what it follows
+            return True
+    return False
+
+
+def _remembering(
+    pool: list[Candidate], every: dict[str, Source], used: Sequence[Candidate]
+) -> tuple[list[Candidate], str]:
+    """Without candidates that are noise from sample to sample; all of them, with a sentence, where all are."""
+    late = [*used] * (SHORT_DELAY + 1)
+    steps = _steps(pool, every, late, [lag for lag in range(SHORT_DELAY + 1) for _ in used])
+    if len(steps.X) < max(FEWEST, 2 * (len(pool) + len(late))):
+        return pool, ""
+    share = predicted(steps.X, steps.U, steps.X + steps.dX)
+    if not (share >= NOISE).any():
+        return pool, (
+            "nothing here is more than noise from one sample to the next: record the machine at work before you "
+            "fit a model"
+        )
+    for candidate, known in zip(pool, share, strict=True):
+        if known < NOISE:
+            candidate.reason = (
+                f"noise: one sample predicts {max(0.0, known):.0%} of the variance at the next, controls included"
+            )
+            candidate.ready = "state"
+    return [c for c in pool if not c.reason], ""
 
 
 def _is_pose(pool: Sequence[Candidate]) -> bool:
@@ -649,17 +755,18 @@ def _strongest(steps: _Steps, used: list[Candidate], most: int) -> list[Candidat
     return [c for j, c in enumerate(used) if j in order]
 
 
-def _coupled(steps: _Steps, pool: list[Candidate], most: int, pose: bool) -> list[Candidate]:
+def _coupled(steps: _Steps, pool: list[Candidate], most: int, pose: bool, driven: Array) -> list[Candidate]:
     """States in whose next step the controls show, those that help to predict them, and those that follow them.
 
-    Of a body's pose only those in which the controls show most: all of its numbers are coupled by geometry.
+    Of a body's pose only those in which the controls show most: all of its numbers are coupled by geometry, and a
+    place adds up what the attitude did, so that the attitude goes before where the controls show in it at all.
     """
     n = len(pool)
-    driven = steps.effect(range(n)) if steps.U.shape[1] else np.zeros(n)
-    least = max(SHOWS, 0.5 * float(driven.max(initial=0.0))) if pose else SHOWS
-    kept = [int(i) for i in np.argsort(-driven, kind="stable") if driven[i] > least]
-    angles = [i for i in kept if "(" in pool[i].path]
-    kept = (angles if pose and angles else kept)[:most]
+    order = [int(i) for i in np.argsort(-driven, kind="stable")]
+    angles = [i for i in order if "(" in pool[i].path and driven[i] > FAINT] if pose else []
+    among = angles or order
+    least = SHOWS if not pose else max(FAINT if angles else SHOWS, 0.5 * float(driven[among].max(initial=0.0)))
+    kept = [i for i in among if driven[i] > least][:most]
     if not kept:
         for candidate in pool[most:]:
             candidate.reason = "the recording is too short for so many states"
@@ -689,18 +796,28 @@ def _coupled(steps: _Steps, pool: list[Candidate], most: int, pose: bool) -> lis
     return [pool[j] for j in sorted(kept)]
 
 
-def _delay(states: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> int:
-    """Samples by which the controls must be shifted to explain clearly more of the next step."""
+def _delay(states: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> None:
+    """Samples by which each control must be taken earlier to explain clearly more of the next step: as the fit says."""
     if not used or not states:
-        return 0
-    effects = []
-    for lag in range(4):
-        steps = _steps(states, every, used, lag)
-        if len(steps.X) < FEWEST:
-            return 0
-        effects.append(float(np.median(steps.effect(range(len(states))))))
-    best = int(np.argmax(effects))
-    return best if effects[best] > max(SHOWS, 1.5 * effects[0]) else 0
+        return
+    for _ in range(2 * len(used)):
+        late = [*used] * (LONGEST_DELAY + 1)
+        by = [c.delay + lag for lag in range(LONGEST_DELAY + 1) for c in used]
+        steps = _steps(states, every, late, by)
+        N = len(steps.X)
+        if N < PER_UNKNOWN * (len(states) + len(used)):
+            return
+        u = steps.U.T.reshape(LONGEST_DELAY + 1, len(used), N)
+        found = lags(steps.X.T / _spread(steps.X), u / _spread(u[0].T)[None], steps.dX.T, np.ones(N))
+        if not found:
+            return
+        first = max(found, key=lambda j: found[j][1])
+        used[first].delay += found[first][0]
+
+
+def _spread(values: Array) -> Array:
+    """Size of each column, (k, 1), to divide by."""
+    return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300)[:, None])
 
 
 # --- names and numbers --------------------------------------------------------------------------------------------
@@ -751,9 +868,9 @@ def _operating_point(states: Sequence[Candidate], controls: Sequence[Candidate],
     limits = [_hold(every[c.topic], clock)[0] if c in controls else None for c in group]
     recordings = [
         np.column_stack(
-            [_held(c, every[c.topic], number, arrival, limit) for c, limit in zip(group, limits, strict=True)]
+            [_held(c, every[c.topic], number, clock, limit) for c, limit in zip(group, limits, strict=True)]
         )
-        for number, arrival in enumerate(clock.arrival)
+        for number in range(len(clock.arrival))
     ]
     recordings = [r for r in recordings if len(r)]
     signals = [Signal(c.name, c.topic, c.path, "auto", "auto") for c in group]
@@ -778,7 +895,7 @@ def _own_scale(candidate: Candidate) -> None:
 
 def _text(
     bags: Sequence[Bag], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
-    delay: int,
+    doubt: str,
 ) -> str:  # fmt: skip
     every = {s.topic: s for s in sources}
     topics = list(dict.fromkeys(c.topic for c in [*states, *controls]))
@@ -809,20 +926,22 @@ def _text(
         ]
         lines += [f"  {_quoted(t)}: {{time: log}}" for t in topics]
     lines += ["", "# steady: median over the longest stretch in which everything stands still; scale: the largest such"]
-    lines += ["# magnitude, or the range where that is small. Both in recorded units.", "states:"]
+    lines.append("# magnitude, or the range where that is small. Both in recorded units.")
+    lines += [f"# Beware: {doubt}."] if doubt else []
+    lines.append("states:")
     lines += [_entry(c) for c in states]
     lines += [_entry(c, comment=c.reason, out=True) for s in sources for c in s.candidates if c.ready == "state"]
     if controls:
         lines += ["", "controls:"]
         if any(every[c.topic].role == "guess" for c in controls):
             lines.append("  # by correlation alone: nothing is called a command here")
-        if delay:
-            lines.append(f"  # delay: the states follow {delay} sample{'s' * (delay > 1)} later")
+        if any(c.delay for c in controls):
+            lines.append("  # delay: by so many samples the states follow later")
         for candidate in controls:
-            lines.append(_entry(candidate, *_hold(every[candidate.topic], clock), delay))
+            lines.append(_entry(candidate, *_hold(every[candidate.topic], clock)))
         for candidate in (c for s in sources for c in s.candidates if c.ready == "control"):
             limit, _ = _hold(every[candidate.topic], clock)
-            lines.append(_entry(candidate, limit, candidate.reason, delay, out=True))
+            lines.append(_entry(candidate, limit, candidate.reason, out=True))
     else:
         lines += [
             "",
@@ -849,9 +968,7 @@ def _quoted(text: str) -> str:
     )
 
 
-def _entry(
-    candidate: Candidate, max_hold: float | None = None, comment: str = "", delay: int = 0, out: bool = False
-) -> str:
+def _entry(candidate: Candidate, max_hold: float | None = None, comment: str = "", out: bool = False) -> str:
     """Line of a signal; `out`: in a comment, ready to be taken in."""
     parts = [f"name: {_quoted(candidate.name)}", f"topic: {_quoted(candidate.topic)}"]
     parts.append('field: "' + re.sub(r'(["\\])', r"\\\1", candidate.path) + '"')
@@ -860,8 +977,8 @@ def _entry(
         parts.append(f"unit: {candidate.unit}")
     if max_hold is not None:
         parts.append(f"max_hold: {_number(max_hold)}")
-    if delay:
-        parts.append(f"delay: {delay}")
+    if candidate.delay:
+        parts.append(f"delay: {candidate.delay}")
     return f"  {'# ' * out}- {{{', '.join(parts)}}}" + (f" # {comment}" if comment else "")
 
 

@@ -79,9 +79,9 @@ REAL = {
     "neato/person_follower": ({"twist.twist.linear.x", "twist.twist.angular.z"}, {"linear.x", "angular.z"}),
     "neato/draw_square": ({"twist.twist.linear.x", "twist.twist.angular.z"}, {"linear.x", "angular.z"}),
     "crazyflie/rollbag_0": ({"unwrap(roll(pose.orientation))"}, {"position.x"}),
-    "crazyflie/yx3bag_0": (set(), set()),
+    "crazyflie/yx3bag_0": ({"unwrap(roll(pose.orientation))"}, {"position.x"}),
     "crazyflie/yx4bag_0": (set(), set()),
-    "cougars_auv/SO_bag_0": ({"fluid_pressure"}, {"fin[0]"}),
+    "cougars_auv/SO_bag_0": (set(), {"fin[0]"}),
 }
 
 
@@ -96,6 +96,9 @@ def test_real_recordings_fit_unedited(recordings, name):
     model = fitted([path], proposal)
     assert model.fit["violations"] == 0
     assert "vector.y" not in controls and "twist.angular.z" not in states - wanted_states
+    assert not any("better when it is taken" in m or "like noise" in m for m in model.fit["messages"]), proposal.text
+    if name in ("cougars_auv/SO_bag_0", "hunter_se/straight_odd_t_0_5_run_01"):  # depth is pressure; a rate is noise
+        assert len(states) == 1
 
 
 def test_of_many_joints_one_with_its_command(recordings):
@@ -451,3 +454,76 @@ def test_whatever_is_recorded_gets_a_file_or_a_sentence(tmp_path_factory, data):
         fit(run)
     except FitError as error:  # too few samples, or numbers that no arithmetic holds
         assert str(error)
+
+
+# --- copies and noise ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "copy",
+    [
+        lambda x, rng: -57.3 * x + 4.0,
+        lambda x, rng: 101325.0 + 9810.0 * x + 5.0 * rng.normal(),
+        lambda x, rng: np.exp(x / 3.0),
+        lambda x, rng: x + 0.02 * rng.normal(),
+    ],
+    ids=["another unit", "another sensor", "a function", "a worse sensor"],
+)
+@pytest.mark.parametrize("name", ["/plant/pressure", "/aaa/sensor"])
+def test_a_function_of_a_state_in_another_topic_is_no_second_state(tmp_path, copy, name):
+    rng = np.random.default_rng(1)
+    path = save(
+        tmp_path / "run.mcap", driven(extra=lambda k, x, u: [f64(name, 10**18 + k * 20 * MS, copy(x, rng))]), {}
+    )
+    proposal = propose([path])
+    assert len(proposal.states) == 1, proposal.text
+    (left,) = {"/plant/state", name} - {proposal.states[0].topic}
+    assert f"{left} data: says what {proposal.states[0].topic} data says already" in proposal.text
+
+
+def test_the_root_of_a_square_stays(tmp_path):
+    """x says what x² says, and x² does not say what x says."""
+    path = save(
+        tmp_path / "run.mcap",
+        driven(extra=lambda k, x, u: [f64("/plant/power", 10**18 + k * 20 * MS, 3 * x * x)]),
+        {},
+    )
+    proposal = propose([path])
+    assert [c.topic for c in proposal.states] == ["/plant/state"], proposal.text
+
+
+def test_noise_is_no_state(tmp_path):
+    rng = np.random.default_rng(2)
+
+    def extra(k, x, u):
+        return [f64("/plant/temperature", 10**18 + k * 20 * MS, 20.0 + 0.1 * rng.normal() + 0.02 * u)]
+
+    proposal = propose([save(tmp_path / "run.mcap", driven(count=2000, extra=extra), {})])
+    assert [c.topic for c in proposal.states] == ["/plant/state"], proposal.text
+    (line,) = [line for line in proposal.text.splitlines() if "/plant/temperature" in line]
+    assert "noise: one sample predicts" in line or "the controls do not show" in line
+
+
+def test_a_recording_of_noise_alone_says_so(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    messages = [f64("/plant/state", 10**18 + k * 20 * MS, 1.0 + 0.1 * rng.normal()) for k in range(500)]
+    path = save(tmp_path / "run.mcap", messages, {})
+    proposal = propose([path])
+    assert len(proposal.states) == 1 and "# Beware: nothing here is more than noise" in proposal.text
+    assert main(["init", str(path)]) == 0
+    assert "record the machine at work" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("late", [0, 1, 4, 8])
+def test_a_late_answer_becomes_the_delay_that_the_fit_would_name(tmp_path, late):
+    rng = np.random.default_rng(4)
+    x, history, messages = 0.0, [0.0] * 9, []
+    for k in range(1500):
+        history.append(float(rng.normal()) if k % 23 == 0 else history[-1])
+        t = 10**18 + k * 20 * MS
+        messages += [f64("/plant/state", t, x + 1e-3 * rng.normal()), f64("/plant/cmd", t, history[-1])]
+        x += 0.02 * (-2.0 * x + 3.0 * history[-1 - late])
+    path = save(tmp_path / "run.mcap", messages, {})
+    proposal = propose([path])
+    assert [c.delay for c in proposal.controls] == [late]
+    assert not any("better when it is taken" in m for m in fitted([path], proposal).fit["messages"])

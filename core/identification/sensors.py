@@ -191,6 +191,9 @@ def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int
         best = int(np.argmin(scores))
         gain = scores[0] - scores[best]
         # 5 % less unexplained, and far more than chance: N log-likelihood units per row
-        if best and gain > 0.05 and gain * N > 50:
+        if not (0 < best < longest and gain > 0.05 and gain * N > 50):  # at the end of what is tried it is no optimum
+            continue
+        # beside a late control the present one says nothing; where it does, the late one stands for past states
+        if scores[best] - score([*undelayed, first + best - 1]) < 0.3 * gain:
             found[j] = (best, float(1 - np.exp(-gain / n / 2)))
     return found
