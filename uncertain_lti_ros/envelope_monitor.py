@@ -32,6 +32,7 @@ from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdict
 from uncertain_lti.signals import FieldPath
 from uncertain_lti.verdict_messages import FALSE, JUDGED, TRUE
+from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.arming import Condition
 from uncertain_lti_ros.layout import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
@@ -43,6 +44,11 @@ from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, MatchedSubs
 from uncertain_lti_ros.watch import ERROR, STALE, Report, Rule, Watch, topic_types
 
 NAME = "envelope_monitor"
+_SUMMARY = (
+    "Watches the topics that a model file names and publishes, per sample, whether each state lies within its bounds; "
+    "~/violation is the alarm. Needs the parameter model. Services: ~/status, ~/reset, ~/reload, ~/snapshot "
+    "(std_srvs/srv/Trigger) and those of a managed node."
+)
 VECTORS = ("flags", *JUDGED, "predicted_lower", "predicted_upper")
 """Topics below the node's name that carry one number per state as sensor_msgs/JointState."""
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
@@ -78,8 +84,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        for parameter in PARAMETERS:
-            self.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+        declare(self, PARAMETERS)
         self.watch: Watch | None = None
         self.active = False
         self._reason = ""  # why the last configure failed
@@ -609,7 +614,11 @@ class EnvelopeMonitorNode(LifecycleNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until a signal ends it."""
+    """Run the node until a signal ends it; 0 then, 2 for arguments that it cannot use."""
+    return run_node(NAME, _SUMMARY, PARAMETERS, _run, args)
+
+
+def _run(args: list[str]) -> int:
     spare_the_middleware()
     with living(EnvelopeMonitorNode, args) as life:
         node = life.node

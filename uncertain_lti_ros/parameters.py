@@ -2,35 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-
+from uncertain_lti_ros.arguments import Declared
 from uncertain_lti_ros.subscriptions import DEPTH, DURABILITY, RELIABILITY
-
-
-@dataclass(frozen=True)
-class Declared:
-    """One parameter; fixed: it can be given at the start only."""
-
-    name: str
-    default: str | bool | int | float
-    text: str
-    fixed: bool = False
-    low: float | None = None
-    high: float | None = None
-
-    def descriptor(self) -> ParameterDescriptor:
-        """What `ros2 param describe` tells."""
-        descriptor = ParameterDescriptor(description=self.text, read_only=self.fixed)
-        if self.low is not None and self.high is not None:
-            if isinstance(self.default, int):
-                limits = IntegerRange(from_value=int(self.low), to_value=int(self.high), step=0)
-                descriptor.integer_range = [limits]
-            else:
-                descriptor.floating_point_range = [FloatingPointRange(from_value=self.low, to_value=self.high)]
-        return descriptor
-
 
 _ANEW = "Setting it starts the alarm anew."
 RULE = ("violations", "window", "margin", "masked", "enable", "enable_type", "grace", "latch")

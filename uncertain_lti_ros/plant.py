@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 
 import rclpy
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -14,9 +13,20 @@ from sensor_msgs.msg import JointState
 
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
 from uncertain_lti.transient import Transient
+from uncertain_lti_ros.arguments import Declared, declare, run_node
 from uncertain_lti_ros.process import Life, living
 
 _SETTLE = 0.5  # s from the first subscriber on, for the others to come
+
+
+SUMMARY = "Publishes {} on {} and {}, once both have subscribers; then it ends."
+PARAMETERS = (
+    Declared("steps", 1200, "Samples to publish.", True, 2, 10**9),
+    Declared("seed", 1, "Seed of the pulses and of the draws.", True, 0, 10**9),
+    Declared("fault_at", -1, "Sample from which on the matrices leave their intervals; -1: never.", True, -1, 10**9),
+    Declared("rate", 1.0, "Speed of publication; stamps are 0.025 s apart at any rate.", True, 1e-3, 1e9),
+    Declared("wait", 30.0, "Time to wait for subscribers of both topics, s.", True, 0.0, 1e9),
+)
 
 
 class Plant(Node):
@@ -25,23 +35,9 @@ class Plant(Node):
     def __init__(self) -> None:
         super().__init__("plant")
 
-        def integer(name: str, default: int, low: int, text: str) -> int:
-            bounds = [IntegerRange(from_value=low, to_value=10**9, step=0)]
-            descriptor = ParameterDescriptor(description=text, read_only=True, integer_range=bounds)
-            return int(self.declare_parameter(name, default, descriptor).value)
-
-        def real(name: str, default: float, low: float, text: str) -> float:
-            bounds = [FloatingPointRange(from_value=low, to_value=1e9, step=0.0)]
-            descriptor = ParameterDescriptor(description=text, read_only=True, floating_point_range=bounds)
-            return float(self.declare_parameter(name, default, descriptor).value)
-
-        self.steps = integer("steps", 1200, 2, "Samples to publish.")
-        self.seed = integer("seed", 1, 0, "Seed of the pulses and of the draws.")
-        self.fault_at = integer(
-            "fault_at", -1, -1, "Sample from which on the matrices leave their intervals; -1: never."
-        )
-        self.rate = real("rate", 1.0, 1e-3, "Speed of publication; stamps are 0.025 s apart at any rate.")
-        self.wait = real("wait", 30.0, 0.0, "Time to wait for subscribers of both topics, s.")
+        given = declare(self, PARAMETERS)
+        self.steps, self.seed, self.fault_at = given["steps"], given["seed"], given["fault_at"]
+        self.rate, self.wait = given["rate"], given["wait"]
         qos = QoSProfile(depth=1000)
         self.state = self.create_publisher(JointState, STATE_TOPIC, qos)
         self.control = self.create_publisher(JointState, CONTROL_TOPIC, qos)
@@ -111,5 +107,10 @@ def _subscribed(life: Life, publishers: tuple[Publisher, ...], limit: float) -> 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until its transient is over."""
-    with living(Plant, args) as life:
-        return run(life)
+
+    def started(args: list[str]) -> int:
+        with living(Plant, args) as life:
+            return run(life)
+
+    summary = SUMMARY.format("the published engine, drawn anew inside its intervals,", STATE_TOPIC, CONTROL_TOPIC)
+    return run_node("plant", summary, PARAMETERS, started, args)

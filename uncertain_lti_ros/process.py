@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+
+from uncertain_lti_ros.arguments import ArgumentError, hold_overrides, in_words
 
 _PATIENCE = 0.1  # s that a signal waits at most
 _SPELL = 30.0  # s between two looks at whether rclpy has been shut down by somebody else
@@ -88,7 +91,15 @@ def spare_the_middleware() -> None:
 
 @contextmanager
 def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
-    """Start rclpy (on these arguments, or those of the process), make the node, and put all away at the end."""
+    """Start rclpy on these ROS arguments, make the node, and put all away at the end.
+
+    Raises
+    ------
+    ArgumentError
+        An argument, or a setting of the middleware, cannot be used; or a parameter is given that the node does not
+        have, or a value that it cannot take.
+    """
+    args = list(args or [])
     stop: list[int] = []
     lives: list[Life] = []
 
@@ -98,10 +109,15 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
             life.end()
 
     before = {name: signal.signal(name, end) for name in _SIGNALS}
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
-        node = make_node()
+        try:
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            node = make_node()
+        except (RuntimeError, InvalidParameterTypeException, InvalidParameterValueException) as error:
+            # RuntimeError: what rcl raises, under names that rclpy does not export
+            raise ArgumentError(in_words(error)) from None
+        hold_overrides(node, args)
         lives.append(Life(node, stop))
         yield lives[0]
     finally:

@@ -1,0 +1,178 @@
+"""Arguments that a node cannot use: one sentence with the remedy and status 2, never a traceback; and `--help`."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from ros_processes import World, open_world
+
+from uncertain_lti_ros import parameters, plant, turbofan
+
+NODES = {"envelope_monitor": parameters, "plant": plant, "turbofan": turbofan}
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
+    """Start a node with these arguments and come back when it has ended."""
+
+    def call(*arguments: str, node: str = "envelope_monitor", **environment: str) -> subprocess.CompletedProcess:
+        code = f"import sys; from uncertain_lti_ros.{node} import main; sys.exit(main())"
+        return subprocess.run(
+            [sys.executable, "-c", code, *arguments],
+            env=os.environ
+            | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(tmp_path / "log"), **environment},
+            cwd=tmp_path, capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
+
+    return call
+
+
+def refusal(result: subprocess.CompletedProcess, node: str = "envelope_monitor") -> str:
+    """The one sentence; what rcl logs itself may stand before it."""
+    assert result.returncode == 2, result
+    assert "Traceback" not in result.stderr and not result.stdout, result
+    *before, sentence = result.stderr.strip().splitlines()
+    assert all("[rcl]: " in line for line in before), result.stderr
+    assert sentence.startswith(f"{node}: "), sentence
+    assert "/project/" not in sentence, "a line of rcl's own source"
+    return sentence
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["-p", "violations:=two"], ["parameter violations is 'two'", "a whole number from 0 to 1000000"]),
+        (["-p", "violations:=-2"], ["parameter violations is -2", "from 0"]),
+        (["-p", "violations:=2.5"], ["parameter violations is 2.5", "a whole number"]),
+        (["-p", "margin:=2"], ["parameter margin is 2", "write 2.0"]),
+        (["-p", "margin:=-2.0"], ["parameter margin is -2.0", "from 0"]),
+        (["-p", "latch:=1"], ["parameter latch is 1", "true or false"]),
+        (["-p", "model:=123"], ["parameter model is 123", "model:='123'"]),
+        (["-p", "enable:=true"], ["parameter enable is true", "enable:='true'"]),
+        (["-p", "model:=[a, b]"], ["parameter model is", "text is wanted"]),
+        (["-p", "use_sim_time:=maybe"], ["parameter use_sim_time is 'maybe'", "bool"]),
+        (["-p", "modle:=x"], ["no parameter modle", "did you mean model?"]),
+        (["-p", "snapshot_folder:=x"], ["no parameter snapshot_folder", "did you mean snapshot.folder?"]),
+        (["-p", "envelope_monitor:windows:=3"], ["no parameter windows", "did you mean window?"]),
+        (["-p", "banana:=x"], ["no parameter banana", "--help"]),
+        (["-p", "model:="], ["-p model:= has nothing after :=", "model:=''"]),
+        (["-p", "model"], ["-p model cannot be read", "-p NAME:=VALUE"]),
+        (["-p"], ["-p has nothing after it", "-p NAME:=VALUE"]),
+        (["-r"], ["-r has nothing after it", "-r FROM:=TO"]),
+        (["-r", "-p", "model:=x"], ["-r has nothing after it"]),
+        (["-r", "one"], ["-r one cannot be read", "-r FROM:=TO"]),
+        (["-r", "__node:=a-b"], ["-r __node:=a-b cannot be read", "letters, digits"]),
+        (["--log-level", "loud"], ["--log-level loud", "debug, info, warn"]),
+        (["--nonsense"], ["--nonsense is no ROS argument", "--help"]),
+        (["model:=x"], ["model:=x is no ROS argument", "write -p model:=x"]),
+        (["--params-file"], ["--params-file has nothing after it"]),
+        (["--params-file", "nowhere.yaml"], ["--params-file nowhere.yaml is not a file"]),
+    ],
+)  # fmt: skip
+def test_a_ros_argument_that_cannot_be_used(
+    start: Callable[..., subprocess.CompletedProcess], arguments: list[str], says: list[str]
+) -> None:
+    sentence = refusal(start("--ros-args", *arguments))
+    assert all(text in sentence for text in says), sentence
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["a.model.json"], ["argument a.model.json", "--ros-args -p model:=a.model.json"]),
+        (["--model", "x"], ["argument --model", "-p NAME:=VALUE"]),
+        (["model:=x"], ["argument model:=x", "--ros-args -p model:=x"]),
+        (["-p", "model:=x"], ["argument -p", "--ros-args -p model:=x"]),
+        (["-r"], ["argument -r", "--ros-args -r FROM:=TO"]),
+        (["--ros-args", "-p", "model:=x", "--", "rest"], ["argument rest"]),
+    ],
+)
+def test_an_argument_outside_the_ros_arguments(
+    start: Callable[..., subprocess.CompletedProcess], arguments: list[str], says: list[str]
+) -> None:
+    sentence = refusal(start(*arguments))
+    assert all(text in sentence for text in says), sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("envelope_monitor:\n  ros__parameters:\n    model: [1, a]\n", "line_num 3"),
+        ("envelope_monitor:\n  model: x\n", "ros__parameters"),
+        ("a: [b\n", "cannot be read"),
+        ("envelope_monitor:\n  ros__parameters:\n    modle: x\n", "did you mean model?"),
+        ("/**:\n  ros__parameters:\n    snapshot:\n      folders: x\n", "did you mean snapshot.folder?"),
+        ("/**:\n  ros__parameters:\n    margin: 2\n", "write 2.0"),
+    ],
+)
+def test_a_wrong_parameter_file(
+    start: Callable[..., subprocess.CompletedProcess], tmp_path: Path, text: str, says: str
+) -> None:
+    (tmp_path / "given.yaml").write_text(text)
+    sentence = refusal(start("--ros-args", "--params-file", "given.yaml"))
+    assert says in sentence, sentence
+    assert "given.yaml" in sentence or "parameter" in sentence
+
+
+def test_a_setting_of_the_environment_that_rcl_refuses(start: Callable[..., subprocess.CompletedProcess]) -> None:
+    assert "ROS_DOMAIN_ID is not an integral number" in refusal(start(ROS_DOMAIN_ID="abc"))
+
+
+@pytest.mark.parametrize("node", NODES)
+@pytest.mark.parametrize("arguments", [["--help"], ["-h"], ["--ros-args", "--help"]])
+def test_help_describes_every_parameter(
+    start: Callable[..., subprocess.CompletedProcess], node: str, arguments: list[str]
+) -> None:
+    result = start(*arguments, node=node)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.startswith(f"usage: {node} ") and max(map(len, result.stdout.splitlines())) <= 120
+    words = " ".join(result.stdout.split())
+    for parameter in NODES[node].PARAMETERS:
+        assert f"{parameter.name} = " in words and parameter.text in words
+
+
+@pytest.mark.parametrize("node", ["plant", "turbofan"])
+def test_the_other_nodes_refuse_in_the_same_way(start: Callable[..., subprocess.CompletedProcess], node: str) -> None:
+    assert "parameter rate is 2" in refusal(start("--ros-args", "-p", "rate:=2", node=node), node)
+    assert "did you mean seed?" in refusal(start("--ros-args", "-p", "sed:=2", node=node), node)
+    assert "argument now" in refusal(start("now", node=node), node)
+
+
+def test_the_turbofan_refuses_a_manoeuvre_that_there_is_not(start: Callable[..., subprocess.CompletedProcess]) -> None:
+    assert "loop" in refusal(start("--ros-args", "-p", "manoeuvre:=loop", node="turbofan"), "turbofan")
+
+
+def test_what_a_shared_file_says_to_other_nodes_is_no_reason_to_refuse(tmp_path: Path) -> None:
+    """It is logged: a file is shared by many nodes, and the section may be for all of them."""
+    shared, others, empty = (tmp_path / f"{name}.yaml" for name in ("shared", "others", "empty"))
+    shared.write_text("/**:\n  ros__parameters:\n    robot_description: x\n    latch: true\n")
+    empty.write_text("")
+    others.write_text("camera:\n  ros__parameters:\n    latch: true\n")
+
+    def starts(world: World, file: Path, says: str) -> None:
+        process = world.run_node("envelope_monitor", {}, "--params-file", str(file))
+        process.says("not configured: parameter 'model' is empty")
+        assert process.running and says in process.output
+        process.kill()
+
+    with open_world(tmp_path) as world:
+        starts(world, shared, "parameter robot_description is ignored")
+        for file in (others, empty):
+            starts(
+                world, file, f"{file.name}: nothing in it is for this node; name the section envelope_monitor or /**"
+            )
+
+
+def test_every_console_script_takes_its_arguments_or_those_of_the_process(capsys: pytest.CaptureFixture[str]) -> None:
+    for node in NODES:
+        assert importlib.import_module(f"uncertain_lti_ros.{node}").main(["--help"]) == 0
+        assert capsys.readouterr().out.startswith(f"usage: {node} ")
