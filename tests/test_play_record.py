@@ -300,6 +300,18 @@ def test_the_clock_goes_before_each_message(world: World, tmp_path: Path) -> Non
     assert all(a < b for a, b in zip(clock.times, heard.times, strict=True))
 
 
+def test_another_speed_without_stamps_is_warned_of(world: World, tmp_path: Path) -> None:
+    """At 100 times its speed, a machine without header stamps seems to take steps a hundred times as short."""
+    stamped = Topic("/stamped", "geometry_msgs/msg/TwistStamped")
+    topics = [Topic("/x"), stamped]
+    bag = write(topics, [Message("/x", START_NS, float64(1.0))]).save(tmp_path / "in.mcap")
+    quick = [bag, "--wait", "0.1", "--rate", "100"]
+    said = world.command("play", *quick).succeed()
+    assert "no header stamps: /x; who goes by time of receipt sees steps 100 times as fast" in said
+    for arguments in ([*quick, "--clock"], quick[:3], [*quick, "--topics", "/stamped"]):
+        assert "no header stamps" not in world.command("play", *arguments).succeed()
+
+
 def test_what_cannot_be_played_is_said(world: World, tmp_path: Path) -> None:
     other = "float64 data\nfloat64 more\n"
     topics = [

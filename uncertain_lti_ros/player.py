@@ -82,6 +82,12 @@ def run(args: argparse.Namespace) -> int:
         clock = life.node.create_publisher(Clock, CLOCK, QoSProfile(depth=_DEPTH)) if args.clock else None
         for warning in bag.warnings:
             say(warning)
+        unstamped = [topic for topic in played if "header" not in live_fields(bag.topics[topic].type)]
+        if unstamped and not args.clock and args.rate not in (None, 1.0):
+            say(
+                f"no header stamps: {', '.join(unstamped)}; who goes by time of receipt sees steps {args.rate:g} times "
+                f"as fast; play with --clock, and start the listeners with use_sim_time"
+            )
         _wait(life, played, args.wait)
         messages = (m for m in bag.raw_messages(list(played)) if m.channel.counted)
         began = time.monotonic()
