@@ -30,13 +30,14 @@ def run(tmp_path):
     for tool in "bash cat cksum dirname env grep rm sed tail uname".split():
         (bin / tool).symlink_to(shutil.which(tool))
 
-    def call(*arguments: str, programs: dict[str, str] | None = None, **environment: str):
+    def call(*arguments: str, programs: dict[str, str] | None = None, cwd: Path | None = None, **environment: str):
         for name, text in (programs or {}).items():
             (bin / name).write_text(f"#!{bin}/bash\n{text}\n")
             (bin / name).chmod(0o755)
         return subprocess.run(
             [checkout / "run", *arguments],
             env={"PATH": str(bin), "HOME": str(tmp_path), "PIP_CONFIG_FILE": os.devnull, **environment},
+            cwd=cwd,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -114,3 +115,55 @@ def test_no_network(run):
     nowhere = {"PIP_INDEX_URL": "http://127.0.0.1:9", "PIP_RETRIES": "1"}
     sentence = refusal(run("setup", programs={"python3": this_python()}, **nowhere))
     assert "no package index can be reached" in sentence and "connect this machine" in sentence
+
+
+PROGRAMS = ("uncertain-lti", "envelope_monitor", "plant", "turbofan")
+_ENVIRONMENT = r"""
+import sys
+from pathlib import Path
+
+def write(path, text):
+    path.write_text(f"#!{bash}\n{{text}}\n")
+    path.chmod(0o755)
+
+bin = Path(sys.argv[-1]) / "bin"
+bin.mkdir(parents=True)
+write(bin / "python", '[[ $2 == pip ]] || exec "{python}" "$@"')
+for name in {programs}:
+    write(bin / name, 'printf "%s\\n" "${{0##*/}}" "$PWD" "$@"')
+"""
+
+
+@pytest.fixture
+def elsewhere(run, tmp_path):
+    """Call `./run` from another folder; its environment has programs that print name, folder and arguments."""
+    bash, python = tmp_path / "bin" / "bash", Path(sys.executable).resolve()
+    maker = tmp_path / "make_environment.py"
+    maker.write_text(_ENVIRONMENT.format(bash=bash, python=python, programs=PROGRAMS))
+    python3 = f'[[ "$1 $2" == "-m venv" ]] && exec "{python}" "{maker}" "$@"\n{this_python()}'
+    folder = tmp_path / "some where"
+    folder.mkdir()
+
+    def call(*arguments: str):
+        done = run(*arguments, programs={"python3": python3}, cwd=folder)
+        assert done.returncode == 0, done
+        lines = done.stdout.strip().splitlines()
+        return lines[next(i for i, line in enumerate(lines + [""]) if line and not line.startswith("./run:")) :]
+
+    return call
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_programs_run_in_the_folder_of_the_caller(elsewhere, tmp_path, program):
+    arguments = ["fit", "a bag.mcap", "--output", "../x.model.json"]
+    for _ in range(2):  # the first time installs, the second does not
+        assert elsewhere(program, *arguments) == [program, str(tmp_path / "some where"), *arguments]
+
+
+def test_python_runs_in_the_folder_of_the_caller(elsewhere, tmp_path):
+    (tmp_path / "some where" / "mine.py").write_text("import os; print(os.getcwd())")
+    assert elsewhere("python", "mine.py") == [str(tmp_path / "some where")]
+
+
+def test_the_demo_writes_to_the_folder_of_the_caller(elsewhere, tmp_path):
+    assert elsewhere("demo", "--rate", "9") == ["uncertain-lti", str(tmp_path / "some where"), "demo", "--rate", "9"]
