@@ -144,8 +144,8 @@ def elsewhere(run, tmp_path):
     folder = tmp_path / "some where"
     folder.mkdir()
 
-    def call(*arguments: str):
-        done = run(*arguments, programs={"python3": python3}, cwd=folder)
+    def call(*arguments: str, **environment: str):
+        done = run(*arguments, programs={"python3": python3}, cwd=folder, **environment)
         assert done.returncode == 0, done
         lines = done.stdout.strip().splitlines()
         return lines[next(i for i, line in enumerate(lines + [""]) if line and not line.startswith("./run:")) :]
@@ -163,6 +163,15 @@ def test_programs_run_in_the_folder_of_the_caller(elsewhere, tmp_path, program):
 def test_python_runs_in_the_folder_of_the_caller(elsewhere, tmp_path):
     (tmp_path / "some where" / "mine.py").write_text("import os; print(os.getcwd())")
     assert elsewhere("python", "mine.py") == [str(tmp_path / "some where")]
+
+
+def test_programs_hear_this_machine_alone_unless_told_otherwise(elsewhere, tmp_path):
+    names = "ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    (tmp_path / "some where" / "mine.py").write_text(f"import os; print(*map(os.getenv, {names}))")
+    domain, reach = elsewhere("python", "mine.py")[0].split()
+    assert 1 <= int(domain) <= 100 and reach == "LOCALHOST"
+    robot = dict(zip(names, ("7", "SUBNET"), strict=True))
+    assert elsewhere("python", "mine.py", **robot) == ["7 SUBNET"]
 
 
 def test_the_demo_writes_to_the_folder_of_the_caller(elsewhere, tmp_path):
