@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import time
@@ -15,7 +16,7 @@ from bag_writer import JAZZY, Message, Topic, cdr, float64, header, ramp, write
 from rosbags.highlevel import AnyReader
 from rosbags.typesys.store import Typestore
 
-from uncertain_lti import Transient
+from uncertain_lti import Transient, cli
 from uncertain_lti.bag import Bag
 from uncertain_lti.message_types import define
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, leibov2006, transient
@@ -31,6 +32,7 @@ from ros_processes import World, open_world
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Empty, Float64, Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout, String
+from std_srvs.srv import Trigger
 
 from uncertain_lti_ros.messages import definition, live_fields, message_class
 
@@ -347,7 +349,69 @@ def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
     player = world.command("play", bag)
     heard.count(3)
     player.signal(signal.SIGINT)
-    assert "Traceback" not in player.succeed(5)
+    assert player.wait(5) == 130
+    assert re.fullmatch(r"\S+in.mcap: played \d+ messages of 1 topics in \S+ s, then interrupted\n", player.output)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("more", [[], ["--lockstep", "nobody"]], ids=["subscribers", "the node"])
+def test_a_signal_ends_waiting_at_once(world: World, tmp_path: Path, more: list[str], number: int, status: int) -> None:
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 10**8))).save(tmp_path / "in.mcap")
+    until = time.monotonic() + 20
+    player = world.command("play", bag, "--wait", "60", *more)
+    while not any("player" in name for name in world.node.get_node_names()):
+        assert time.monotonic() < until and player.running, player.output
+        time.sleep(0.05)
+    time.sleep(0.3)
+    player.signal(number)
+    began = time.monotonic()
+    assert player.wait(5) == status and time.monotonic() - began < 2
+    assert player.output == f"{bag}: interrupted before a message was played\n"
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "fast", ""])
+def test_speeds_and_times_that_are_none_are_refused_in_words(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, says in (
+        (["play", "in.mcap", f"--rate={text}"], f"argument --rate: {text} is not a speed; give a number above 0"),
+        (["demo", f"--rate={text}"], f"argument --rate: {text} is not a speed; give a number above 0"),
+        (["play", "in.mcap", f"--wait={text}"], f"argument --wait: {text} is not a time; give seconds, 0 or more"),
+    ):
+        if text == "0" and "--wait=0" in arguments:
+            continue
+        with pytest.raises(SystemExit) as ended:
+            cli.main(arguments)
+        assert ended.value.code == 2 and says in capsys.readouterr().err
+
+
+def test_lockstep_asks_again_where_an_answer_is_lost(world: World, tmp_path: Path) -> None:
+    """Of each five answers of the status service the second leaves the node only after the next one."""
+    received, answers, held = [0], [0], list[Any]()
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = json.dumps({"received": {"/x": received[0]}, "use_sim_time": True})
+        return response
+
+    def count(_: Float64) -> None:
+        received[0] += 1
+
+    service = world.node.create_service(Trigger, "/listener/status", answer)
+    sends = service.send_response
+
+    def send(response: Any, header: Any) -> None:
+        answers[0] += 1
+        if answers[0] % 5 == 2:
+            held.append((response, header))
+            return
+        sends(response, header)
+        while held:
+            sends(*held.pop())
+
+    service.send_response = send
+    world.node.create_subscription(Float64, "/x", count, 100)
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 2 * 10**8))).save(tmp_path / "in.mcap")
+    player = world.command("play", bag, "--lockstep", "listener")
+    assert "played 5 messages of 1 topics" in player.succeed(60)
+    assert received[0] == 5 and answers[0] > 5 and not held
 
 
 def test_quiet_says_nothing_but_errors(world: World, tmp_path: Path) -> None:

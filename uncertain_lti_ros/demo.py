@@ -25,7 +25,7 @@ from uncertain_lti.plots import budget_figure, envelope_figure, matrices_figure,
 from uncertain_lti.reading import read_for_model
 from uncertain_lti.report import check_data, check_text, fit_text
 from uncertain_lti_ros.process import Life, living
-from uncertain_lti_ros.terminal import say
+from uncertain_lti_ros.terminal import say, speed
 
 FIT = tuple(f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels"))
 CHECK = "turbofan_fan_damage.mcap"
@@ -37,7 +37,7 @@ _PATIENCE = 20.0  # s for another process to do its next step
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `uncertain-lti demo`."""
     parser.add_argument("--output", metavar="FOLDER", default="demo-output", help="where model and figure are written")
-    parser.add_argument("--rate", type=float, default=4.0, metavar="R", help="speed of the player (default 4)")
+    parser.add_argument("--rate", type=speed, default=4.0, metavar="R", help="speed of the player (default 4)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     offline = EnvelopeMonitor(model).check(read_for_model(bags / CHECK, model))
     with living(lambda: Node("uncertain_lti_demo")) as life:
         live = _watch(life, model_file, bags / CHECK, args.rate, offline.transient.t_ns)
+        if not life.alive:
+            raise KeyboardInterrupt
 
     print("\n3. The same recording checked offline")
     print(check_text(check_data(model, offline, samples=False)))
@@ -193,6 +195,8 @@ def _process(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 def _until(life: Life, done: Any, otherwise: str) -> None:
     limit = time.monotonic() + _PATIENCE
     while not done():
-        if not life.alive or time.monotonic() > limit:
+        if not life.alive:
+            raise KeyboardInterrupt
+        if time.monotonic() > limit:
             raise UncertainLTIError(f"{otherwise} within {_PATIENCE:g} s; look at its messages above")
         life.spin_once(0.1)

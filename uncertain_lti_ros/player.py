@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -24,22 +26,24 @@ from uncertain_lti.errors import BagError, SignalError, UncertainLTIError
 from uncertain_lti.signals import TypeFields
 from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.process import Life, living
-from uncertain_lti_ros.terminal import Progress, hush, say, seconds, tell
+from uncertain_lti_ros.terminal import Progress, hush, say, seconds, speed, tell
 
 CLOCK = "/clock"
 _DEPTH = 1000
 _CROWD = 2000.0
 """Messages a second up to which a subscriber keeps up; faster only where the recording itself is faster."""
+_SIGNALLED = 128  # exit status of a process that a signal ended: this and its number
 _SETTLE = 0.5  # s without a new subscriber
 _ACKNOWLEDGED = 10.0  # s to wait at the end until everything sent has been received
 _LOCKSTEP_TIMEOUT = 10.0  # s
+_ASK_AGAIN = 2.0  # s; Fast DDS loses the answer to a request that came before the server found the reader of answers
 _REPEAT = 0.1  # s after which /clock, which is best effort, is sent again
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `uncertain-lti play`."""
     parser.add_argument("bag", metavar="BAG", help="recording (MCAP file, or folder of a split one)")
-    parser.add_argument("--rate", type=_rate, metavar="R", help="speed, times real time (default 1)")
+    parser.add_argument("--rate", type=speed, metavar="R", help="speed, times real time (default 1)")
     parser.add_argument("--clock", action="store_true", help="publish /clock (log time) before each message")
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="play these only (default: all)")
     parser.add_argument(
@@ -64,7 +68,7 @@ class _Played:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play to the end, or until SIGINT or SIGTERM.
+    """Play to the end (0), or until SIGINT (130) or SIGTERM (143).
 
     Raises
     ------
@@ -96,15 +100,14 @@ def run(args: argparse.Namespace) -> int:
         else:
             _paced(life, played, clock, args.rate or 1.0, messages, _crowd(bag, played))
         took = time.monotonic() - began
-        missed = [
-            p.topic
-            for p in played.values()
-            if life.alive and not p.publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED))
-        ]
-        if missed:
+        if missed := _unconfirmed(life, played):
             say(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     sent = sum(p.sent for p in played.values())
-    tell(f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s")
+    ended = f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s"
+    if life.signal is not None:
+        say(f"{ended}, then interrupted" if sent else f"{bag.path}: interrupted before a message was played")
+        return _SIGNALLED + life.signal
+    tell(ended)
     return 0
 
 
@@ -188,6 +191,8 @@ def _wait(life: Life, played: dict[str, _Played], limit: float) -> None:
         if now - began > limit:
             break
         life.spin_once(0.05)
+    if not life.alive:
+        return
     unmet = [t for t in played if wanted[t] > counts[t]]
     if not any(wanted.values()):
         say(f"nobody subscribes to {', '.join(played)} after {limit:g} s; playing all the same")
@@ -211,7 +216,7 @@ def _paced(
         while life.alive and (rest := at - time.monotonic()) > 0:
             time.sleep(min(rest, 0.1))
         if not life.alive:
-            return
+            break
         last = time.monotonic()
         behind = max(behind, last - due)
         if clock is not None:
@@ -220,8 +225,17 @@ def _paced(
         sent += 1
         progress.show(f"{sent} of {total} messages")
     progress.clear()
-    if behind > 1.0:
+    if behind > 1.0 and life.alive:
         say(f"fell behind the asked rate by up to {behind:.1f} s, to keep messages at least {1e3 / crowd:.2g} ms apart")
+
+
+def _unconfirmed(life: Life, played: dict[str, _Played]) -> list[str]:
+    """Topics with a subscriber that does not confirm all messages in time; none where a signal came first."""
+    end = time.monotonic() + _ACKNOWLEDGED
+    waiting = list(played.values())
+    while life.alive and waiting and time.monotonic() < end:
+        waiting = [p for p in waiting if not p.publisher.wait_for_all_acked(Duration(seconds=_REPEAT))]
+    return [p.topic for p in waiting] if life.alive else []
 
 
 def _send(played: dict[str, _Played], message: RawMessage) -> None:
@@ -250,7 +264,7 @@ def _lockstep(
         if clock is not None:
             follower.reach(clock, message.log_time_ns)
         if not life.alive:
-            return
+            break
         topic = played[message.topic].publisher.topic_name
         before = follower.received(topic)
         _send(played, message)
@@ -304,17 +318,18 @@ class _Follower:
             )
 
     def _ask(self) -> dict[str, Any]:
-        future = self._client.call_async(Trigger.Request())
-        began = time.monotonic()
-        while self._life.alive and not future.done():
+        """The status of from now on; asked for again where no answer comes, which changes nothing."""
+        began, asked = time.monotonic(), -math.inf
+        self.status = {}
+        futures: list[Future] = []
+        while self._life.alive and not any(future.done() for future in futures):
+            if time.monotonic() - asked >= _ASK_AGAIN:
+                asked = time.monotonic()
+                futures.append(self._client.call_async(Trigger.Request()))
             self._life.spin_once()
             self._give_up(began, "a request for its status")
-        self.status = json.loads(future.result().message) if future.done() else {}
+        for future in futures:
+            if future.done():
+                self.status = json.loads(future.result().message)
+            self._client.remove_pending_request(future)
         return self.status
-
-
-def _rate(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise ValueError(text)
-    return value

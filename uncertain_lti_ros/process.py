@@ -53,6 +53,11 @@ class Life:
         """No signal has come and nobody has shut rclpy down."""
         return not self._stop and rclpy.ok()
 
+    @property
+    def signal(self) -> int | None:
+        """The first signal that came; None while none has."""
+        return self._stop[0] if self._stop else None
+
     def spin_once(self, seconds: float = _PATIENCE) -> None:
         """Wait for work at most this long, and do what is there."""
         self.executor.spin_once(timeout_sec=min(seconds, _PATIENCE))

@@ -1,5 +1,7 @@
 """What `play` and `record` share at the command line: a progress line, remarks, numbers."""
 
+import argparse
+import math
 import sys
 import time
 
@@ -26,10 +28,25 @@ def tell(text: str) -> None:
 
 def seconds(text: str) -> float:
     """Argument that is a time: a finite number, 0 or more."""
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise ValueError(text)
+    value = _number(text)
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a time; give seconds, 0 or more")
     return value
+
+
+def speed(text: str) -> float:
+    """Argument that is a speed, times real time: a finite number above 0."""
+    value = _number(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a speed; give a number above 0, such as 1 or 0.5")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 class Progress:
