@@ -189,6 +189,7 @@ class _Loader:
     def __init__(self, contents: Contents, stream: BinaryIO) -> None:
         self.contents, self.stream = contents, stream
         self.zstd = zstandard.ZstdDecompressor()
+        self.lz4 = lz4.frame.create_decompression_context()
         self.data = bytearray()
         self.packed: list[bytearray] = []
 
@@ -282,11 +283,13 @@ class _Loader:
                 while filled < block.length and (more := reader.readinto(target[filled:])):
                     filled += more
                 return filled == block.length and (not block.unchecked or not reader.read(1))
-            frame = lz4.frame.LZ4FrameDecompressor()
-            records = frame.decompress(data, max_length=block.length + 1)
+            records, _, ended = lz4.frame.decompress_chunk(self.lz4, data, max_length=block.length + 1)
+            if not ended:  # the next block is not its continuation
+                lz4.frame.reset_decompression_context(self.lz4)
             target[: len(records)] = records  # ValueError where there is more than room
             return len(records) == block.length
         except (zstandard.ZstdError, RuntimeError, EOFError, ValueError, MemoryError):
+            lz4.frame.reset_decompression_context(self.lz4)
             return False
 
     def _as_stated(self, block: Block, packed: memoryview, offset: int, records: memoryview) -> bool:

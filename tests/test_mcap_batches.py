@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 import threading
+import zlib
 from pathlib import Path
 
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 from bag_writer import Layout, float64
@@ -60,6 +64,57 @@ def test_whole_files(tmp_path: Path, compression: str, chunk_size: int) -> None:
     path = recording(tmp_path, compression, chunk_size)
     found = outcome(path, by_message=False)
     assert not isinstance(found, str) and found == outcome(path, by_message=True)
+
+
+def test_lz4_frames_without_their_end_mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each gives all of its records, and the next one is not taken for its continuation."""
+    whole = outcome(recording(tmp_path, "lz4", 5000), by_message=False)
+    compress = lz4.frame.compress
+    marks = []
+
+    def unended(data: bytes) -> bytes:
+        packed = compress(data)
+        marks.append(packed[-4:])
+        return bytes(packed[:-4])
+
+    monkeypatch.setattr(lz4.frame, "compress", unended)
+    path = recording(tmp_path, "lz4", 5000)
+    assert len(marks) > 5 and set(marks) == {bytes(4)}
+    assert outcome(path, by_message=False) == outcome(path, by_message=True) == whole
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+def test_the_same_without_isal(tmp_path: Path, compression: str) -> None:
+    """Whole and with a bit flipped, which a checksum tells."""
+    path = recording(tmp_path, compression, 5000)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    code = f"""
+import sys
+sys.modules["isal"] = None
+sys.path[:0] = {sys.path!r}
+from pathlib import Path
+from test_mcap_batches import outcome
+from uncertain_lti.mcap_records import crc32
+assert crc32.__module__ == "zlib", crc32.__module__
+print([outcome(Path(path), False) for path in {[str(path), str(damaged)]!r}])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    here = [outcome(path, by_message=False), outcome(damaged, by_message=False)]
+    assert here[0] != here[1] and done.stdout == f"{here}\n"
+
+
+def test_checksums_are_those_of_zlib() -> None:
+    isal = pytest.importorskip("isal.isal_zlib", reason="isal is not installed: checksums are by zlib")
+    dice = random.Random(0)
+    for size in [*range(300), *(dice.randrange(1 << 20) for _ in range(50))]:
+        data = bytearray(dice.randbytes(size + 16))
+        at, begin = dice.randrange(16), dice.choice([0, 1, 2**32 - 1, dice.getrandbits(32)])
+        for piece in (memoryview(data)[at : at + size], bytes(data[at : at + size])):
+            assert isal.crc32(piece, begin) == zlib.crc32(piece, begin)
 
 
 @pytest.mark.parametrize("chunk_size", [300, 5000])
