@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from uncertain_lti.errors import BagError
+from uncertain_lti.files import kind_of
 
 MAGIC = b"\x89MCAP0\r\n"
 _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.mcap")
@@ -116,6 +117,8 @@ def not_mcap(path: Path, head: bytes) -> BagError:
         return BagError(f"{path}: MCAP of another version ({head[5:6]!r}) or damaged in its first bytes; copy it anew")
     if not head.strip(b"\0"):
         return BagError(f"{path}: begins with zeros only, as after a power cut; there is no recording in it")
+    if known := kind_of(path):
+        return BagError(f"{path}: this is {known}, and an MCAP recording is wanted here; are the arguments swapped?")
     kind = "a text file" if all(byte >= 32 or byte in b"\t\r\n\f" for byte in head[:512]) else "not an MCAP file"
     return BagError(f"{path}: {kind}, while an MCAP recording is wanted; check the path")
 

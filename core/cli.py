@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import os
+import re
 import shlex
 import signal
 import sys
@@ -14,10 +15,10 @@ import time
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from uncertain_lti import __version__
-from uncertain_lti.errors import BagError, FitError, SignalError, UncertainLTIError
+from uncertain_lti.errors import BagError, FitError, ModelError, SignalError, UncertainLTIError
 from uncertain_lti.progress import Progress
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ _EXTRAS = {
 
 def _parser(chosen: str) -> argparse.ArgumentParser:
     """Arguments of every command; those of the ROS commands, which import rclpy, only of the chosen one."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="uncertain-lti",
         description="Fit an uncertain linear model to recorded transients, and tell when a machine leaves it.",
         epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 130 interrupted by Ctrl-C.",
@@ -230,7 +231,47 @@ def _ros(module: str) -> Any:
 
 def _budget(text: str) -> float:
     """A whole number, or a share below 1."""
-    return int(text) if text.isdigit() else float(text)
+    try:
+        return int(text) if text.isdigit() else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor a share such as 0.001") from None
+
+
+def _model_target(wish: str) -> Path:
+    """Where a model goes; an older model gives way, and nothing else.
+
+    Raises
+    ------
+    BagError
+        Something else is there, or its folder is not.
+    """
+    from uncertain_lti.files import may_replace
+
+    path = Path(wish)
+    if not path.parent.is_dir():
+        raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
+    if path.is_dir():
+        raise BagError(f"{path}: is a folder; name a file in it, for example {path / 'machine.model.json'}")
+    if not may_replace(path, holds=b'"uncertain-lti/'):
+        raise BagError(f"{path}: is there already and is no model file; choose another name, or move it away")
+    return path
+
+
+class _Parser(argparse.ArgumentParser):
+    """Names the nearest command, option or choice in place of a misspelt one."""
+
+    def error(self, message: str) -> NoReturn:
+        from uncertain_lti.wording import meant
+
+        if match := re.search(r"invalid choice: '?(.*?)'? \(choose from (.*)\)", message):
+            message += meant(match[1], re.findall(r"[\w-]+", match[2]))
+        elif message.startswith("unrecognized arguments: "):
+            commands: list[dict[str, argparse.ArgumentParser]] = [
+                a.choices for a in self._actions if isinstance(a.choices, dict)
+            ]
+            known = {o for group in commands for p in group.values() for o in p._option_string_actions}
+            message += meant(message.split(": ")[1].split()[0].partition("=")[0], known)
+        super().error(message)
 
 
 def _topics(options: argparse.Namespace) -> int:
@@ -309,9 +350,9 @@ def _fit(options: argparse.Namespace) -> int:
     from uncertain_lti.report import fit_text, left_out_text, next_text, recording_text
     from uncertain_lti.validation import leave_out_cheaply
 
-    output = Path(options.output)
-    if not output.parent.is_dir():
-        raise BagError(f"{output}: the folder {output.parent} is not there; make it first")
+    output = _model_target(options.output)
+    if options.workers is not None and options.workers < 1:
+        raise FitError(f"--workers is {options.workers}; give 1 or more")
     if options.cache or options.scheduler or options.workers:
         return _fit_archive(options, output)
     transients = read_transients(options.bags, options.signals, options.progress.iterate("reading"), processes=None)
@@ -498,8 +539,8 @@ def _validate(options: argparse.Namespace) -> int:
     bags = options.bags or [s["file"] for s in sources]
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
-    if options.output is not None and not Path(options.output).parent.is_dir():
-        raise BagError(f"{options.output}: the folder {Path(options.output).parent} is not there; make it first")
+    if options.output is not None:
+        _model_target(options.output)
     transients = [read_for_model(bag, model, options.progress.iterate("reading")) for bag in group_recordings(bags)]
     for transient in transients:
         _say(options, transient.notes)
@@ -548,8 +589,14 @@ def _named(model: str) -> UncertainLTI:
     """The model of a file, or the paper's by its name."""
     from uncertain_lti import UncertainLTI
     from uncertain_lti.plants.leibov import leibov2006
+    from uncertain_lti.wording import meant
 
-    return leibov2006() if model == "leibov2006" and not os.path.exists(model) else UncertainLTI.load(model)
+    if not os.path.exists(model):
+        if model == "leibov2006":
+            return leibov2006()
+        if near := meant(model, ["leibov2006"]):
+            raise ModelError(f"{model}: there is no such model file{near}; write one with `uncertain-lti fit`")
+    return UncertainLTI.load(model)
 
 
 def _info(options: argparse.Namespace) -> int:

@@ -43,10 +43,31 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise
 
 
-def is_mcap(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins as an MCAP recording does; False where it cannot be read."""
+def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
+    """Whether nothing is lost at this path when a file is written there that has such words in its first 500 bytes.
+
+    So it is where there is nothing yet, and where an older file of the same kind stands; of a folder it is not asked.
+    """
     try:
         with open(path, "rb") as stream:
-            return stream.read(5) == b"\x89MCAP"
+            head = stream.read(500)
     except OSError:
-        return False
+        return True
+    return not head or holds in head
+
+
+def kind_of(path: str | os.PathLike[str]) -> str:
+    """What a file is by its first bytes, with an article: a recording, a model, signals; "" where that is not known."""
+    if os.path.isdir(path):
+        return "a folder"
+    try:
+        with open(path, "rb") as stream:
+            head = stream.read(4000)
+    except OSError:
+        return ""
+    if head.startswith(b"\x89MCAP"):
+        return "an MCAP recording"
+    if head.lstrip().startswith(b"{") and b'"uncertain-lti/' in head:
+        return "a model file"
+    lines = head.splitlines()
+    return "a signals file" if any(line.startswith((b"states:", b"controls:")) for line in lines) else ""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.bag import Bag
 from uncertain_lti.errors import BagError
+from uncertain_lti.files import may_replace
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.report import check_data, number
@@ -108,6 +109,8 @@ def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequ
     for other in (Path(model_file), *(part for bag in bags for part in bag.parts)):
         if path.exists() and other.exists() and path.samefile(other):
             raise BagError(f"{path}: is what the report is about; choose another name")
+    if not may_replace(path, holds=b"<html"):
+        raise BagError(f"{path}: is there already and is no page; choose another name, or move it away")
     return path
 
 

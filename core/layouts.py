@@ -12,7 +12,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from uncertain_lti.errors import ModelError
-from uncertain_lti.files import whole_file
+from uncertain_lti.files import may_replace, whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.signals import Signal
 from uncertain_lti.verdict_messages import NODE
@@ -170,6 +170,9 @@ def write_layouts(
         raise ModelError("no layout is asked for; give --foxglove FILE.json, --plotjuggler FILE.xml or both")
     base = NODE if base is None else f"/{base.strip('/')}"
     written = []
+    for path, words in ((foxglove, b'"configById"'), (plotjuggler, b"<root")):
+        if path is not None and not may_replace(path, holds=words):
+            raise ModelError(f"{path}: is there already and is no such layout; choose another name, or move it away")
     for path, make in wanted:
         if path is not None:
             try:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.errors import ModelError, SignalError
-from uncertain_lti.files import is_mcap, whole_file
+from uncertain_lti.files import kind_of, whole_file
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.signals import Signal, SignalMap
 from uncertain_lti.transient import Transient
@@ -489,10 +489,12 @@ class UncertainLTI:
             The file is missing, is not JSON, has an unknown format, wrong shapes, numbers that are not finite,
             negative half-widths or scales that are not positive; names file and field.
         """
-        if is_mcap(path):
-            raise ModelError(
-                f"{path}: this is an MCAP recording, and a model file is wanted here; are the arguments swapped?"
-            )
+        if (kind := kind_of(path)) and kind != "a model file":
+            cure = {
+                "a folder": "name the file in it",
+                "a signals file": "write a model with `uncertain-lti fit`",
+            }.get(kind, "are the arguments swapped?")
+            raise ModelError(f"{path}: this is {kind}, and a model file is wanted here; {cure}")
         try:
             if os.path.getsize(path) > MAX_FILE_BYTES:
                 raise ModelError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, so not a model file; check the path")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 from array import array
@@ -24,6 +23,7 @@ from uncertain_lti.sampler import Sampler, Status, resolve
 from uncertain_lti.sampler_arrays import Decisions, Samples, decided, sample_arrays
 from uncertain_lti.signals import FieldPath, SignalMap, UncarriedTopicError
 from uncertain_lti.transient import Transient
+from uncertain_lti.wording import meant
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -109,7 +109,8 @@ def _refuse_absent_names(
             if missing := path.missing_name(first):
                 wanted, there = missing
                 raise SignalError(
-                    f"field '{path.text}' of {name} in {bag.path}: there is no '{wanted}' in the message's names; "
+                    f"field '{path.text}' of {name} in {bag.path}: there is no '{wanted}' in the message's names"
+                    f"{meant(wanted, there)}; "
                     f"names there: {', '.join(there) or 'none'}"
                 )
 
@@ -349,9 +350,8 @@ def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.Pat
 
 def no_topic(bag: Bag, topic: str) -> str:
     """The sentence for a topic that a recording lacks, with the nearest names and all of them."""
-    near = difflib.get_close_matches(topic, sorted(bag.topics), n=3, cutoff=0.75)
-    meant = f" (is {' or '.join(near)} meant?)" if near else ""
-    return f"{bag.path}: there is no topic {topic}{meant}; topics there: {', '.join(sorted(bag.topics)) or 'none'}"
+    there = ", ".join(sorted(bag.topics)) or "none"
+    return f"{bag.path}: there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
 
 
 def _types(bags: Sequence[Bag], signals: SignalMap) -> Mapping[str, str]:

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple
 
 from uncertain_lti.errors import SignalError
-from uncertain_lti.files import is_mcap
+from uncertain_lti.files import kind_of
+from uncertain_lti.wording import meant
 
 LONGEST_DELAY = 1_000_000
 """Samples by which a control may be delayed at most."""
@@ -148,7 +149,8 @@ class FieldPath:
         while match := re.fullmatch(r"([A-Za-z_]\w*)\s*\((.*)\)", inner, re.DOTALL):
             if match[1] not in _FUNCTIONS:
                 raise SignalError(
-                    f"field '{text}': there is no function '{match[1]}'; there are {', '.join(_FUNCTIONS)}"
+                    f"field '{text}': there is no function '{match[1]}'{meant(match[1], _FUNCTIONS)}; "
+                    f"there are {', '.join(_FUNCTIONS)}"
                 )
             functions.append(match[1])
             inner = match[2].strip()
@@ -256,7 +258,7 @@ class FieldPath:
                 parent = type_fields(current.type_name)
                 if key not in parent:
                     raise SignalError(
-                        f"{here}: there is no '{key}' in {current.type_name}; fields there: "
+                        f"{here}: there is no '{key}' in {current.type_name}{meant(key, parent)}; fields there: "
                         f"{', '.join(parent) or 'none'}; numeric field paths of {topic}: "
                         f"{_some(numeric_paths(type_name, type_fields))}"
                     )
@@ -450,10 +452,8 @@ class SignalMap:
         """
         import yaml  # the live node reads signals from the model file and needs no YAML
 
-        if is_mcap(path):
-            raise SignalError(
-                f"{path}: this is an MCAP recording, and a signals file is wanted here; are the arguments swapped?"
-            )
+        if (kind := kind_of(path)) and kind != "a signals file":
+            raise SignalError(f"{path}: this is {kind}, and a signals file is wanted here; {_other(kind)}")
         try:
             with open(path, encoding="utf-8") as stream:
                 node = yaml.compose(stream, Loader=yaml.SafeLoader)
@@ -539,11 +539,24 @@ def _repeated_key(top: Any) -> Any:
 
 def _keys(data: Any, where: str, known: set[str] | None) -> dict[str, Any]:
     if not isinstance(data, dict):
-        raise SignalError(f"{where}: a mapping is wanted here, not {type(data).__name__}; see config/signals/")
+        raise SignalError(f"{where}: a mapping is wanted here, not {_kind(data)}; see config/signals/")
     for key in data:
         if known is not None and key not in known:
-            raise SignalError(f"{where}: unknown key {reprlib.repr(key)}; known are {', '.join(sorted(known))}")
+            raise SignalError(
+                f"{where}: unknown key {reprlib.repr(key)}{meant(key, known)}; known are {', '.join(sorted(known))}"
+            )
     return data
+
+
+def _kind(data: object) -> str:
+    """What something is in the words of YAML."""
+    names = {dict: "a mapping", list: "a list", str: "a text", bool: "a truth value", type(None): "nothing"}
+    return names.get(type(data), "a number" if isinstance(data, (int, float)) else type(data).__name__)
+
+
+def _other(kind: str) -> str:
+    """What to do about a file of another kind."""
+    return "name a file in it" if kind == "a folder" else "are the arguments swapped?"
 
 
 def _number(value: Any, where: str) -> float | None:
@@ -567,7 +580,7 @@ def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
     if data is None:
         return ()
     if not isinstance(data, list):
-        raise SignalError(f"{where}: a list is wanted here, not {type(data).__name__}; see config/signals/")
+        raise SignalError(f"{where}: a list is wanted here, not {_kind(data)}; see config/signals/")
     known = {f.name for f in fields(Signal)}
     signals = []
     for position, entry in enumerate(data):
@@ -575,6 +588,8 @@ def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
         entry = dict(_keys(entry, here, known))
         for key in ("name", "topic", "field"):
             if not isinstance(entry.get(key), str) or not (entry[key] or (key == "topic" and not need_topics)):
+                if entry.get(key) is None:
+                    raise SignalError(f"{here}: '{key}' is missing; every signal has a name, a topic and a field")
                 raise SignalError(f"{here}: '{key}' is {reprlib.repr(entry.get(key))}; write a text, in quotes")
         for key in ("steady", "scale"):
             if key in entry and entry[key] != "auto":

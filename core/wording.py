@@ -1,6 +1,9 @@
-"""Counted things in sentences."""
+"""Counted things, and names near to a misspelt one, in sentences."""
 
 from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
 
 
 def plural(count: object, word: str) -> str:
@@ -11,6 +14,13 @@ def plural(count: object, word: str) -> str:
 def times(count: int) -> str:
     """Once, or how many times."""
     return "once" if count == 1 else f"{count} times"
+
+
+def meant(word: object, known: Iterable[str]) -> str:
+    """(is X meant?), with the known names that are near to a word, or nothing."""
+    names = {name.lower(): name for name in sorted(known)}
+    near = difflib.get_close_matches(str(word).lower(), names, n=3, cutoff=0.7)
+    return f" (is {' or '.join(names[n] for n in near)} meant?)" if near else ""
 
 
 def _several(word: str) -> str:

@@ -152,7 +152,29 @@ def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
             fit_with("clock: /engine/state\n" + SIGNALS.replace("topic: /engine/state", "topic: /engine/stte")),
             "no topic /engine/stte (is /engine/state meant?)",
         ),
-        (["check", str(folder / "signals.yaml"), run], "is not JSON"),
+        (
+            ["check", str(folder / "signals.yaml"), run],
+            "this is a signals file, and a model file is wanted here; write a",
+        ),
+        (["check", str(text), run], "is not JSON"),
+        (["check", str(folder), run], "this is a folder, and a model file is wanted here; name the file in it"),
+        (["check", "leibov206", run], "(is leibov2006 meant?)"),
+        (
+            ["topics", signals],
+            "this is a signals file, and an MCAP recording is wanted here; are the arguments swapped?",
+        ),
+        (
+            ["fit", run, "--signals", str(folder), "--output", out],
+            "this is a folder, and a signals file is wanted here",
+        ),
+        (fit_with(SIGNALS.replace("position[fan_speed]", "positon[0]")), "(is position meant?)"),
+        (fit_with(SIGNALS.replace("position[fan_speed]", "position[fan_sped]")), "(is fan_speed meant?)"),
+        (fit_with(SIGNALS.replace("position[fan_speed]", "rol(position[0])")), "no function 'rol' (is roll meant?)"),
+        (fit_with(SIGNALS.replace("states:", "sates:")), "unknown key 'sates' (is states meant?)"),
+        (fit_with(SIGNALS.replace("name: core,", "")), "'name' is missing"),
+        (fit_with("states: /engine/state"), "a list is wanted here, not a text"),
+        (["fit", run, "--signals", signals, "--output", out, "--workers", "-1"], "--workers is -1; give 1 or more"),
+        (["fit", run, "--signals", signals, "--output", out, "--workers", "0"], "--workers is 0; give 1 or more"),
         (["check", run, out], "this is an MCAP recording, and a model file is wanted here; are the arguments swapped?"),
         (["fit", run, "--signals", run, "--output", out], "this is an MCAP recording, and a signals file is wanted"),
         (["check", out, run, "--margin", "-1"], "no such model file"),
@@ -160,6 +182,45 @@ def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
     for arguments, words in cases:
         assert words in refused(capsys, arguments), arguments
     assert not Path(out).exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["chek", "m", "b"], "(is check meant?)"),
+        (["fit", "b", "--signals", "s", "--output", "m", "--additive", "noies"], "(is noise meant?)"),
+        (["fit", "b", "--signals", "s", "--output", "m", "--discrad", "3"], "(is --discard meant?)"),
+        (["fit", "b", "--signals", "s", "--output", "m", "--discard", "abc"], "neither a whole number nor a share"),
+    ],
+)
+def test_misspelt_words_of_the_command_line_are_named(arguments, words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2 and words in capsys.readouterr().err
+
+
+def test_nothing_but_an_older_file_of_its_kind_is_written_over(folder, capsys):
+    """Not a recording, not a signals file, not a note: whatever the option was meant to be."""
+    run, signals, model = folder / "run.mcap", folder / "signals.yaml", folder / "kept.model.json"
+    assert main(["fit", str(run), "--signals", str(signals), "--output", str(model), "--additive", "noise", "-q"]) == 0
+    note = folder / "notes.txt"
+    note.write_text("mine")
+    for victim in (run, signals, note):
+        before = victim.read_bytes()
+        for arguments in (
+            ["fit", str(run), "--signals", str(signals), "--output", str(victim), "--additive", "noise"],
+            ["validate", str(model), "--output", str(victim)],
+            ["report", str(model), str(run), "--output", str(victim)],
+            ["layout", str(model), "--foxglove", str(victim)],
+            ["layout", str(model), "--plotjuggler", str(victim)],
+        ):
+            assert "choose another name" in refused(capsys, arguments), arguments
+            assert victim.read_bytes() == before
+    pages = [["report", str(model), str(run), "--output", str(folder / "page.html"), "-q"]]
+    pages += [["layout", str(model), f"--{kind}", str(folder / kind)] for kind in ("foxglove", "plotjuggler")]
+    pages += [["validate", str(model), "--output", str(model), "-q"]]
+    for arguments in [*pages, *pages]:
+        assert main(arguments) == 0, arguments
 
 
 def test_alarm_rule_that_cannot_be(folder, capsys):

@@ -490,7 +490,7 @@ def test_a_matrix_that_is_none_is_refused_by_name(name: str, value: Any, tmp_pat
         ("states", [], "'states' is empty"),
         ("states", {}, "states: a list is wanted here"),
         ("states.0", 5, r"states\[0\]: a mapping is wanted here"),
-        ("states.0.name", ..., r"states\[0\]: 'name' is None"),
+        ("states.0.name", ..., r"states\[0\]: 'name' is missing"),
         ("states.0.name", "b", "signal 'b' is listed twice"),
         ("states.0.colour", "red", r"states\[0\]: unknown key 'colour'"),
         ("states.0.scale", 0, "signal 'a': scale is 0"),
@@ -592,7 +592,7 @@ def test_nesting_ends_in_a_sentence(name: str, tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_or_far_too_large(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="there is no such model file; write one with `uncertain-lti fit`"):
         UncertainLTI.load(tmp_path / "none.model.json")
-    with pytest.raises(ModelError, match="cannot be read: Is a directory"):
+    with pytest.raises(ModelError, match="this is a folder, and a model file is wanted here"):
         UncertainLTI.load(tmp_path)
     with open(tmp_path / "large.model.json", "wb") as stream:
         stream.truncate(1 << 40)

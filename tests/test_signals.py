@@ -326,7 +326,7 @@ def test_any_text_is_a_path_or_a_signal_error(text: str) -> None:
         (
             "sensor_msgs/msg/JointState",
             "header.stam",
-            "no 'stam' in std_msgs/msg/Header; fields there: stamp, frame_id",
+            "no 'stam' in std_msgs/msg/Header .is stamp meant..; fields there: stamp, frame_id",
         ),
         ("sensor_msgs/msg/JointState", "roll(position[0])", "wants a quaternion with x, y, z, w"),
         ("sensor_msgs/msg/JointState", "norm(position[0])", "wants a vector with x, y, z or an array of numbers"),
@@ -418,7 +418,7 @@ def control(entry: str) -> str:
     [
         ("", "nothing is in it; list the states and controls, or let `uncertain-lti init`"),
         ("# only words", "nothing is in it"),
-        ("- a", "a mapping is wanted here, not list"),
+        ("- a", "a mapping is wanted here, not a list"),
         ("a: b: c", "is not YAML at line 1"),
         ("a: [", "is not YAML at line 1"),
         ("a: 2001-99-99", "is not YAML: month must be in 1..12"),
@@ -427,12 +427,12 @@ def control(entry: str) -> str:
         ("[" * 5000, "is not YAML"),
         ("a: \x07", "is not YAML"),
         (b"\xff\xfe\x00", "is not YAML"),
-        ("clocks: /a\n" + X, "unknown key 'clocks'; known are .*clock, controls, max_gap"),
+        ("clocks: /a\n" + X, "unknown key 'clocks' \\(is clock meant\\?\\); known are .*clock, controls, max_gap"),
         ("states: []", "'states' is empty; list at least one state"),
         ("controls: []", "'states' is empty"),
-        ("states: {name: x}", "states: a list is wanted here, not dict"),
-        ("states: [7]", "states\\[0\\]: a mapping is wanted here, not int"),
-        ("states: [{topic: /a, field: data}]", "states\\[0\\]: 'name' is None; write a text"),
+        ("states: {name: x}", "states: a list is wanted here, not a mapping"),
+        ("states: [7]", "states\\[0\\]: a mapping is wanted here, not a number"),
+        ("states: [{topic: /a, field: data}]", "states\\[0\\]: 'name' is missing"),
         ("states: [{name: on, topic: /a, field: data}]", "'name' is True; write a text, in quotes"),
         ("states: [{name: x, topic: 5, field: data}]", "'topic' is 5; write a text"),
         ("states: [{name: x, topic: '', field: data}]", "'topic' is ''; write a text"),
@@ -441,7 +441,10 @@ def control(entry: str) -> str:
         (X + "  - {name: x, topic: /b, field: data}", "signal 'x' is listed twice"),
         (control("name: x"), "key 'name' stands twice in one mapping, again at line 4; keep one"),
         (X + "max_gap: 1\nmax_gap: 2", "key 'max_gap' stands twice in one mapping, again at line 4"),
-        (state("scales: 2"), "states\\[0\\]: unknown key 'scales'; known are delay, field, max_hold, name"),
+        (
+            state("scales: 2"),
+            "states\\[0\\]: unknown key 'scales' \\(is scale meant\\?\\); known are delay, field, max_hold, name",
+        ),
         (state("scale: 0"), "signal 'x': scale is 0.0; it must be a positive number or auto"),
         (state("scale: -1"), "signal 'x': scale is -1.0"),
         (state("scale: .inf"), "signal 'x': scale is inf"),
@@ -464,7 +467,7 @@ def control(entry: str) -> str:
         (X + "topics: {/b: {time: log}}", "'topics' names /b, which carries no signal; signals come from /a"),
         (X + "topics: {/a: {time: wall}}", "topics: /a: time is 'wall'; write header or log"),
         (X + "topics: {/a: {}}", "topics: /a: time is None; write header or log"),
-        (X + "topics: {/a: log}", "topics: /a: a mapping is wanted here, not str"),
+        (X + "topics: {/a: log}", "topics: /a: a mapping is wanted here, not a text"),
         (X + "topics: {/a: {time: log, queue: 1}}", "topics: /a: unknown key 'queue'; known are time"),
         (X + "max_gap: 0", "max_gap is 0.0; it must be a positive number of seconds"),
         (X + "max_gap: .inf", "max_gap is inf; it must be a positive number of seconds"),
@@ -486,7 +489,7 @@ def test_a_wrong_signals_file_is_refused_in_one_sentence(text: str | bytes, word
 def test_a_signals_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(SignalError, match="there is no such signals file; check the path"):
         SignalMap.load(tmp_path / "none.yaml")
-    with pytest.raises(SignalError, match="cannot be read: Is a directory"):
+    with pytest.raises(SignalError, match="this is a folder, and a signals file is wanted here"):
         SignalMap.load(tmp_path)
 
 
