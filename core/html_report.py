@@ -132,6 +132,8 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
         what, look = "Violations, no alarm", "care"
     elif "quiet" in states:
         what, look = ("Nothing left its bounds", "good") if "unknown" not in states else ("Partly unknown", "care")
+        if look == "good" and (rely["answer"] == NO or any("proves nothing" in r["text"] for r in reasons)):
+            what, look = "Nothing left its bounds, which says little here", "care"
     else:
         what, look = "Unknown", "care"
     order = sorted(happened, key=lambda h: ["alarm", "unknown", "violations", "quiet"].index(h["state"]))
@@ -141,12 +143,13 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
     )
     if len(order) > 5:
         told += f'<li class="soft">and {len(order) - 5} more recordings <a href="#recordings">below</a></li>'
+    if rely["answer"] == NO and look == "bad":
+        told += '<li class="soft">The model is not to be relied on: the machine may be well, and the model wrong.</li>'
     rule = facts["rule"]
     return (
         f"<header><h1>{_text(name)}</h1>"
-        f'<p class="soft">{_text(_summary(facts))}. Alarm: {rule["violations"]} of the last '
-        f"{plural(rule['window'], 'verdict')} "
-        f"violated, margin {number(rule['margin'])}.</p>"
+        f'<p class="soft">{_text(_summary(facts))}. Alarm: {_rule(rule)}, margin '
+        f"{number(rule['margin'])}.</p>"
         '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a><a href="#trust">How far to trust it'
         '</a><a href="#origin">Where it comes from</a></nav></header>\n'
         f'<div class="cards"><section class="card {tone[rely["answer"]]}"><h2>May I rely on it?</h2>'
@@ -154,6 +157,12 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
         f'<section class="card {look}"><h2>What happened?</h2><p class="answer">{what}</p><ul>{told}</ul></section>'
         "</div>"
     )
+
+
+def _rule(rule: Mapping[str, Any]) -> str:
+    if rule["window"] == 1:
+        return "at every violation"
+    return f"{rule['violations']} of the last {rule['window']} verdicts violated"
 
 
 def _summary(facts: Mapping[str, Any]) -> str:

@@ -397,3 +397,12 @@ def test_remedies_go_by_what_was_found():
     assert "sample faster" in remedies(messages(run(dt=0.5, noise=1e-5)), "noise", "flow")
     few = remedies(messages(run(change=spiked((400,)))), "noise", "speed")
     assert "few samples" in few and "faster" not in few
+
+
+def test_many_signals_that_move_together_get_few_sentences():
+    rng = np.random.default_rng(5)
+    base = np.cumsum(rng.uniform(-1, 1, (1500, 1)), axis=0)
+    x = base @ rng.uniform(0.5, 1, (1, 30)) + 1e-3 * rng.standard_normal((1500, 30))
+    wide = Transient(np.arange(1500) * 0.01, x, np.zeros((1500, 0)), name="run")
+    found = [m for m in messages(wide) if WORDS["collinear"] in m]
+    assert len(found) == 4 and "29 combinations" in found[-1] and all(len(m) < 700 for m in found)

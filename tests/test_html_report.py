@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.cli import main
 from uncertain_lti.findings import APART, CARE, MOST_EPISODES, NO, YES, findings
-from uncertain_lti.html_report import MOST_DRAWN, html_report
+from uncertain_lti.html_report import MOST_DRAWN, _first_screen, html_report
 from uncertain_lti.report import beyond
 from uncertain_lti.validation import validate
 
@@ -302,3 +302,11 @@ def test_bad_places_are_one_sentence(engine, tmp_path, capsys):
         said = capsys.readouterr()
         assert why in said.err and said.err.count("\n") == 1 and not said.out
     assert (Path(bag).read_bytes(), Path(model).read_bytes()) == before
+
+
+def test_the_headline_is_no_better_than_the_model():
+    """Quiet by bounds that hold everything is no good news, and the page does not say so in green."""
+    good, wide = judged([0.15, 0.15], validated(9, 10, 0.9999)), judged([0.9, 0.9])
+    assert (good["rely"]["answer"], wide["rely"]["answer"]) == (YES, NO)
+    assert "Nothing left its bounds<" in _first_screen("m", good) and "at every violation" in _first_screen("m", good)
+    assert "Nothing left its bounds, which says little here<" in _first_screen("m", wide)

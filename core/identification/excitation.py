@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 COLLINEAR = 1e-3
 """Smallest eigenvalue of the regressors' correlation below which signals move nearly together (and above rank)."""
+MOST_GROUPS, MOST_NAMES = 3, 6
+"""Combinations of signals that are named, and names in a sentence."""
 DETERMINED = 4.0
 """A control's effect on some state must be so many standard errors, or it cannot be told from the noise."""
 FEW = 10
@@ -29,10 +31,17 @@ def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: f
     free = np.flatnonzero(moments.phi_scale[: problem.p] > 0)
     unit = 1.0 / moments.phi_scale[free]
     values, vectors = np.linalg.eigh(moments.centre[np.ix_(free, free)] * np.outer(unit, unit) / moments.count)
-    messages = []
+    messages: list[str] = []
+    groups = int(np.count_nonzero((values > limit) & (values < COLLINEAR)))
     for value, vector in zip(values, vectors.T, strict=True):
         if not limit < value < COLLINEAR:
             continue
+        if len(messages) == MOST_GROUPS:
+            messages.append(
+                f"{groups} combinations of signals nearly move together, of which the {MOST_GROUPS} nearest are named "
+                f"above: few of {len(free)} signals can be told apart; use fewer, or more controls of their own"
+            )
+            break
         part = [int(free[j]) for j in np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())]
         if len(part) < 2:
             continue
@@ -165,6 +174,8 @@ def successive(problem: Problem) -> NDArray[np.intp]:
 
 
 def quoted(names: Sequence[str]) -> str:
-    """'a', 'b' and 'c'."""
+    """'a', 'b' and 'c'; of many names the first ones, and how many others there are."""
     marked = [n if n.startswith("the ") else f"'{n}'" for n in names]
+    if len(marked) > MOST_NAMES + 1:
+        return f"{', '.join(marked[:MOST_NAMES])} and {len(marked) - MOST_NAMES} others"
     return marked[0] if len(marked) == 1 else ", ".join(marked[:-1]) + " and " + marked[-1]
