@@ -34,6 +34,7 @@ from uncertain_lti.signals import FieldPath
 from uncertain_lti.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.arming import Condition
+from uncertain_lti_ros.journal import Journal
 from uncertain_lti_ros.layout import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.outputs import sendable
@@ -41,7 +42,7 @@ from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living, spare_the_middleware
 from uncertain_lti_ros.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, MatchedSubscription, Wish
-from uncertain_lti_ros.watch import ERROR, STALE, Report, Rule, Watch, topic_types
+from uncertain_lti_ros.watch import ERROR, STALE, WARN, Report, Rule, Watch, topic_types
 
 NAME = "envelope_monitor"
 _SUMMARY = (
@@ -52,6 +53,7 @@ _SUMMARY = (
 VECTORS = ("flags", *JUDGED, "predicted_lower", "predicted_upper")
 """Topics below the node's name that carry one number per state as sensor_msgs/JointState."""
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
+_NOTE = 0.05  # s between two looks for what the log should say
 _OUTPUT_DEPTH = 1000
 _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 _LOGGED = 5.0  # s between two log entries on unexpected errors
@@ -104,6 +106,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._recent: Recent | None = None  # kept while snapshots can be asked for
         self._album: Album | None = None
         self._snapshot_due: float | None = None
+        self._journal = Journal(self._log)
+        self._noted = 0.0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         services = {
             "status": self._on_status, "reset": self._on_reset, "reload": self._on_reload, "snapshot": self._on_snapshot
@@ -198,6 +202,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.active:
             self._subscribe()
         self.get_logger().info(f"model swapped: {watch.model}")
+        self._journal.begin(watch, time.monotonic())
 
     # --- lifecycle ---
 
@@ -268,6 +273,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.watch.restart(time.monotonic())
         self._simulated = self._clock.ros_time_is_active
         self._subscribe()
+        self._journal.begin(self.watch, time.monotonic())
+        self.get_logger().info(f"active: listening to {', '.join(self.watch.types)}")
         self.active = True
         for output in self._outputs.values():
             output.look()
@@ -277,6 +284,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; no heartbeat comes from now on."""
         self._unsubscribe()
+        self.get_logger().info("no longer active: no verdicts are given")
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -366,8 +374,11 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = time.monotonic()
         alarms, alarm = watch.alarms, watch.alarm
         verdicts, opened = watch.take(topic, arrival, data, now)
-        if verdicts or opened:
-            self._publish(watch, verdicts, opened, now, watch.alarm != alarm)
+        turned = watch.alarm != alarm
+        if turned:
+            self._journal.turned(watch, verdicts, now)
+        if verdicts or opened or turned:
+            self._publish(watch, verdicts, opened, now, turned)
         if self._recent is not None:
             self._recent.add(Entry(now, arrival, topic, data, verdicts, watch.alarm))
             if watch.alarms > alarms and self._snapshot_due is None:
@@ -411,7 +422,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_tick(self) -> None:
         self._simulated = self._clock.ros_time_is_active
-        for task in (self._keep_beating, self._look_around, self._keep_reporting, self._keep_album):
+        for task in (self._keep_beating, self._look_around, self._keep_reporting, self._keep_album, self._keep_journal):
             try:
                 task()
             except Exception as error:
@@ -449,6 +460,22 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _keep_reporting(self) -> None:
         if time.monotonic() - self._reported >= self._real("diagnostics_period"):
             self._report()
+
+    def _keep_journal(self) -> None:
+        now = time.monotonic()
+        if self.watch is None or not self.active or now - self._noted < _NOTE:
+            return
+        self._noted = now
+        problems = [problem for subscription in self._inputs.values() for problem in subscription.problems]
+        problems += [self._enable_problem] if self._enable_problem else []
+        publishers = {topic: subscription.publishers for topic, subscription in self._inputs.items()}
+        self._journal.look(self.watch, now, self._real("state_timeout"), publishers, problems)
+
+    def _log(self, level: int, line: str) -> None:
+        if level == WARN:
+            self.get_logger().warning(line)
+        else:
+            self.get_logger().info(line)
 
     def _keep_album(self) -> None:
         if self._snapshot_due is not None and time.monotonic() >= self._snapshot_due:

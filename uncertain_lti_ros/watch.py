@@ -334,6 +334,24 @@ class Watch:
         """Messages that came after the sample they belonged to was closed."""
         return sum(count for name, count in self.sampler.counters.items() if name.startswith("late /"))
 
+    def heard(self, topic: str) -> float | None:
+        """When the last message of a topic came; None where none has."""
+        return self._heard.get(topic)
+
+    def held(self, topic: str) -> float:
+        """Seconds that what a topic said last may be used for; infinite where the model sets no limit."""
+        if topic not in self._readers:
+            return math.inf  # that of the enable condition
+        signals = self.model.signals
+        chosen = [signals.signals[i] for i in signals.on(topic)]
+        if any(signal in signals.states for signal in chosen):
+            return 0.0
+        return max(math.inf if signal.max_hold is None else signal.max_hold for signal in chosen)
+
+    def without_verdict(self, now: float) -> float:
+        """Seconds since the last verdict, or since the start."""
+        return now - max(self._judged, self._began)
+
     def silent_for(self, now: float) -> float:
         """Seconds since the last message of the clock topic."""
         return now - self._heard.get(self.sampler.clock, self._began)
@@ -349,7 +367,7 @@ class Watch:
         self._period.late = self.late
         self._period.unreadable = self.unreadable.total()
         self._period.future = self.future.total()
-        without = now - max(self._judged, self._began)
+        without = self.without_verdict(now)
         reports = [self._report_monitor(period, now, without, state_timeout, problems)]
         for i, name in enumerate(self.model.state_names):
             reports.append(self._report_state(i, name, period, without, state_timeout))
@@ -364,7 +382,7 @@ class Watch:
             complaints.append(f"outside the fitted domain in {period.outside} of {period.verdicts} verdicts")
         for status in (Status.GAP, Status.RESET, Status.MISSING):
             if period.statuses[status]:
-                complaints.append(f"{period.statuses[status]} samples without a verdict: {_WHY[status]}")
+                complaints.append(f"{period.statuses[status]} samples without a verdict: {WHY[status]}")
         dropped = sum(count for status, count in period.statuses.items() if status.dropped)
         if dropped:
             which = ", ".join(f"{status.value} {count}" for status, count in period.statuses.items() if status.dropped)
@@ -393,14 +411,15 @@ class Watch:
         elif period.alarm:
             level = ERROR
             if self.monitor.alarm or not self.latched:
-                complaints.insert(0, f"alarm: {self._rule_text()}")
+                complaints.insert(0, f"alarm: {self.rule_text()}")
         else:
             level = WARN if complaints else OK
         well = f"{period.verdicts} verdicts" if period.verdicts else f"last verdict {without:.1f} s ago"
         message = "; ".join([*(complaints or [f"{well}, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
 
-    def _rule_text(self) -> str:
+    def rule_text(self) -> str:
+        """The alarm rule in words."""
         rule = self.monitor.rule
         return f"at least {rule.violations} of {rule.window} verdicts violated"
 
@@ -461,7 +480,7 @@ class Watch:
         return counts
 
 
-_WHY = {
+WHY = {
     Status.GAP: "the step is longer than max_gap",
     Status.RESET: "time stepped back",
     Status.MISSING: "a signal is missing, stale or not finite",

@@ -1,0 +1,244 @@
+"""The node's log: what changes is said once, with its cause; what keeps changing does not flood it."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from uncertain_lti.model import Alarm
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from rclpy.serialization import deserialize_message
+from ros_processes import World, open_world
+from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, Plant, by_hand, joint_state, saved, vector
+
+from uncertain_lti_ros.journal import Journal
+from uncertain_lti_ros.layout import MessageReader
+from uncertain_lti_ros.messages import live_fields, message_class
+from uncertain_lti_ros.watch import OK, WARN, Rule, Watch, topic_types
+
+TIMEOUT = 1.0
+STEP = STEP_NS * 1e-9
+
+
+class Rig:
+    """A watch fed by hand, and what its journal says; time goes on by one step with every sample."""
+
+    def __init__(self, **rule: Any) -> None:
+        model = self.model = by_hand(alarm=Alarm(2, 5))
+        self.said: list[tuple[int, str]] = []
+        self.now, self.t_ns = 100.0, EPOCH_NS
+        self.x, self.u = np.zeros(model.n), np.full(model.m, 0.2)
+        self.publishers = {STATE: 1, CONTROL: 1}
+        self.problems: list[str] = []
+
+        def reader(type_name: str, paths: Any) -> MessageReader:
+            kind = message_class(type_name)
+            return MessageReader(type_name, paths, live_fields, lambda data: deserialize_message(data, kind))
+
+        types = topic_types(model, "by hand", live_fields)
+        self.watch = Watch(model, Rule(**rule), types, live_fields, reader, self.now)
+        self.journal = Journal(lambda level, line: self.said.append((level, line)))
+        self.journal.begin(self.watch, self.now)
+
+    def take(self, topic: str, data: bytes) -> None:
+        before = self.watch.alarm
+        verdicts, _ = self.watch.take(topic, time.time_ns(), data, self.now)
+        if self.watch.alarm != before:
+            self.journal.turned(self.watch, verdicts, self.now)
+
+    def send(self, samples: int, off: float = 0.0, control: bool = True, state: bool = True) -> None:
+        point = self.model.operating_point
+        for _ in range(samples):
+            if control:
+                self.take(CONTROL, vector(self.t_ns, *(point.u_s + point.U * self.u)))
+            if state:
+                self.take(STATE, joint_state(self.t_ns, point.recorded_x(self.x)))
+            centre, half = self.model.centre_and_half(self.x, self.u, STEP)
+            self.x = centre + off * half
+            self.wait(STEP)
+
+    def wait(self, seconds: float) -> None:
+        """Time goes by, and the journal looks as often as the node does."""
+        for _ in range(max(1, round(seconds / 0.1))):
+            self.now += min(seconds, 0.1)
+            self.t_ns += round(min(seconds, 0.1) * 1e9)
+            self.journal.look(self.watch, self.now, TIMEOUT, self.publishers, self.problems)
+
+    @property
+    def lines(self) -> list[str]:
+        """What was said since this was last asked for."""
+        said, self.said = self.said, []
+        return [line for _, line in said]
+
+
+def test_the_first_verdict_is_told_and_nothing_after_it() -> None:
+    rig = Rig(masked="b")
+    rig.send(1000)
+    assert rig.lines == ["judging a, b; alarm when at least 2 of 5 verdicts violated; masked: b"]
+
+
+def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end_is_none() -> None:
+    rig = Rig()
+    rig.send(10)
+    rig.lines.clear()
+    rig.send(3, off=2.0)
+    (level, line) = rig.said[-1]
+    verdict = rig.watch.last
+    assert level == WARN and verdict is not None
+    found = re.findall(r"(\w) = (\S+) is (\S+) above its bounds (\S+) to ([\d.]+)", line)
+    assert [name for name, *_ in found] == ["a", "b"] and line.startswith("alarm, at least 2 of 5 verdicts violated: ")
+    for i, (_, *numbers) in enumerate(found):
+        value, by, lower, upper = map(float, numbers)
+        said = [verdict.numbers(n)[i] for n in ("state", "lower", "upper")]
+        np.testing.assert_allclose([value, lower, upper], said, rtol=1e-5)
+        assert by == pytest.approx(said[0] - said[2], rel=1e-2)
+    rig.said.clear()
+    rig.send(10)
+    ((level, line),) = rig.said
+    assert level == OK and re.fullmatch(r"the alarm is over after 0\.0\d+ s", line)
+
+
+def test_masked_states_are_not_named_and_a_latched_alarm_says_what_ends_it() -> None:
+    rig = Rig(masked="b", latch=True)
+    rig.send(10)
+    rig.lines.clear()
+    rig.send(30, off=-2.0)
+    (line,) = rig.lines[-1:]
+    assert " below its bounds " in line and "b = " not in line and line.endswith("it stands until ~/reset")
+    rig.send(50)
+    assert not rig.lines
+    rig.watch.reset()
+    rig.wait(0.1)
+    assert [line[:21] for line in rig.lines] == ["the alarm is over aft"]
+
+
+def test_a_flapping_alarm_does_not_flood_the_log_and_its_state_is_told_in_the_end() -> None:
+    rig = Rig()
+    rig.send(10)
+    rig.lines.clear()
+    began = rig.now
+    for _ in range(300):
+        rig.send(2, off=2.0)
+        rig.send(8)
+    turned, minutes = 2 * rig.watch.alarms, (rig.now - began) / 60
+    lines = rig.lines
+    assert turned > 500 and len(lines) <= 6 + 6 * minutes + 1
+    rig.wait(11.0)
+    lines += rig.lines
+    alarms = [line for line in lines if "alarm" in line]
+    assert re.search(r"the alarm is off \(it has turned \d+ times more since the last line\)", alarms[-1])
+    assert (
+        sum(int(n) for line in alarms for n in re.findall(r"turned (\d+) time", line))
+        + sum(line.startswith(("alarm,", "the alarm is over")) for line in alarms)
+        == turned
+    ), "every turn is told or counted"
+
+
+def test_silence_of_each_input_and_its_return_are_told_once() -> None:
+    rig = Rig()
+    rig.wait(30.0)
+    assert rig.lines == [f"no verdict yet: nothing received on {STATE}, {CONTROL}"]
+    rig.send(200, state=False)
+    assert rig.lines == [f"no verdict yet: nothing received on {STATE}"]
+    rig.send(20)
+    assert rig.lines == ["judging a, b; alarm when at least 2 of 5 verdicts violated"]
+    rig.wait(30.0)
+    assert [re.sub(r"\d+\.\d", "#", line) for line in rig.lines] == [
+        f"no message on {CONTROL} for # s",
+        f"no verdict for # s: no message on {STATE}",
+    ]
+    rig.send(20)
+    assert rig.lines == [f"messages on {CONTROL} again", "judging again, after 30.0 s without a verdict"]
+    rig.send(400, control=False)
+    assert [re.sub(r"\d+\.\d", "#", line) for line in rig.lines] == [
+        f"no message on {CONTROL} for # s",
+        "no verdict for # s: p, q missing, stale or not finite",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("what", "why"),
+    [
+        ("not a number", "a missing, stale or not finite"),
+        ("a name gone", "b missing, stale or not finite"),
+        ("no message", f"{STATE}: a message "),
+        ("far apart", "the step is longer than max_gap"),
+        ("no stamp", f"messages on {STATE} are dropped (no stamp)"),
+        ("the same stamp", f"messages on {STATE} are dropped (equal stamp)"),
+    ],
+)
+def test_messages_that_come_and_give_no_verdict_are_told_with_the_cause(what: str, why: str) -> None:
+    rig = Rig()
+    rig.send(20)
+    rig.lines.clear()
+    fixed = rig.t_ns
+    for _ in range(150):
+        rig.send(1, state=False)
+        x = rig.model.operating_point.recorded_x(rig.x)
+        rig.take(
+            STATE,
+            {
+                "not a number": joint_state(rig.t_ns, [np.nan, x[1]]),
+                "a name gone": joint_state(rig.t_ns, x, ("a", "c")),
+                "no message": b"\x00\x01\x00\x00\x07",
+                "far apart": joint_state(rig.t_ns, x),
+                "no stamp": joint_state(0, x),
+                "the same stamp": joint_state(fixed, x),
+            }[what],
+        )
+        if what == "far apart":
+            rig.t_ns += 10 * STEP_NS
+    (line,) = rig.lines
+    assert re.match(r"no verdict for 1\.\d s: ", line) and why in line
+
+
+def test_problems_and_the_enable_condition_are_told_when_they_change() -> None:
+    rig = Rig(enable=f"{CONTROL} vector.x > 0.2")
+    rig.u[:] = 0.9
+    rig.problems = ["/x: a publisher cannot be heard"]
+    rig.wait(0.1)
+    assert rig.lines == [rig.problems[0], f"alarms are off: it is not known whether {CONTROL} vector.x > 0.2"]
+    rig.send(50)
+    assert f"alarms count from now on: {CONTROL} vector.x > 0.2" in rig.lines
+    rig.u[:] = -0.9
+    rig.problems = []
+    rig.send(50)
+    assert rig.lines == [f"alarms are off until {CONTROL} vector.x > 0.2"]
+    rig.problems = ["/x: a publisher cannot be heard"]
+    rig.send(5)
+    assert rig.lines == rig.problems
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+def test_the_log_of_the_node_tells_the_story(world: World, tmp_path: Path) -> None:
+    model = by_hand(alarm=Alarm(2, 5))
+    process = world.monitor(saved(model, tmp_path))
+    process.says(f"active: listening to {STATE}, {CONTROL}")
+    process.says(f"no verdict yet: nothing received on {STATE}, {CONTROL}")
+    plant = Plant(world, model).subscribed()
+    plant.send(50)
+    process.says("judging a, b; alarm when at least 2 of 5 verdicts violated")
+    plant.send(3, off=2.0)
+    process.says("above its bounds")
+    plant.send(10)
+    process.says("the alarm is over after")
+    process.says(f"no message on {STATE}")
+    plant.send(50)
+    process.says("judging again, after ")
+    assert world.change("deactivate")
+    process.says("no longer active")
+    warnings = [line for line in process.output.splitlines() if line.startswith("[WARN]")]
+    assert len(warnings) == 1 and "]: alarm, at least 2 of 5 verdicts violated: a = " in warnings[0]

@@ -1,0 +1,190 @@
+"""What the node's log says while it watches: each change once, and few lines where something keeps changing."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from uncertain_lti.monitor import Verdict
+from uncertain_lti.sampler import Status
+from uncertain_lti.wording import plural
+from uncertain_lti_ros.watch import OK, WARN, WHY, Watch
+
+_BURST, _REFILL = 6, 10.0  # lines on one matter at once, and s until there is one more
+_SHOWN = 5  # states that one line names
+
+
+class _Matter:
+    """Something that changes, and what was last said of it."""
+
+    def __init__(self, said: Any) -> None:
+        self.said = said
+        self._lines, self._at = float(_BURST), -math.inf
+
+    def may(self, now: float) -> bool:
+        """Whether a line may be spent now; spends it."""
+        self._lines = min(_BURST, self._lines + (now - self._at) / _REFILL)
+        self._at = now
+        if self._lines < 1.0:
+            return False
+        self._lines -= 1.0
+        return True
+
+    def becomes(self, value: Any, now: float) -> bool:
+        """Whether this is new and may be said; where it may not be, it stays new."""
+        if value == self.said or not self.may(now):
+            return False
+        self.said = value
+        return True
+
+
+class Journal:
+    """Alarms with the states that left their bounds, verdicts that begin and cease, inputs that fall silent.
+
+    Parameters
+    ----------
+    say : callable
+        Takes a level of `watch` (WARN for the alarm, OK for all else) and a line.
+    """
+
+    def __init__(self, say: Callable[[int, str], None]) -> None:
+        self._say = say
+        self._matters: dict[str, _Matter] = {}
+        self._alarm, self._alarm_since, self._unsaid = False, 0.0, 0
+        self._counters: Counter[str] = Counter()
+        self._unreadable: Counter[str] = Counter()
+        self._ceased, self._judged = 0.0, False
+        self._cause = ("", 0.0)  # of no verdicts, and since when it is this one
+
+    def begin(self, watch: Watch, now: float) -> None:
+        """A watch starts, with no sample."""
+        self._alarm, self._unsaid = watch.alarm, 0
+        self._counters, self._unreadable = Counter(watch.sampler.counters), Counter(watch.unreadable)
+        self._ceased, self._judged = now, False
+        self._cause = ("", now)
+        self._matters.clear()
+
+    def _matter(self, name: str) -> _Matter:
+        if name not in self._matters:
+            self._matters[name] = _Matter(True if name == "arming" else None)
+        return self._matters[name]
+
+    def turned(self, watch: Watch, verdicts: Iterable[Verdict], now: float) -> None:
+        """The alarm may have turned; verdicts: those that did it."""
+        if watch.alarm == self._alarm:
+            return
+        self._alarm = watch.alarm
+        if watch.alarm:
+            cause = next((v for v in verdicts if v.alarm and v.violated), watch.last)
+            left = f": {_left(watch, cause)}" if cause is not None and cause.violated else ""
+            level, line = WARN, f"alarm, {watch.rule_text()}{left}"
+            line += "; it stands until ~/reset" if watch.rule.latch else ""
+            self._alarm_since = now
+        else:
+            level, line = OK, f"the alarm is over after {now - self._alarm_since:.3g} s"
+        if self._matter("alarm").may(now):
+            self._say(level, f"{line}{self._passed_over()}")
+        else:
+            self._unsaid += 1
+
+    def _passed_over(self) -> str:
+        unsaid, self._unsaid = self._unsaid, 0
+        return f" (it has turned {plural(unsaid, 'time')} more since the last line)" if unsaid else ""
+
+    def look(
+        self, watch: Watch, now: float, timeout: float, publishers: Mapping[str, int], problems: Sequence[str]
+    ) -> None:
+        """Say what has changed since the last look.
+
+        timeout: s without a verdict or a message after which that is said. publishers: how many each topic has.
+        problems: what keeps messages from coming, in words that stay the same while it lasts.
+        """
+        self.turned(watch, (), now)
+        if self._unsaid and self._matter("alarm").may(now):
+            self._say(
+                WARN if self._alarm else OK, f"the alarm is {'on' if self._alarm else 'off'}{self._passed_over()}"
+            )
+        matter = self._matter("problems")
+        new = [problem for problem in problems if problem not in (matter.said or ())]
+        if matter.becomes(tuple(problems) or None, now):
+            for problem in new[:_SHOWN]:
+                self._say(OK, problem)
+        if self._matter("arming").becomes(watch.arming.on, now):
+            self._say(OK, watch.arming.why_off() or f"alarms count from now on: {watch.arming.condition}")
+        for topic in watch.types:
+            if topic != watch.sampler.clock:
+                self._look_at_topic(watch, topic, now, timeout, publishers.get(topic, 0))
+        self._look_at_verdicts(watch, now, timeout)
+
+    def _look_at_topic(self, watch: Watch, topic: str, now: float, timeout: float, publishers: int) -> None:
+        heard = watch.heard(topic)
+        if heard is None:
+            return  # the line on verdicts says so
+        held = watch.held(topic)
+        age = now - heard
+        silent = age > max(timeout, held) or (age > timeout and math.isinf(held) and not publishers)
+        if self._matter(f"silence {topic}").becomes(silent or None, now):
+            held_on = " and no publisher any more; its last values are held" if math.isinf(held) else ""
+            self._say(OK, f"no message on {topic} for {age:.1f} s{held_on}" if silent else f"messages on {topic} again")
+
+    def _look_at_verdicts(self, watch: Watch, now: float, timeout: float) -> None:
+        without = watch.without_verdict(now)
+        matter = self._matter("verdicts")
+        if watch.verdicts and without <= timeout:
+            if matter.becomes("", now):
+                again = f"judging again, after {now - without - self._ceased:.1f} s without a verdict"
+                self._say(OK, again if self._judged else self._judging(watch))
+                self._judged = True
+            self._counters, self._unreadable = Counter(watch.sampler.counters), Counter(watch.unreadable)
+            self._ceased = now - without
+        elif without > timeout:
+            why = self._why(watch, now, timeout) or matter.said or "no two samples have come one after the other"
+            if why != self._cause[0]:
+                self._cause = (why, now)
+            # another cause than was told may be that of the moment in which messages come again
+            lasting = not matter.said or now - self._cause[1] >= timeout
+            if lasting and matter.becomes(why, now):
+                self._say(OK, f"no verdict {f'for {without:.1f} s' if watch.verdicts else 'yet'}: {why}")
+
+    def _judging(self, watch: Watch) -> str:
+        text = f"judging {', '.join(watch.model.state_names)}; alarm when {watch.rule_text()}"
+        return f"{text}; masked: {', '.join(watch.monitor.masked)}" if watch.monitor.masked else text
+
+    def _why(self, watch: Watch, now: float, timeout: float) -> str:
+        """What keeps verdicts from being given, without numbers that change from one look to the next; or nothing."""
+        never = [topic for topic in watch.types if watch.heard(topic) is None]
+        found = [f"nothing received on {', '.join(never)}"] if never else []
+        clock = watch.sampler.clock
+        if clock not in never and watch.silent_for(now) > timeout / 2:
+            return "; ".join([f"no message on {clock}", *found])
+        since = watch.sampler.counters - self._counters
+        signals = [
+            s.name for s in watch.model.signals.signals if since[f"missing {s.name}"] or since[f"stale {s.name}"]
+        ]
+        if signals:
+            found.append(f"{', '.join(signals)} missing, stale or not finite")
+        for status, name in ((Status.GAP, "gaps"), (Status.RESET, "resets")):
+            if since[name]:
+                found.append(WHY[status])
+        dropped = [status.value for status in Status if status.dropped and since[status.value]]
+        if dropped:
+            found.append(f"messages on {clock} are dropped ({', '.join(dropped)})")
+        unreadable = watch.unreadable - self._unreadable
+        found += [f"{topic}: a message {watch.why_unreadable[topic]}" for topic in sorted(unreadable)]
+        return "; ".join(found)
+
+
+def _left(watch: Watch, verdict: Verdict) -> str:
+    """The states that left their bounds, and by how much."""
+    numbers = zip(
+        watch.model.state_names, *(verdict.numbers(n) for n in ("flags", "state", "lower", "upper")), strict=True
+    )
+    left = []
+    for name, flag, value, lower, upper in numbers:
+        if flag == 1.0 and name not in watch.monitor.masked:
+            side, by = ("above", value - upper) if value > upper else ("below", lower - value)
+            left.append(f"{name} = {value:.6g} is {by:.3g} {side} its bounds {lower:.6g} to {upper:.6g}")
+    more = len(left) - _SHOWN
+    return ", ".join(left[:_SHOWN]) + (f", and {more} more" if more > 0 else "")
