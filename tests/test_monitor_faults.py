@@ -232,7 +232,7 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
         message.vector.x, message.vector.y = float(u[0]), float(u[1])
         plant.control.publish(message)
         time.sleep(0.01)
-    status = diagnostics.reaches(STALE, saying=f"no message on {STATE} for", patience=5)
+    status = diagnostics.reaches(STALE, saying=f"no message on {STATE} for", patience=20)
     values = Diagnostics.values(status)
     assert float(values[f"age {CONTROL}"]) < 0.4 <= float(values[f"age {STATE}"])
     assert len(flags.messages) == 10 and violation.messages[-1].data is False
@@ -249,7 +249,7 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
     held = np.flatnonzero(got)[0]
     assert 49 <= held <= 52 and got[held:].all(), held
     assert ever(diagnostics, ERROR, "a signal is missing, stale or not finite")
-    values = Diagnostics.values(diagnostics.reaches(STALE, patience=5))
+    values = Diagnostics.values(diagnostics.reaches(STALE, patience=20))
     assert float(values[f"age {CONTROL}"]) > 0.5 and int(values["stale p"]) > 20
 
 
@@ -261,7 +261,7 @@ def test_missed_deadlines_are_told(world: World, tmp_path: Path) -> None:
     world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
     diagnostics = world.diagnostics()
     plant.subscribed().send(5)
-    status = diagnostics.reaches(WARN, saying=f"{STATE}: ", patience=5)
+    status = diagnostics.reaches(WARN, saying=f"{STATE}: ", patience=20)
     assert "deadlines missed by its publishers" in status.message
 
 
@@ -353,7 +353,7 @@ sys.exit(envelope_monitor.main())
     got = [m.position[0] for m in flags.count(36)]
     assert np.isnan(got).sum() == 4  # the first, and the first after each that was lost; nothing was called contained
     assert not any(value == 1.0 for value in got)
-    status = diagnostics.reaches(STALE, saying="unexpected errors, the last", patience=5)
+    status = diagnostics.reaches(STALE, saying="unexpected errors, the last", patience=20)
     until(lambda: world.status()["unexpected_errors"] > 10, "errors of the timer")
     assert int(Diagnostics.values(status)["unexpected errors"]) >= 4
     assert "ZeroDivisionError: every tenth" in process.output
@@ -385,7 +385,7 @@ def test_masks_grace_latch_and_reset(world: World, tmp_path: Path) -> None:
     plant.send(1)
     assert [list(m.position) for m in flags.count(5)[1:]] == [[0, 0], [0, 1], [0, 1], [0, 1]]
     assert not any(m.data for m in violation.messages)
-    status = diagnostics.reaches(OK, saying="masked: b", patience=5)
+    status = diagnostics.reaches(OK, saying="masked: b", patience=20)
     assert diagnostics.latest("envelope_monitor: b").message.endswith("(masked)")
     plant.send(1, off=2.0)
     plant.send(5)
@@ -393,13 +393,13 @@ def test_masks_grace_latch_and_reset(world: World, tmp_path: Path) -> None:
     flags.count(11)
     time.sleep(0.3)
     assert [m.position[0] for m in flags.messages[-4:]] == [0, 0, 0, 0] and violation.messages[-1].data, "not latched"
-    status = diagnostics.reaches(ERROR, saying="latched until ~/reset", patience=5)
+    status = diagnostics.reaches(ERROR, saying="latched until ~/reset", patience=20)
     assert Diagnostics.values(status)["latched"] == "1"
     success, message = trigger(world, "reset")
     assert success and message == "the alarm is reset"
     until(lambda: not violation.messages[-1].data, "the end of the alarm")
     plant.send(3)
-    diagnostics.reaches(OK, patience=5)
+    diagnostics.reaches(OK, patience=20)
     assert trigger(world, "reset")[0]
 
     for wrong, why in (("c", "masked state 'c' is not in the model"), ("a, b", "every state of the model is masked")):
@@ -425,7 +425,7 @@ def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Pat
     plant = Plant(world, model).subscribed()
     plant.send(5, off=2.0)
     assert [m.position[0] for m in flags.count(5)[2:]] == [1, 1, 1]
-    diagnostics.reaches(WARN, saying="alarms are off: it is not known whether /machine/mode data == 3", patience=5)
+    diagnostics.reaches(WARN, saying="alarms are off: it is not known whether /machine/mode data == 3", patience=20)
     assert world.status()["armed"] is None
     lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     mode = world.publisher(UInt8, "/machine/mode", lasting)  # its type is found in the graph
@@ -433,7 +433,7 @@ def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Pat
     until(lambda: world.status()["armed"] is False, "the mode")
     plant.send(5, off=2.0)
     flags.count(10)
-    diagnostics.reaches(WARN, name="envelope_monitor: a", saying="outside its bounds", patience=5)
+    diagnostics.reaches(WARN, name="envelope_monitor: a", saying="outside its bounds", patience=20)
     assert not any(m.data for m in violation.messages)
     mode.publish(UInt8(data=3))
     until(lambda: world.status()["armed"], "the mode")
