@@ -160,7 +160,7 @@ def test_what_a_shared_file_says_to_other_nodes_is_no_reason_to_refuse(tmp_path:
 
     def starts(world: World, file: Path, says: str) -> None:
         process = world.run_node("envelope_monitor", {}, "--params-file", str(file))
-        process.says("not configured: parameter 'model' is empty")
+        process.says("not configured: parameter model is empty")
         assert process.running and says in process.output
         process.kill()
 

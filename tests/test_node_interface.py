@@ -336,3 +336,28 @@ def test_messages_that_are_lost_on_the_way_are_counted_and_never_bridged(world: 
         plant.send(20)
         values = Diagnostics.values(diagnostics.reaches(0))
         assert values[f"lost {STATE}"] == str(status["lost"][STATE])
+
+
+# --- what a user gives --------------------------------------------------------------------------------------
+
+
+def test_paths_that_a_user_gives_are_those_of_the_user(world: World, tmp_path: Path) -> None:
+    """`~` is the home folder, which no shell puts in behind `:=`; a relative path to nothing is told with where."""
+    saved(by_hand(), tmp_path)
+    world.env["HOME"] = str(tmp_path)
+    process = world.monitor("~/hand.model.json", **{"snapshot.folder": "~/snapshots"})
+    assert (tmp_path / "snapshots").is_dir() and world.status()["model"] == "~/hand.model.json"
+    for wrong in ("hand.model.json", "x" * 5000):
+        accepted, reason = world.set(model=wrong)
+        assert not accepted and reason == f"{wrong}: there is no such model file in {Path.cwd()}; give the whole path"
+    assert process.running and world.state() == "active"
+
+
+def test_snapshots_on_alarm_without_a_folder_are_refused(world: World, tmp_path: Path) -> None:
+    path = saved(by_hand(), tmp_path)
+    said = "parameter snapshot.on_alarm is true, and snapshot.folder is empty; start the node with a folder"
+    process = world.run_node("envelope_monitor", {"model": str(path), "snapshot.on_alarm": True})
+    process.says(f"not configured: {said}")
+    process.kill()
+    world.monitor(path)
+    assert world.set(**{"snapshot.on_alarm": True}) == (False, said)

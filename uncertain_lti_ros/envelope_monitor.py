@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import os
 import struct
 import time
 import traceback
@@ -140,8 +141,11 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _make_watch(self, path: str, rule: Rule) -> Watch:
         if not path:
-            raise ModelError("parameter 'model' is empty; give the path of a model file")
-        model = UncertainLTI.load(path)
+            raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")
+        file = Path(path).expanduser()  # no shell does that behind :=
+        if not (file.is_absolute() or os.path.exists(file)):
+            raise ModelError(f"{path}: there is no such model file in {Path.cwd()}; give the whole path")
+        model = UncertainLTI.load(file)
         types = topic_types(model, path, _type_fields)
         for names in (model.state_names, model.control_names):
             sendable(names)
@@ -160,9 +164,11 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Make what the new values ask for, or say why not; it takes its place in `_on_have_set`."""
-        changes = {p.name: p.value for p in parameters if p.name in ("model", *RULE)}
+        given = {p.name: p.value for p in parameters}
+        changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
         self._candidate = None
         try:
+            self._hold_folder(given.get("snapshot.on_alarm", False))
             if "model" in changes:
                 self._candidate = self._make_watch(changes["model"], self._rule(changes))
             elif changes and self.watch is not None:
@@ -249,8 +255,15 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.get_logger().info("the model has no median step, so nothing is predicted")
         return super().on_configure(state)
 
+    def _hold_folder(self, on_alarm: bool) -> None:
+        if on_alarm and not self.get_parameter("snapshot.folder").value:
+            raise ModelError(
+                "parameter snapshot.on_alarm is true, and snapshot.folder is empty; start the node with a folder"
+            )
+
     def _open_album(self) -> None:
         folder = str(self.get_parameter("snapshot.folder").value)
+        self._hold_folder(self.get_parameter("snapshot.on_alarm").value)
         if folder:
             limit = round(self._real("snapshot.megabytes") * _MIB)
             self._album = Album(

@@ -136,7 +136,7 @@ class Album:
     """
 
     def __init__(self, folder: str, node_name: str, keep: int, limit: int) -> None:
-        self._folder = Path(folder)
+        self._folder = Path(folder).expanduser()
         stem = re.sub(r"\W+", "_", node_name.strip("/"), flags=re.ASCII)
         self._stem, self._keep, self._limit = stem, keep, limit
         self._pattern = re.compile(rf"{re.escape(stem)}-\d{{8}}T\d{{6}}\.\d{{6}}Z\.mcap(\.part)?", re.ASCII)
