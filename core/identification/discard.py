@@ -22,8 +22,8 @@ FEW, FEW_SHARE = 12, 0.005
 """At most so many transitions, and such a share of all, are few."""
 MUCH, ENOUGH = 2.0, 1.2
 """Mean width with the few over that without them, from which on they are worth a word; what is left of the latter."""
-LARGEST = 200_000
-"""Transitions up to which the few are sought."""
+LARGEST, MOST_ELEMENTS = 200_000, 300
+"""Transitions, and elements of A and B, up to which the few are sought: some seconds."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def carriers(problem: Problem, structure: Structure | None) -> Carriers | None:
     its weights couple the rows.
     """
     budget = min(FEW, int(FEW_SHARE * problem.N))
-    if not budget or problem.N > LARGEST or problem.weights.ndim == 3:
+    if not budget or problem.N > LARGEST or problem.n * problem.p > MOST_ELEMENTS or problem.weights.ndim == 3:
         return None
     engine = WorkingSet(Fleet([problem]), structure)
     chosen: list[int] = []
