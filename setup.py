@@ -72,9 +72,9 @@ setup(
     entry_points={
         "console_scripts": [
             "uncertain-lti = uncertain_lti.cli:main",
-            "envelope_monitor = uncertain_lti_ros.envelope_monitor:main",
-            "plant = uncertain_lti_ros.plant:main",
-            "turbofan = uncertain_lti_ros.turbofan:main",
+            "envelope_monitor = uncertain_lti_ros.programs:envelope_monitor",
+            "plant = uncertain_lti_ros.programs:plant",
+            "turbofan = uncertain_lti_ros.programs:turbofan",
         ]
     },
 )

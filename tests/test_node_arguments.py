@@ -176,3 +176,16 @@ def test_every_console_script_takes_its_arguments_or_those_of_the_process(capsys
     for node in NODES:
         assert importlib.import_module(f"uncertain_lti_ros.{node}").main(["--help"]) == 0
         assert capsys.readouterr().out.startswith(f"usage: {node} ")
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_without_rclpy_a_program_says_what_to_install(node: str) -> None:
+    for module, fake, says in (
+        ("rclpy", "None", "the Python package rclpy is not installed"),
+        ("sensor_msgs.msg", "type(sys)('empty')", "cannot import name 'JointState'"),
+    ):
+        code = f"import sys; sys.modules[{module!r}] = {fake}; from uncertain_lti_ros.programs import {node} as run"
+        done = subprocess.run([sys.executable, "-c", f"{code}; sys.exit(run())"], capture_output=True, text=True)
+        (line,) = done.stderr.splitlines()
+        assert done.returncode == 2 and line.startswith(f"{node}: {says}")
+        assert line.endswith("; source a ROS 2 Jazzy installation, or pip install 'uncertain-lti-ros[ros]'")

@@ -1,0 +1,38 @@
+"""The programs that run as nodes; what they need and is not installed is one sentence, and no traceback."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+_BAD_USAGE, _INTERRUPTED = 2, 130
+
+
+def envelope_monitor() -> int:
+    """The live monitor."""
+    return _run("envelope_monitor")
+
+
+def plant() -> int:
+    """The published engine."""
+    return _run("plant")
+
+
+def turbofan() -> int:
+    """The nonlinear engine."""
+    return _run("turbofan")
+
+
+def _run(name: str) -> int:
+    try:
+        main = import_module(f"uncertain_lti_ros.{name}").main
+    except ImportError as error:
+        package = (error.name or "").partition(".")[0]
+        absent = isinstance(error, ModuleNotFoundError) and package
+        what = f"the Python package {package} is not installed" if absent else str(error).partition("\n")[0]
+        remedy = "source a ROS 2 Jazzy installation, or pip install 'uncertain-lti-ros[ros]'"
+        print(f"{name}: {what}; {remedy}", file=sys.stderr)
+        return _BAD_USAGE
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    return int(main())
