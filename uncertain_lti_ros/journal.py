@@ -185,6 +185,8 @@ def _left(watch: Watch, verdict: Verdict) -> str:
     for name, flag, value, lower, upper in numbers:
         if flag == 1.0 and name not in watch.monitor.masked:
             side, by = ("above", value - upper) if value > upper else ("below", lower - value)
-            left.append(f"{name} = {value:.6g} is {by:.3g} {side} its bounds {lower:.6g} to {upper:.6g}")
+            left.append(
+                f"{name} = {value:.7g} is {float(f'{by:.3g}'):.7g} {side} its bounds {lower:.7g} to {upper:.7g}"
+            )
     more = len(left) - _SHOWN
     return ", ".join(left[:_SHOWN]) + (f", and {more} more" if more > 0 else "")
