@@ -6,17 +6,19 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import LifecycleNode
-from launch_ros.parameter_descriptions import ParameterValue
 
 PARAMETERS = Path(__file__).resolve().parents[1] / "config" / "envelope_monitor.yaml"
 
 
 def start(context):
     """Make the node; an empty `model` leaves the one of the parameter file in place."""
-    parameters = [
-        LaunchConfiguration("params_file").perform(context),
-        {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)},
-    ]
+    file = LaunchConfiguration("params_file").perform(context)
+    if not Path(file).is_file():
+        raise FileNotFoundError(f"params_file:={file} is not a file; check the path")
+    simulated = LaunchConfiguration("use_sim_time").perform(context)
+    if simulated.lower() not in ("true", "false"):
+        raise ValueError(f"use_sim_time:={simulated} is neither true nor false")
+    parameters = [file, {"use_sim_time": simulated.lower() == "true"}]
     model = LaunchConfiguration("model").perform(context)
     if model:
         parameters.append({"model": model})

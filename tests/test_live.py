@@ -533,6 +533,7 @@ def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Pa
     assert world.state() == "unconfigured"
     diagnostics.reaches(STALE, saying="unconfigured: no verdicts")
     assert not world.change("activate")
+    process.says("no transition activate from unconfigured; there are configure")
     assert world.change("configure") and world.state() == "inactive"
     violation = world.listen(Bool, "/envelope_monitor/violation").connected()
     flags = world.listen(JointState, "/envelope_monitor/flags").connected()
@@ -557,6 +558,15 @@ def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Pa
     assert world.state() == "finalized"
     process.signal(signal.SIGINT)
     process.succeed()
+
+
+def test_a_rule_that_kept_the_node_from_starting_can_be_mended(world: World, tmp_path: Path) -> None:
+    process = world.run_node(
+        "envelope_monitor", {"model": str(saved(by_hand(), tmp_path)), "violations": 3, "window": 1}
+    )
+    process.says("the node starts as soon as its parameters are set right")
+    assert world.state() == "unconfigured"
+    assert world.set(window=5) == (True, "") and world.state() == "active"
 
 
 def test_what_cannot_be_configured_says_why_and_can_be_mended(world: World, tmp_path: Path) -> None:

@@ -70,6 +70,9 @@ def refusal(result: subprocess.CompletedProcess, node: str = "envelope_monitor")
         (["-r"], ["-r has nothing after it", "-r FROM:=TO"]),
         (["-r", "-p", "model:=x"], ["-r has nothing after it"]),
         (["-r", "one"], ["-r one cannot be read", "-r FROM:=TO"]),
+        (["-r", "__ns:=bad"], ["-r __ns:=bad cannot be read", "a namespace from / on"]),
+        (["-p", 'model:=[1,"a"]'], ["cannot be read", "a value as in YAML"]),
+        (["-p", "latch:=true", "a.model.json"], ["a.model.json is no ROS argument", "-p model:=a.model.json"]),
         (["-r", "__node:=a-b"], ["-r __node:=a-b cannot be read", "letters, digits"]),
         (["--log-level", "loud"], ["--log-level loud", "debug, info, warn"]),
         (["--nonsense"], ["--nonsense is no ROS argument", "--help"]),
@@ -125,6 +128,7 @@ def test_a_wrong_parameter_file(
 
 def test_a_setting_of_the_environment_that_rcl_refuses(start: Callable[..., subprocess.CompletedProcess]) -> None:
     assert "ROS_DOMAIN_ID is not an integral number" in refusal(start(ROS_DOMAIN_ID="abc"))
+    assert "from 0 to 232" in refusal(start(ROS_DOMAIN_ID="999"))
 
 
 @pytest.mark.parametrize("node", NODES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import textwrap
@@ -18,6 +19,7 @@ from rclpy.node import Node
 from uncertain_lti.errors import UncertainLTIError
 
 BAD_USAGE = 2
+_LAST_DOMAIN = 232
 _PARAMETER, _REMAP, _FILE = "-p NAME:=VALUE", "-r FROM:=TO", "--params-file FILE"
 _LEVEL, _ENCLAVE, _LOG = "--log-level LEVEL", "--enclave ENCLAVE", "--log-config-file FILE"
 _FORMS = {
@@ -116,10 +118,16 @@ def run_node(
         return 0
     try:
         _check(given, name)
+        _hold_domain(os.environ.get("ROS_DOMAIN_ID", ""))
         return run(given)
     except UncertainLTIError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return BAD_USAGE
+
+
+def _hold_domain(number: str) -> None:
+    if number.isdecimal() and int(number) > _LAST_DOMAIN:
+        raise ArgumentError(f"ROS_DOMAIN_ID is {number}; choose one from 0 to {_LAST_DOMAIN}, whose ports exist")
 
 
 def _help(name: str, summary: str, parameters: Sequence[Declared]) -> str:
@@ -164,8 +172,12 @@ def _check(given: Sequence[str], name: str) -> None:
             at += 1
             _hold_value(word, value)
         elif word not in _LOGGING:
-            remedy = f"-p {word}" if ":=" in word else "--help lists what there is"
-            raise ArgumentError(f"{word} is no ROS argument; {'write ' if ':=' in word else ''}{remedy}")
+            remedy = "--help lists what there is"
+            if ":=" in word:
+                remedy = f"write -p {word}"
+            elif name == "envelope_monitor" and not word.startswith("-"):
+                remedy = f"if it is the model file, write -p model:={word}"
+            raise ArgumentError(f"{word} is no ROS argument; {remedy}")
 
 
 def _refuse(word: str, after: Sequence[str], name: str) -> None:
@@ -213,7 +225,10 @@ def in_words(error: Exception) -> str:
         return f"parameter file {value} cannot be read: {why}; it reads NODE: ros__parameters: NAME: VALUE"
     if form == _LEVEL:
         return f"{flag} {value} is no log level; choose debug, info, warn, error or fatal"
-    return f"{flag} {value} cannot be read; write {form}, with names of letters, digits, _ and /"
+    said = f"{flag} {value} cannot be read; write {form}"
+    if form == _PARAMETER:
+        return f"{said}, with a name of letters, digits, _ and . and a value as in YAML"
+    return f"{said}, with names of letters, digits, _ and /" + ", and a namespace from / on" * value.startswith("__ns")
 
 
 def hold_overrides(node: Node, args: Sequence[str]) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
@@ -60,6 +61,11 @@ _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 _LOGGED = 5.0  # s between two log entries on unexpected errors
 _MIB = 1 << 20
 _NAN = float("nan")
+
+_TRANSITIONS = {
+    getattr(Transition, name): name.removeprefix("TRANSITION_").lower()
+    for name in ("TRANSITION_CONFIGURE", "TRANSITION_CLEANUP", "TRANSITION_ACTIVATE", "TRANSITION_DEACTIVATE")
+}
 
 _type_fields = cache(live_fields)
 
@@ -198,6 +204,8 @@ class EnvelopeMonitorNode(LifecycleNode):
                 self._swap(candidate)
             elif self._starts_itself:
                 self.start()
+        elif self.watch is None and self._starts_itself and any(p.name in RULE for p in parameters):
+            self.start()
 
     def _swap(self, watch: Watch) -> None:
         """Put another model in place, between two messages."""
@@ -223,7 +231,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         try:
             return self._change_state(request, response)
         except RuntimeError:  # RCLError, which rclpy does not export
-            asked = request.transition.label or request.transition.id
+            number = request.transition.id
+            asked = request.transition.label or _TRANSITIONS.get(number, str(number))
             state = self._state_machine.current_state[1]
             there = ", ".join(transition[1] for transition in self._state_machine.available_transitions)
             self.get_logger().error(f"no transition {asked} from {state}; there are {there or 'none'}")
@@ -240,7 +249,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         except Exception as error:
             self.watch = None
             self._reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
-            self.get_logger().error(f"not configured: {self._reason}")
+            then = "; the node starts as soon as its parameters are set right" if self._starts_itself else ""
+            self.get_logger().error(f"not configured: {self._reason}{then}")
             self._report()
             return TransitionCallbackReturn.FAILURE
         self._reason = ""
