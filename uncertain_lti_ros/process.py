@@ -129,8 +129,9 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        # Who was told to end is often told twice, by the terminal and by what started it.
         for name, handler in before.items():
-            signal.signal(name, handler)
+            signal.signal(name, signal.SIG_IGN if stop else handler)
 
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
