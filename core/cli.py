@@ -368,6 +368,7 @@ def _fit(options: argparse.Namespace) -> int:
             additive=options.additive,
             discard=options.discard,
             count=options.count,
+            seek_carriers=True,
             progress=step,
         )
     sources = [{"file": name, "sha256": _sha256(name)} for t in transients for name in t.sources]

@@ -42,7 +42,7 @@ def run(seed=0, count=1500, noise=1e-3, dt=0.05, u=None, feedback=None, lag=0, c
 
 
 def messages(*transients, additive="noise", **options):
-    return fit(list(transients), additive=additive, **options).fit["messages"]
+    return fit(list(transients), additive=additive, seek_carriers=True, **options).fit["messages"]
 
 
 WORDS = {

@@ -43,6 +43,7 @@ def fit(
     discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
+    seek_carriers: bool = False,
     alarm: Alarm | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> UncertainLTI:
@@ -79,6 +80,9 @@ def fit(
         cvxpy states the whole problem as written (OSQP, HiGHS); slow, without tie-breaks, for comparison.
     describe_data : bool
         Say in `fit["messages"]` what the user should know; a fit of many need not.
+    seek_carriers : bool
+        Say there as well which few transitions make a state's envelope much wider than the others need. Takes several
+        times as long as the fit; beyond 200 000 transitions it is not sought.
     alarm : Alarm, optional
         Goes to the model file.
     progress : callable, optional
@@ -164,6 +168,7 @@ def fit(
             describe_on=problem if describe_data else None,
             transients=transients,
             discarded=len(discarded),
+            seek_carriers=seek_carriers,
         )
     except InfeasibleError as error:
         raise name(error) from None
@@ -202,6 +207,7 @@ def fit_fleet(
     describe_on: Problem | None = None,
     transients: Sequence[Transient] = (),
     discarded: int = 0,
+    seek_carriers: bool = False,
 ) -> UncertainLTI:
     """`fit` on transitions that are already normalised, wherever they lie.
 
@@ -220,6 +226,8 @@ def fit_fleet(
         The recordings, for the same messages.
     discarded : int
         Transitions of them that were left out already, for the same messages.
+    seek_carriers : bool
+        As in `fit`.
 
     Raises
     ------
@@ -272,7 +280,7 @@ def fit_fleet(
     }
     if describe_on is not None:
         whole = describe_on.N == sums.count and method == "working-set"
-        few = carriers(describe_on, structure) if whole else None
+        few = carriers(describe_on, structure) if seek_carriers and whole else None
         facts["rank"], facts["messages"] = describe(
             model, describe_on, sums, mean_width, max_width, transients, few, discarded if criterion == "qp" else None
         )
