@@ -203,7 +203,8 @@ def test_ctrl_c_at_any_time(long_run, cache):
     output = long_run / "out"
     output.mkdir(exist_ok=True)
     model, folder = output / "m.model.json", output / "cache"
-    model.write_text("before")
+    before = '{"format": "uncertain-lti/1", "of": "before"}'
+    model.write_text(before)
     more = ["--cache", str(folder)] if cache else []
     began = time.monotonic()
     finished = subprocess.run([*CLI, *fit_arguments(long_run, "out/m.model.json"), *more], capture_output=True)
@@ -212,7 +213,7 @@ def test_ctrl_c_at_any_time(long_run, cache):
     whole = json.loads(model.read_text())
     interrupted = 0
     for share in np.linspace(0.15, 1.0, 18):
-        model.write_text("before")
+        model.write_text(before)
         for file in folder.glob("*") if cache else ():
             file.unlink()
         process = subprocess.Popen(
@@ -232,7 +233,7 @@ def test_ctrl_c_at_any_time(long_run, cache):
         else:  # before the command could begin: Python itself was starting
             assert process.returncode == -signal.SIGINT or b"KeyboardInterrupt" in said
         text = model.read_text()
-        assert text == "before" or json.loads(text)["A"] == whole["A"]
+        assert text == before or json.loads(text)["A"] == whole["A"]
         if cache and folder.exists():
             files = {p.name for p in folder.iterdir()}
             assert files in (set(), {"transitions.f64", "facts.json"}), files

@@ -121,7 +121,6 @@ def test_the_experiment_shows_what_it_must(experiment):
         assert spools == pytest.approx([-1.6, -2.0], rel=0.1)
     for search in data["direct_search"]:
         assert search["exact"] <= search["direct_search"] < 1.1 * search["exact"]
-        assert search["direct_search_seconds"] > search["exact_seconds"]
 
 
 @pytest.mark.slow

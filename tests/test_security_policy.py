@@ -58,6 +58,8 @@ def test_the_policy_allows_what_the_node_does_and_nothing_else(world: World, tmp
     def names(found: list[tuple[str, list[str]]]) -> set[str]:
         return {name for name, _ in found}
 
+    until(lambda: NODE in node.get_node_names(), "the node in the graph")
+
     def subscribed() -> set[str]:
         return names(node.get_subscriber_names_and_types_by_node(NODE, "/"))
 
