@@ -334,7 +334,7 @@ def test_rare_steps_of_a_control_are_to_be_recorded_more_often_and_not_left_out(
     assert "where 'pump' steps: record more such steps" in message and "--discard" not in message
 
 
-def test_criterion_whose_discards_take_long_names_the_stretch():
+def test_for_a_criterion_that_would_discard_others_the_stretch_is_named():
     (message,) = [m for m in messages(run(change=spiked((400,))), criterion="lp") if WORDS["few"] in m]
     assert "leave that stretch out" in message and "--discard" not in message
 

@@ -634,13 +634,23 @@ def test_discards_find_the_outliers(criterion, budget):
     assert count_outside(model, [kept]) <= 6
 
 
-def test_discards_are_the_best_single_ones():
-    """Against trying every transition: the first discard lowers the objective most."""
-    transient = drawn(small_plant(82), 60, 82, noise=5e-3)
+@pytest.mark.parametrize("seed", [82, 83, 84])
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_discards_are_the_best_single_ones(criterion, seed):
+    """Against trying every transition: the first discard lowers the objective most; for (11) δ of the rows in all."""
+    transient = drawn(small_plant(seed), 60, seed, noise=5e-3)
     problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
-    best = min(range(60), key=lambda k: formulation.solve(problem.without(np.array([k])), "qp", cp.CLARABEL)[2][0])
-    (chosen,) = fit(transient, additive="noise", discard=1).fit["discarded"]
-    assert chosen["k"] == best
+
+    def objective(*without):
+        return formulation.solve(problem.without(np.array(without, dtype=int)), criterion, cp.CLARABEL)[2]
+
+    everything = objective()
+    effects = [float(np.sum((everything - objective(k)) / everything)) for k in range(60)]
+    (chosen,) = fit(transient, criterion, additive="noise", discard=1).fit["discarded"]
+    # (10) sums the widths over one transition less here, which the choice leaves out of account
+    assert effects[chosen["k"]] >= max(effects) - (0.01 if criterion == "qp" else 1e-6)
+    if criterion == "lp":
+        assert chosen["effect"] == pytest.approx(max(effects), rel=1e-5)
 
 
 def test_discards_out_of_range_are_refused():

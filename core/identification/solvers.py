@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -206,6 +207,15 @@ class Simplex:
         self._highs.addRows(
             count, h, np.full(count, self._infinity), rows.size, starts, index, np.ascontiguousarray(rows).ravel()
         )
+
+    def hold(self, rows: Iterable[int], h: Iterable[float]) -> None:
+        """Ask rows·ξ >= h of these rows from now on; -inf asks nothing."""
+        for row, least in zip(rows, h, strict=True):
+            self._highs.changeRowBounds(row, max(least, -self._infinity), self._infinity)
+
+    def duals(self) -> Array:
+        """What the optimum found last would fall by, per unit of h, for each row."""
+        return np.asarray(self._highs.getSolution().row_dual, dtype=np.float64)
 
     def solve(self) -> Array:
         """Optimal ξ; raises FitError where there is none."""
