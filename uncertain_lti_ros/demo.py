@@ -158,6 +158,9 @@ def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> di
                 if len(flags) - shown >= 100 or len(flags) == len(expected):
                     _show(flags, shown, names, int(expected[0]))
                     shown = len(flags)
+            confirmed_by = time.monotonic() + _PATIENCE  # the player ends once its messages are confirmed
+            while life.alive and playing.poll() is None and time.monotonic() < confirmed_by:
+                life.spin_once(0.1)
     life.node.destroy_subscription(subscription)
     return flags
 
