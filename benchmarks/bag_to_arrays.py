@@ -27,7 +27,21 @@ import time
 from pathlib import Path
 
 import numpy as np
-from recorded import CAMERA, COMPRESSIONS, FRAMES, JAZZY, ROBOT, Topic, imu, payloads, pictures, write
+from measure import best, peak_memory, table
+from recorded import (
+    CAMERA,
+    COMPRESSIONS,
+    FRAMES,
+    JAZZY,
+    ROBOT,
+    START_NS,
+    Topic,
+    imu,
+    payloads,
+    pictures,
+    write,
+    write_messages,
+)
 
 from uncertain_lti import mcap_batches
 from uncertain_lti.bag import Bag
@@ -53,16 +67,6 @@ def recording(folder, count, compression, chunk, frames):
         streams = [payloads(topic, count // len(ROBOT), names, seed) for seed, topic in enumerate(ROBOT)]
         write(path, ROBOT, streams, compression, CHUNKS[chunk])
     return path
-
-
-def best(function, runs=3):
-    """Least wall time of some runs, s, and the last result."""
-    times = []
-    for _ in range(runs):
-        began = time.perf_counter()
-        result = function()
-        times.append(time.perf_counter() - began)
-    return min(times), result
 
 
 def ours(path, paths):
@@ -150,31 +154,20 @@ def images(folder, scale, share):
             topics = (Topic("/imu", "sensor_msgs/msg/Imu", imu), CAMERA)
             inertial = payloads(topics[0], 10 * number, FRAMES[:1], 1)
             bundled = [inertial[10 * i : 10 * i + 10] for i in range(number)]
-            write_mixed(path, topics, bundled, pictures(number, 2), compression)
+            write_messages(path, topics, mixed(bundled, pictures(number, 2)), compression)
         rows.append(where_it_goes(path, wanted, 10 * number, share, [compression]))
         keep_or_drop(folder, path)
     table(f"{10 * number} Imu messages beside {number} images of 640 x 480", ["compression", *WHERE], rows)
 
 
-def write_mixed(path, topics, bundled, shown, compression):
-    """Ten small messages, then an image, and so on."""
-    from mcap.writer import Writer
-
-    with open(path, "wb") as stream:
-        writer = Writer(stream, chunk_size=768 << 10, compression=COMPRESSIONS[compression])
-        writer.start(profile="ros2", library="benchmark")
-        channels = []
-        for topic in topics:
-            text = JAZZY.generate_msgdef(topic.type, ros_version=2)[0]
-            schema = writer.register_schema(topic.type, "ros2msg", text.encode())
-            channels.append(writer.register_channel(topic.name, "cdr", schema))
-        at = 1_700_000_000_000_000_000
-        for several, picture in zip(bundled, shown, strict=True):
-            for data in several:
-                at += 3_000_000
-                writer.add_message(channels[0], at, data, at)
-            writer.add_message(channels[1], at, picture, at)
-        writer.finish()
+def mixed(bundled, shown):
+    """Several small messages, then an image, and so on: time, number of the topic, content."""
+    at = START_NS
+    for several, picture in zip(bundled, shown, strict=True):
+        for data in several:
+            at += 3_000_000
+            yield at, 0, data
+        yield at, 1, picture
 
 
 def eighth(folder, scale, share):
@@ -274,16 +267,10 @@ def memory(folder, scale, share):
 
 def peak(path):
     """In a process of its own: peak memory before reading and after, and size of the result, bytes."""
-    before = high_water()
+    before = peak_memory()
     columns = ours(Path(path), PATHS)
     result = sum(a.nbytes for a in (columns.topic, columns.arrival, columns.stamp, *columns.values))
-    print(before, high_water(), result)
-
-
-def high_water():
-    """Peak memory of this process, bytes; getrusage would count that of the process it was forked from."""
-    (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
-    return int(line.split()[1]) * 1024
+    print(before, peak_memory(), result)
 
 
 def robot():
@@ -340,13 +327,6 @@ def keep_or_drop(folder, path):
     """Large recordings are not left lying around."""
     if not KEEP:
         path.unlink(missing_ok=True)
-
-
-def table(title, header, rows):
-    """Print a table as Markdown."""
-    print(f"\n{title}\n\n| {' | '.join(header)} |\n|{'---|' * len(header)}")
-    for row in rows:
-        print(f"| {' | '.join(row)} |", flush=True)
 
 
 def main():

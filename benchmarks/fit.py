@@ -22,6 +22,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from measure import best, peak_memory, table
 
 from uncertain_lti import OperatingPoint
 from uncertain_lti.identification import formulation
@@ -79,16 +80,6 @@ def names(n, m):
     return SignalMap(
         tuple(Signal(f"x{i}", "", f"x{i}") for i in range(n)), tuple(Signal(f"u{j}", "", f"u{j}") for j in range(m))
     )
-
-
-def best(function, runs=3):
-    """Least wall time of some runs, s, and the last result."""
-    times = []
-    for _ in range(runs):
-        began = time.perf_counter()
-        result = function()
-        times.append(time.perf_counter() - began)
-    return min(times), result
 
 
 def outside(problem, model):
@@ -263,12 +254,6 @@ def disk_write(folder, N, parts):
     print(f"wrote {N} transitions in {time.perf_counter() - began:.1f} s, drawing them included")
 
 
-def peak_memory():
-    """Largest resident memory of this process, MiB; its maxrss would start from the parent's."""
-    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM"))
-    return int(line.split()[1]) / 1024
-
-
 def disk_fit(folder, N, parts):
     """Fit from the cache, then with all of it in memory: the same optimum."""
     from uncertain_lti.identification.cache import DiskPartition
@@ -280,7 +265,7 @@ def disk_fit(folder, N, parts):
     def fitted(where, fleet):
         for criterion in ("qp", "lp"):
             took, model = best(lambda c=criterion: fit_fleet(fleet, names(5, 4), c, dt_median=DT), 1)
-            peak = peak_memory()
+            peak = peak_memory() / 2**20
             count = int(fleet.judge(model).outside.sum())
             known = models.setdefault(criterion, model)
             objective = np.max(np.abs(np.divide(model.fit["objective"], known.fit["objective"]) - 1))
@@ -299,14 +284,6 @@ def disk_fit(folder, N, parts):
     fitted("in memory", Fleet.of(Problem(z, x_next, np.full(N, DT), origin, origin, np.ones(5), partition.columns)))
     header = ["arrays", "criterion", "ours", "passes", "peak memory", "gap", "outside"]
     table(f"{N} transitions, n = 5, m = 4", [*header, "objective differs", "elements differ"], rows)
-
-
-def table(title, header, rows):
-    """Print a Markdown table."""
-    print(f"\n**{title}**\n")
-    for line in (header, ["---"] * len(header), *rows):
-        print("| " + " | ".join(line) + " |")
-    print(flush=True)
 
 
 CLAIMS = {f.__name__: f for f in (million, joint, pyipm, large, coupled, growth, disk)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,6 +127,7 @@ def pictures(count: int, seed: int) -> list[bytes]:
     ]
 
 
+START_NS = 1_700_000_000_000_000_000
 ROBOT = (
     Topic("/joint_states", "sensor_msgs/msg/JointState", joint_state),
     Topic("/odom", "nav_msgs/msg/Odometry", odometry),
@@ -169,6 +170,17 @@ def write(
     step_ns: int = 1_000_000,
 ) -> Path:
     """One message of each topic in turn as long as it has some, and a step of time until the next turn."""
+    return write_messages(path, topics, _in_turn(streams, step_ns), compression, chunk_size)
+
+
+def write_messages(
+    path: Path,
+    topics: Sequence[Topic],
+    messages: Iterable[tuple[int, int, bytes]],
+    compression: str = "zstd",
+    chunk_size: int = 768 << 10,
+) -> Path:
+    """Messages in order: time in ns, number of the topic among `topics`, content."""
     with open(path, "wb") as stream:
         writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
         writer.start(profile="ros2", library="benchmark")
@@ -177,16 +189,14 @@ def write(
             text = JAZZY.generate_msgdef(topic.type, ros_version=2)[0]
             schema = writer.register_schema(topic.type, "ros2msg", text.encode())
             channels.append(writer.register_channel(topic.name, "cdr", schema))
-        for time, channel, data in _in_turn(channels, streams, step_ns):
-            writer.add_message(channel, time, data, time)
+        for time, number, data in messages:
+            writer.add_message(channels[number], time, data, time)
         writer.finish()
     return path
 
 
-def _in_turn(
-    channels: Sequence[int], streams: Sequence[Sequence[bytes]], step_ns: int
-) -> Iterator[tuple[int, int, bytes]]:
+def _in_turn(streams: Sequence[Sequence[bytes]], step_ns: int) -> Iterator[tuple[int, int, bytes]]:
     for i in range(max(map(len, streams))):
-        for number, (channel, stream) in enumerate(zip(channels, streams, strict=True)):
+        for number, stream in enumerate(streams):
             if i < len(stream):
-                yield 1_700_000_000_000_000_000 + i * step_ns + number * 1000, channel, stream[i]
+                yield START_NS + i * step_ns + number * 1000, number, stream[i]

@@ -10,9 +10,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from uncertain_lti.errors import BagError
-from uncertain_lti.files import kind_of
+from uncertain_lti.files import MAGIC, kind_of
 
-MAGIC = b"\x89MCAP0\r\n"
 _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.mcap")
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import logging
 import os
 import re
 import shlex
-import signal
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -238,23 +236,10 @@ def _budget(text: str) -> float:
 
 
 def _model_target(wish: str) -> Path:
-    """Where a model goes; an older model gives way, and nothing else.
+    """Where a model goes; raises as `files.target`."""
+    from uncertain_lti.files import target
 
-    Raises
-    ------
-    BagError
-        Something else is there, or its folder is not.
-    """
-    from uncertain_lti.files import may_replace
-
-    path = Path(wish)
-    if not path.parent.is_dir():
-        raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
-    if path.is_dir():
-        raise BagError(f"{path}: is a folder; name a file in it, for example {path / 'machine.model.json'}")
-    if not may_replace(path, holds=b'"uncertain-lti/'):
-        raise BagError(f"{path}: is there already and is no model file; choose another name, or move it away")
-    return path
+    return target(wish, holds=b'"uncertain-lti/', kind="model file", example="machine.model.json")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -347,6 +332,7 @@ def _init(options: argparse.Namespace) -> int:
 
 def _fit(options: argparse.Namespace) -> int:
     from uncertain_lti import fit, read_transients
+    from uncertain_lti.files import sha256
     from uncertain_lti.report import fit_text, left_out_text, next_text, recording_text
     from uncertain_lti.validation import leave_out_cheaply
 
@@ -371,7 +357,7 @@ def _fit(options: argparse.Namespace) -> int:
             seek_carriers=True,
             progress=step,
         )
-    sources = [{"file": name, "sha256": _sha256(name)} for t in transients for name in t.sources]
+    sources = [{"file": name, "sha256": sha256(name)} for t in transients for name in t.sources]
     model = model.with_(fit={**model.fit, "sources": sources})
     with options.progress.stage("validating") as step:
         left_out = leave_out_cheaply(transients, model, time.perf_counter() - began, step)
@@ -394,6 +380,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
     from contextlib import ExitStack
 
     from uncertain_lti.archive import fit_archive
+    from uncertain_lti.files import sha256
     from uncertain_lti.report import archive_text, next_text
 
     if options.discard:
@@ -422,7 +409,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
                 client=client,
                 progress=step,
             )
-    sources = [{**s, "sha256": _sha256(s["file"])} for s in model.fit["sources"]]
+    sources = [{**s, "sha256": sha256(s["file"])} for s in model.fit["sources"]]
     model = model.with_(fit={**model.fit, "sources": sources})
     model.save(output)
     if options.json:
@@ -436,8 +423,9 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
 
 def _local_cluster(dask: Any, workers: int) -> Any:
     """Worker processes that leave Ctrl-C to this one, which ends them."""
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # what a child is born with
-    try:
+    from uncertain_lti.reading_processes import children_ignore_ctrl_c
+
+    with children_ignore_ctrl_c():
         return dask.LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -445,13 +433,6 @@ def _local_cluster(dask: Any, workers: int) -> Any:
             dashboard_address=None,
             silence_logs=logging.CRITICAL,  # of work that is broken off; what goes wrong comes back as an error
         )
-    finally:
-        signal.signal(signal.SIGINT, handler)
-
-
-def _sha256(path: str) -> str:
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _check(options: argparse.Namespace) -> int:

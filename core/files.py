@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import BinaryIO
+
+from uncertain_lti.errors import BagError
+
+MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of an MCAP recording."""
 
 
 @contextmanager
@@ -43,6 +50,12 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         raise
 
 
+def sha256(path: str | os.PathLike[str]) -> str:
+    """Checksum of a file; raises OSError."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
     """Whether nothing is lost at this path when a file is written there that has such words in its first 500 bytes.
 
@@ -56,6 +69,24 @@ def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
     return not head or holds in head
 
 
+def target(wish: str | os.PathLike[str], *, holds: bytes, kind: str, example: str) -> Path:
+    """Where a file of a kind goes, that holds such words (`may_replace`); an older one gives way, and nothing else.
+
+    Raises
+    ------
+    BagError
+        Something else is there, or its folder is not.
+    """
+    path = Path(wish)
+    if not path.parent.is_dir():
+        raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
+    if path.is_dir():
+        raise BagError(f"{path}: is a folder; name a file in it, for example {path / example}")
+    if not may_replace(path, holds=holds):
+        raise BagError(f"{path}: is there already and is no {kind}; choose another name, or move it away")
+    return path
+
+
 def kind_of(path: str | os.PathLike[str]) -> str:
     """What a file is by its first bytes, with an article: a recording, a model, signals; "" where that is not known."""
     if os.path.isdir(path):
@@ -65,7 +96,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
             head = stream.read(4000)
     except OSError:
         return ""
-    if head.startswith(b"\x89MCAP"):
+    if head.startswith(MAGIC[:5]):
         return "an MCAP recording"
     if head.lstrip().startswith(b"{") and b'"uncertain-lti/' in head:
         return "a model file"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.bag import Bag
 from uncertain_lti.errors import BagError
-from uncertain_lti.files import may_replace
+from uncertain_lti.files import sha256, target
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.report import check_data, number
@@ -102,27 +101,15 @@ def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequ
     if wish is None:
         return None
     path = Path(wish)
-    if not path.parent.is_dir():
-        raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
-    if path.is_dir():
-        raise BagError(f"{path}: is a folder; name a file in it, for example {path / 'report.html'}")
     for other in (Path(model_file), *(part for bag in bags for part in bag.parts)):
         if path.exists() and other.exists() and path.samefile(other):
             raise BagError(f"{path}: is what the report is about; choose another name")
-    if not may_replace(path, holds=b"<html"):
-        raise BagError(f"{path}: is there already and is no page; choose another name, or move it away")
-    return path
+    return target(path, holds=b"<html", kind="page", example="report.html")
 
 
 def shortened(name: str, longest: int = 40) -> str:
     """A name for a sentence, with its middle left out where it is long."""
     return name if len(name) <= longest else f"{name[: longest // 2]}…{name[len(name) - longest // 2 + 1 :]}"
-
-
-def sha256(path: str | os.PathLike[str]) -> str:
-    """Checksum of a file; raises OSError."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _model(model: UncertainLTI, model_file: str | os.PathLike[str]) -> dict[str, Any]:

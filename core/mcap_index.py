@@ -14,7 +14,8 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
-from uncertain_lti.bag_files import MAGIC, os_error
+from uncertain_lti.bag_files import os_error
+from uncertain_lti.files import MAGIC
 from uncertain_lti.mcap_records import (
     CHUNK,
     FOOTER_SIZE,

@@ -12,7 +12,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import BinaryIO
 
-_MAGIC = b"\x89MCAP0\r\n"
+from uncertain_lti.files import MAGIC
+
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
 _ATTACHMENT, _ATTACHMENT_INDEX, _STATISTICS, _METADATA, _METADATA_INDEX, _SUMMARY_OFFSET, _DATA_END = range(9, 16)
 _CHUNK_BYTES = 1 << 20
@@ -78,7 +79,7 @@ class McapWriter:
         self._first: int | None = None
         self._last = 0
         self._begin_of_chunk, self._end_of_chunk = 0, 0
-        self._write(_MAGIC + _record(_HEADER, _text(profile) + _text(library)))
+        self._write(MAGIC + _record(_HEADER, _text(profile) + _text(library)))
 
     def metadata(self, name: str, pairs: Mapping[str, str]) -> None:
         """Add named texts."""
@@ -187,7 +188,7 @@ class McapWriter:
                 self._write(group)
         start = self._at
         self._write(offsets + struct.pack("<BQQQ", _FOOTER, 20, summary, start))
-        self._write(struct.pack("<I", self._sum) + _MAGIC)
+        self._write(struct.pack("<I", self._sum) + MAGIC)
 
     def _end_chunk(self) -> None:
         if self._parts:

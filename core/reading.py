@@ -254,16 +254,15 @@ def read_transients(
 
 
 def _streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None, processes: int | None) -> list[Stream]:
-    if processes == 1 or len(bags) == 1:
-        return [read_stream(bag, signals, progress) for bag in bags]
-    from uncertain_lti.reading_processes import processes_for, read_streams
+    if processes != 1 and len(bags) > 1:
+        from uncertain_lti.reading_processes import processes_for, read_streams
 
-    processes = processes_for(bags) if processes is None else processes
-    if processes == 1:
-        return [read_stream(bag, signals, progress) for bag in bags]
-    for bag in bags:
-        _paths(bag, signals)  # what is wrong with the map is found before anything is started
-    return read_streams(bags, signals, progress, processes)
+        processes = processes_for(bags) if processes is None else processes
+        if processes != 1:
+            for bag in bags:
+                _paths(bag, signals)  # what is wrong with the map is found before anything is started
+            return read_streams(bags, signals, progress, processes)
+    return [read_stream(bag, signals, progress) for bag in bags]
 
 
 def read_for_model(

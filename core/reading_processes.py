@@ -80,17 +80,24 @@ def _read(path: Path, contents: Sequence[Contents], signals: SignalMap) -> tuple
 
 
 @contextmanager
-def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that leave Ctrl-C to this one, which ends them where it breaks off."""
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+def children_ignore_ctrl_c() -> Iterator[None]:
+    """Processes that are started here leave Ctrl-C to this one; in another than the main thread it cannot be set."""
     main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None  # what a child is born with
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None
     try:
-        for _ in range(processes):
-            pool.submit(os.getpid)  # each starts a process as long as none is idle
+        yield
     finally:
         if main:
             signal.signal(signal.SIGINT, handler)
+
+
+@contextmanager
+def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that leave Ctrl-C to this one, which ends them where it breaks off."""
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    with children_ignore_ctrl_c():
+        for _ in range(processes):
+            pool.submit(os.getpid)  # each starts a process as long as none is idle
     try:
         yield pool
     except BaseException:

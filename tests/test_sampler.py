@@ -567,14 +567,19 @@ def test_latest_changes_nothing_and_is_what_would_be_fixed_now(case: tuple[Signa
     assert watched.counters == quiet.counters
 
 
-def test_the_held_value_outlives_any_number_of_messages_while_its_sample_is_open() -> None:
-    signals = two_topics(max_gap=1e6)
-    sampler = Sampler(signals)
+def flooded() -> Sampler:
+    """A sample is open, a control is held at it, and more controls have come than are kept."""
+    sampler = Sampler(two_topics(max_gap=1e6))
     sampler.push("/u", 1, 1, [-7.0])
     sampler.push("/c", 2, 2, [0.0])
     for stamp in range(3, 3 * BUFFERED_MESSAGES):
         sampler.push("/u", stamp, stamp, [float(stamp)])
         assert len(sampler._topics["/u"].kept) <= BUFFERED_MESSAGES
+    return sampler
+
+
+def test_the_held_value_outlives_any_number_of_messages_while_its_sample_is_open() -> None:
+    sampler = flooded()
     (step,) = sampler.push("/c", 10**6, 10**6, [0.0])
     assert step.u.tolist() == [-7.0] and step.status is Status.OK
     (step,) = sampler.push("/c", 2 * 10**6, 2 * 10**6, [0.0])
@@ -583,12 +588,7 @@ def test_the_held_value_outlives_any_number_of_messages_while_its_sample_is_open
 
 def test_what_has_been_forgotten_is_missing_and_not_replaced_by_something_older() -> None:
     """A clock so late that more messages arrive before it than are kept."""
-    signals = two_topics(max_gap=1e6)
-    sampler = Sampler(signals)
-    sampler.push("/u", 1, 1, [-7.0])
-    sampler.push("/c", 2, 2, [0.0])
-    for stamp in range(3, 3 * BUFFERED_MESSAGES):
-        sampler.push("/u", stamp, stamp, [float(stamp)])
+    sampler = flooded()
     end = 3 * BUFFERED_MESSAGES
     steps = [sampler.push("/c", end + k, stamp, [0.0])[0] for k, stamp in enumerate([100, end - 5, end - 1])]
     assert [s.u.tolist() for s in steps[:1]] == [[-7.0]]

@@ -199,12 +199,9 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.watch.follow(candidate)
             if self.active:
                 self._subscribe()
-        elif isinstance(candidate, Watch):
-            if self.watch is not None:
-                self._swap(candidate)
-            elif self._starts_itself:
-                self.start()
-        elif self.watch is None and self._starts_itself and any(p.name in RULE for p in parameters):
+        elif isinstance(candidate, Watch) and self.watch is not None:
+            self._swap(candidate)
+        elif self.watch is None and self._starts_itself:
             self.start()
 
     def _swap(self, watch: Watch) -> None:

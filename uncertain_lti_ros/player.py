@@ -318,7 +318,7 @@ class _Follower:
             )
 
     def _ask(self) -> dict[str, Any]:
-        """The status of from now on; asked for again where no answer comes, which changes nothing."""
+        """The status from now on; asked for again where no answer comes, which changes nothing."""
         began, asked = time.monotonic(), -math.inf
         self.status = {}
         futures: list[Future] = []

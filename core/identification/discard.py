@@ -126,7 +126,7 @@ def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
     stale = set(range(len(engine.rows)))
     while True:
         for i in stale:
-            gains[i] = _gains(engine, engine.rows[i], criterion)
+            gains[i] = _gains(engine, engine.rows[i]) if criterion == "qp" else _linear_gains(engine.rows[i])
         total: dict[int, float] = {}
         for i, row_gains in enumerate(gains):
             for index, gain in row_gains.items():
@@ -151,30 +151,29 @@ def _value(row: Row, criterion: str, weights: Array | None) -> float:
     return weight * row.scale**2 * float(d @ row.gram @ d + 2.0 * row.linear @ d)
 
 
-def _gains(engine: WorkingSet, row: Row, criterion: str) -> dict[int, float]:
-    """Fall of the row's objective without each of the samples that carry it."""
+def _gains(engine: WorkingSet, row: Row) -> dict[int, float]:
+    """Fall of the row's part of (10) without each of the samples that carry it."""
     if not row.unknown:
         return {}
-    if criterion == "lp":
-        return _linear_gains(row)
-    value = _value(row, criterion, engine.weights)
+    value = _value(row, "qp", engine.weights)
     gains = {}
     for index in row.samples.index[np.flatnonzero(row.slack() < _ACTIVE)].tolist():
         trial = _copy(row)
         _drop(trial, index)
-        _solve(engine, trial, criterion)
-        gains[index] = value - _value(trial, criterion, engine.weights)
+        _solve(engine, trial, "qp")
+        gains[index] = value - _value(trial, "qp", engine.weights)
     return gains
 
 
 def _linear_gains(row: Row) -> dict[int, float]:
-    """The same for δ of (11), by one programme whose rows are let go of in turn.
+    """Fall of δ of (11) likewise, by one programme whose rows are let go of in turn.
 
     δ falls only without a sample that has a price (a dual variable) in the optimum: without another one the same
     prices prove the same δ. The simplex method goes on from the optimum before, so each takes a few pivots.
     """
+    if not row.unknown:
+        return {}
     trial = _copy(row)
-    trial.pool = row.pool.copy()
     simplex = trial._minimax()
     owner, least = np.empty(0, dtype=np.intp), np.empty(0)
 

@@ -1,0 +1,30 @@
+"""What the benchmarks share: the least time, the peak memory of a process, tables as Markdown."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+
+def best(function, runs=3):
+    """Least wall time of some runs, s, and the last result."""
+    times = []
+    for _ in range(runs):
+        began = time.perf_counter()
+        result = function()
+        times.append(time.perf_counter() - began)
+    return min(times), result
+
+
+def peak_memory():
+    """Largest resident memory of this process, bytes; its maxrss would start from the parent's."""
+    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024
+
+
+def table(title, header, rows):
+    """Print a Markdown table."""
+    print(f"\n**{title}**\n")
+    for line in (header, ["---"] * len(header), *rows):
+        print("| " + " | ".join(line) + " |")
+    print(flush=True)
