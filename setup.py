@@ -1,8 +1,9 @@
 """Metadata and layout of the package, read by pip and by colcon; tool settings are in pyproject.toml."""
 
 from pathlib import Path
+from zlib import crc32
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
 
 NAME = "uncertain_lti_ros"
 CORE = {"uncertain_lti": "core"}
@@ -65,6 +66,16 @@ setup(
         *share("bags"),
         *share("config"),
         *share("launch"),
+    ],
+    # optional: without a C compiler and Python's headers the live node does in Python what is in there.
+    ext_modules=[
+        Extension(
+            f"{NAME}._course",
+            [f"{NAME}/_course.c"],
+            define_macros=[("SOURCE", str(crc32((ROOT / NAME / "_course.c").read_bytes())))],
+            extra_compile_args=["-O3", "-ffp-contract=off"],
+            optional=True,
+        )
     ],
     zip_safe=False,
     install_requires=["lz4", "mcap", "numpy>=1.26", "PyYAML", "rosbags", "tqdm", "zstandard"],

@@ -264,10 +264,9 @@ class EnvelopeMonitor:
         self._point = list(zip(self._steady[:size].tolist(), self._scale[:size].tolist(), strict=True))
         self._point_x = self._point[: model.n]
         self._limits = list(zip(self._least.tolist(), self._greatest.tolist(), strict=True))
-        nominal, spread = np.hstack([model.A, model.B]).tolist(), np.hstack([model.dA, model.dB]).tolist()
         self._rows = [
-            (a[0], d[0], list(zip(a[1:], d[1:], strict=True)), float(c), float(dc), float(v))
-            for a, d, c, dc, v in zip(nominal, spread, model.c, model.dc, model.v, strict=True)
+            (a[0], d[0], list(zip(a[1:], d[1:], strict=True)), c, dc, v)
+            for a, d, c, dc, v in zip(*(row.tolist() for row in self.rows), strict=True)
         ]
         self.alarm = False
         self._recent: deque[bool] = deque()
@@ -294,9 +293,34 @@ class EnvelopeMonitor:
 
     def expect(self, t_ns: int, z: Sequence[float], dt: float) -> Verdict:
         """`predict` for the instant t_ns after z = [x; u]: lower and upper of a verdict that counts nowhere."""
-        step = Step(Status.OK, t_ns, 0, dt, z, z[: self.model.n])
+        return self.look(Step(Status.OK, t_ns, 0, dt, z, z[: self.model.n]))
+
+    def look(self, step: Step) -> Verdict:
+        """Verdict on a complete step that counts nowhere."""
         judgement, outside = self._by_floats(step) if self._small else self._by_arrays(step)
         return Verdict(step, outside, self.alarm, judgement)
+
+    @property
+    def calm(self) -> bool:
+        """No alarm, and no violation among the verdicts that the alarm looks at."""
+        return not (self.alarm or self._violations)
+
+    def contained(self, count: int) -> None:
+        """So many verdicts were given elsewhere while all was calm, and none was a violation."""
+        room = self.rule.window - len(self._recent)
+        self._recent.extend([False] * min(count, room))
+
+    @property
+    def rows(self) -> tuple[Array, Array, Array, Array, Array]:
+        """[A B], [dA dB] (n, n + m), c, dc, v (n,) as the bounds take them."""
+        model = self.model
+        return np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB]), model.c, model.dc, model.v
+
+    @property
+    def point(self) -> tuple[Array, Array, Array, Array]:
+        """Steady values, scales, and the least and greatest normalised values seen in the fit, of [x; u] (n + m,)."""
+        size = self.model.n + self.model.m
+        return self._steady[:size], self._scale[:size], self._least, self._greatest
 
     def judge(self, step: Step, armed: bool = True) -> Verdict:
         """Verdict on one step of the sampler.

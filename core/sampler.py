@@ -86,11 +86,34 @@ class Step:
         return np.array(self.after, dtype=np.float64)
 
 
+Told = tuple[int, int]
+"""Stamp, 0 where there is none, and arrival of a message, ns."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a sampler stands whose messages have come in order; see `Sampler.standing`.
+
+    sample: the clock message that opened sample k, and its values. topics: of each other topic the instant of its
+    last message, the last closed sample, and the messages that may still be chosen with their values.
+    """
+
+    sample: tuple[Told, Sequence[float]]
+    topics: Mapping[str, tuple[int | None, Told | None, Sequence[tuple[Told, Sequence[float]]]]]
+
+
 @dataclass(slots=True)
 class _Message:
     arrival: int
     stamp: int | None
     values: list[float]
+
+    @classmethod
+    def told(cls, told: Told, values: Sequence[float] = ()) -> _Message:
+        return cls(told[1], told[0] or None, list(values))
+
+    def tell(self) -> Told:
+        return self.stamp or 0, self.arrival
 
 
 class _Topic:
@@ -219,6 +242,11 @@ class _Topic:
                 del self.forgotten[by_stamp]
             elif instant is not None:
                 self.forgotten[by_stamp] = max(first, instant + 1), last
+
+    @property
+    def in_order(self) -> bool:
+        """Nothing has been forgotten, and no time has stepped back that another may follow."""
+        return not (self.forgotten or self.leave or self.ahead or self.behind)
 
     def unwrapped(self, values: list[float]) -> list[float]:
         for i in self.unwrap:
@@ -362,13 +390,7 @@ class Sampler:
         if opens:
             self._history = {}
         if self._one_topic:
-            if self._clock_is_x:
-                x_next = message.values
-            else:
-                x_next = [math.nan] * self._n
-                for i, value in zip(self._where[self.clock], message.values, strict=True):
-                    if i < self._n:
-                        x_next[i] = value
+            x_next = message.values if self._clock_is_x else self._states_of(message)
             steps.append(self._step(status, message, dt, self._before, x_next))
         self._open, self._open_status, self._open_dt = message, status, dt
         self.counters["samples"] += 1
@@ -377,6 +399,14 @@ class Sampler:
         elif status is Status.RESET:
             self.counters["resets"] += 1
         return steps
+
+    def _states_of(self, message: _Message) -> list[float]:
+        """States that a clock message carries (n,), NaN for the others."""
+        x = [math.nan] * self._n
+        for i, value in zip(self._where[self.clock], message.values, strict=True):
+            if i < self._n:
+                x[i] = value
+        return x
 
     def _instant(self, sample: _Message) -> int:
         return sample.arrival if sample.stamp is None else sample.stamp
@@ -434,11 +464,73 @@ class Sampler:
                     self.counters[f"missing {signal.name}"] += 1
         return z
 
+    def places(self, topic: str) -> tuple[list[int], list[int]]:
+        """Where the values of a topic stand in [x; u], and the age up to which each may be used, ns."""
+        return list(self._where[topic]), [self._max_age[i] for i in self._where[topic]]
+
     def latest(self) -> tuple[int, list[float]] | None:
         """(t_ns, [x; u] (n + m)) of the open sample with what is known so far; None before the first sample."""
         if self._open is None:
             return None
         return self._instant(self._open), self._fix(self._open, final=False)
+
+    def standing(self) -> Standing | None:
+        """What is needed to go on elsewhere; None where messages do not come in order, or are more than numbers.
+
+        That is, where states are on several topics, and controls with a delay, angles unwrapped, or a step back of
+        time not over.
+        """
+        others = {topic: state for topic, state in self._topics.items() if topic != self.clock}
+        simple = self._one_topic and not self._delays and not any(state.unwrap for state in self._topics.values())
+        if self._open is None or not simple or not all(state.in_order for state in others.values()):
+            return None
+        return Standing(
+            (self._open.tell(), self._open.values),
+            {
+                topic: (
+                    state.last.get(state.header),
+                    state.closed[-1][0].tell() if state.closed else None,
+                    [(message.tell(), message.values) for message in state.kept],
+                )
+                for topic, state in others.items()
+            },
+        )
+
+    def go_on(
+        self,
+        sample: tuple[Told, Sequence[float]],
+        topics: Mapping[str, tuple[int | None, Sequence[tuple[Told, Sequence[float]]], Sequence[tuple[Told, Told]]]],
+        step: tuple[float, Sequence[float]] | None,
+    ) -> Step | None:
+        """Go on from where messages were taken to elsewhere since `standing`; what they count for is told apart.
+
+        Parameters
+        ----------
+        sample : tuple
+            As in `Standing`.
+        topics : mapping
+            Of each other topic the instant of its last message, the messages that may still be chosen, and each
+            sample closed meanwhile beside the message that it chose, `REMEMBERED_SAMPLES` of them at most.
+        step : (float, sequence of float) or None
+            dt and [x; u] of the transition that ends in the open sample; None where none was opened.
+
+        Returns
+        -------
+        Step or None
+            That transition.
+        """
+        for topic, (last, kept, closed) in topics.items():
+            state = self._topics[topic]
+            if last is not None:
+                state.last[state.header] = last
+            state.kept = deque(_Message.told(*message) for message in kept)
+            state.closed.extend((_Message.told(told), _Message.told(chosen)) for told, chosen in closed)
+        if step is None:
+            return None
+        self._open = message = _Message.told(*sample)
+        self._open_status, self._open_dt, self._before = Status.OK, step[0], list(step[1])
+        x_next = self._states_of(message)
+        return Step(Status.OK, self._instant(message), message.arrival, step[0], self._before, x_next)
 
 
 def all_finite(values: Sequence[float]) -> bool:

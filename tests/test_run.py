@@ -25,6 +25,8 @@ def run(tmp_path):
     checkout.mkdir()
     for name in ("run", "setup.py", "pyproject.toml", "constraints.txt"):
         shutil.copy(ROOT / name, checkout)
+    (checkout / "uncertain_lti_ros").mkdir()
+    shutil.copy(ROOT / "uncertain_lti_ros" / "_course.c", checkout / "uncertain_lti_ros")
     bin = tmp_path / "bin"
     bin.mkdir()
     for tool in "bash cat cksum dirname env grep rm sed tail uname".split():

@@ -99,6 +99,10 @@ class Arming:
             self._from = t_ns + self._grace
         return t_ns >= self._from
 
+    def counts_from(self, t_ns: int) -> bool:
+        """Whether every verdict from this instant on counts, until something is learnt or time jumps back."""
+        return bool(self.on) and self._from is not None and t_ns >= self._from
+
     def why_off(self) -> str:
         """What keeps alarms off, in words; empty where they are on."""
         if self.on is None:

@@ -36,6 +36,7 @@ from uncertain_lti.signals import FieldPath
 from uncertain_lti.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.arming import Condition
+from uncertain_lti_ros.course import Course, why_not
 from uncertain_lti_ros.journal import Journal
 from uncertain_lti_ros.layout import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
@@ -73,7 +74,8 @@ _type_fields = cache(live_fields)
 class _Output:
     """One topic of the node, and how many listen to it; takes serialised messages."""
 
-    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
+    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile, changed: Callable[[], None]) -> None:
+        self._changed = changed
         events = PublisherEventCallbacks(matched=self._matched)
         self.publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
         self.listeners = 0
@@ -82,6 +84,7 @@ class _Output:
 
     def _matched(self, event: Any) -> None:
         self.listeners = event.current_count
+        self._changed()
 
     def look(self) -> None:
         """Ask how many listen; events tell as well, and sooner."""
@@ -110,6 +113,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._clock = self.get_clock()
         self._simulated = self._clock.ros_time_is_active
         self._largest = round(self._real("largest_message") * _MIB)
+        self._course: Course | None = None
         self._recent: Recent | None = None  # kept while snapshots can be asked for
         self._album: Album | None = None
         self._snapshot_due: float | None = None
@@ -170,6 +174,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Make what the new values ask for, or say why not; it takes its place in `_on_have_set`."""
+        self._settle()
         given = {p.name: p.value for p in parameters}
         changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
         self._candidate = None
@@ -253,9 +258,9 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._reason = ""
         qos = QoSProfile(depth=_OUTPUT_DEPTH)
         for name in VECTORS:
-            self._outputs[name] = _Output(self, JointState, name, qos)
+            self._outputs[name] = _Output(self, JointState, name, qos, self._settle)
         beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=self._real("heartbeat")))
-        self._outputs["violation"] = _Output(self, Bool, "violation", beat)
+        self._outputs["violation"] = _Output(self, Bool, "violation", beat, self._settle)
         self._prepare_outputs()
         self.get_logger().info(f"configured with {Path(path).name}: {self.watch.model}")
         if self.watch.model.sampling.dt_median is None:
@@ -374,19 +379,25 @@ class EnvelopeMonitorNode(LifecycleNode):
                 )  # fmt: skip
 
     def _unsubscribe(self) -> None:
+        self._settle()
         self.active = False
         for subscription in self._inputs.values():
             subscription.destroy()
         self._inputs.clear()
 
     def _on_message(self, topic: str, data: bytes) -> None:
+        self._settle()
         if not self.active or self.watch is None:
             return
         try:
             self._take(self.watch, topic, data)
         except Exception as error:
-            self.note_failure(f"on a message of {topic}", error)
-            self.watch.failed()
+            self._note_failed_message(topic, error)
+
+    def _note_failed_message(self, topic: str, error: Exception) -> None:
+        self.note_failure(f"on a message of {topic}", error)
+        assert self.watch is not None
+        self.watch.failed()
 
     def _take(self, watch: Watch, topic: str, data: bytes) -> None:
         # The clock's own call makes three objects; without simulated time it says the same.
@@ -423,15 +434,54 @@ class EnvelopeMonitorNode(LifecycleNode):
             for name in JUDGED:
                 if outputs[name].listeners:
                     messages.append((outputs[name].send, self._plain(t_ns, verdict.packed(name))))
-        if opened and (outputs["predicted_lower"].listeners or outputs["predicted_upper"].listeners):
-            if (expected := watch.predict()) is not None:
-                for name, output in ((n, outputs[f"predicted_{n}"]) for n in ("lower", "upper")):
-                    messages.append((output.send, self._plain(expected.t_ns, expected.packed(name))))
+        wanted = [name for name in ("lower", "upper") if outputs[f"predicted_{name}"].listeners]
+        if opened and wanted and (expected := watch.predict()) is not None:
+            for name in wanted:
+                message = self._plain(expected.t_ns, expected.packed(name))
+                messages.append((outputs[f"predicted_{name}"].send, message))
         if turned:
             self._published = now
             messages.append((outputs["violation"].send, TRUE if watch.alarm else FALSE))
         for send, message in messages:
             send(message)
+
+    # --- messages that come in order, complete and within their bounds ---
+
+    def _go_on(self) -> None:
+        """Let compiled code take the messages where that is possible."""
+        watch = self.watch
+        if watch is None or not self.active or why_not():
+            return
+        if self._course is None or self._course.watch is not watch or self._course.monitor is not watch.monitor:
+            self._course = Course(watch, self._plain, self._marked)
+        if not self._course.began:
+            sends = {name: output.send for name, output in self._outputs.items() if output.listeners}
+            now = self._now if self._simulated else None
+            if self._course.resume(sends, now, self._recent is not None):
+                for topic, take in self._course.take.items():
+                    self._inputs[topic].shortcut = take
+
+    def _now(self) -> int:
+        now: int = self._clock.now().nanoseconds
+        return now
+
+    def _count(self) -> None:
+        """Note what compiled code has counted."""
+        if self._course is not None and self._course.began:
+            self._published = max(self._published, self._course.count())
+            if self._recent is not None:
+                for entry in self._course.entries():
+                    self._recent.add(entry)
+
+    def _settle(self) -> None:
+        """Have the watch stand where compiled code has come to, and go on by itself."""
+        if self._course is None or not self._course.began:
+            return
+        for subscription in self._inputs.values():
+            subscription.shortcut = None
+        self._count()
+        if (error := self._course.settle()) is not None:
+            self._note_failed_message(self._course.watch.sampler.clock, error)
 
     def _beat(self) -> None:
         assert self.watch is not None
@@ -442,7 +492,8 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_tick(self) -> None:
         self._simulated = self._clock.ros_time_is_active
-        for task in (self._keep_beating, self._look_around, self._keep_reporting, self._keep_album, self._keep_journal):
+        tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_album, self._keep_journal
+        for task in (self._count, *tasks, self._go_on):
             try:
                 task()
             except Exception as error:
@@ -456,6 +507,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = time.monotonic()
         if now - self._looked < _LOOK and not any(s.look_soon for s in self._inputs.values()):
             return
+        self._settle()
         self._looked = now
         for subscription in self._inputs.values():
             subscription.look()
@@ -548,6 +600,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         return problems
 
     def _report(self) -> None:
+        self._settle()
         now = self._reported = time.monotonic()
         if self.watch is not None and self.active:
             reports = self.watch.report(now, self._real("state_timeout"), self._problems())
@@ -597,6 +650,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     ) -> Trigger.Response:
         """Answer a call; what is refused is told, and what nobody foresaw as well."""
         try:
+            self._settle()
             serve(response)
         except UncertainLTIError as error:
             response.success, response.message = False, str(error)
@@ -670,7 +724,10 @@ def _run(args: list[str]) -> int:
     with living(EnvelopeMonitorNode, args) as life:
         node = life.node
         assert isinstance(node, EnvelopeMonitorNode)
-        node.get_logger().info(f"runs on the {life.executor_name}")
+        python = why_not()
+        node.get_logger().info(
+            f"runs on the {life.executor_name}, " + (f"in Python throughout: {python}" if python else "compiled")
+        )
         if node.get_parameter("autostart").value:
             node.start()
         gc.collect()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from uncertain_lti.signals import NORM, Derived, FieldPath, FieldType, TypeFields
@@ -36,6 +37,20 @@ class UnreadableError(Exception):
 
 class _UnfitError(Exception):
     """This message, or this type, has to be decoded."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where stamp and numbers stand in messages of one length.
+
+    A message is of the kind where each of its bytes under mask is that of want. stamp: where sec and nanosec begin,
+    -1 without a header. places: offset and code, f or d, of each number.
+    """
+
+    mask: bytes
+    want: bytes
+    stamp: int
+    places: tuple[tuple[int, str], ...]
 
 
 class MessageReader:
@@ -65,6 +80,11 @@ class MessageReader:
         self._fields, self._decode = type_fields, decode
         self._layouts: list[_Layout] = []
         self._budget = float(_BUDGET)
+
+    @property
+    def plan(self) -> Plan | None:
+        """Where the numbers of the messages stand that look like the last one; None where that is not so simple."""
+        return self._layouts[0].plan if self._layouts else None
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]]:
         """Header stamp in ns (None without a header, or where it is zero) and one value per path.
@@ -151,6 +171,7 @@ class _Layout:
         walk.message(type_name, [(want, want.path.steps) for want in every])
         self._shape = _shape(data, [(0, 2), *walk.shape])
         places = [place for want in every for place in want.places]
+        self._places = [want.places for want in every]
         order = sorted(set(places))
         self._unpack = _struct(order).unpack_from
         where = {place: i for i, place in enumerate(order)}
@@ -161,6 +182,22 @@ class _Layout:
         self._derived: list[tuple[Derived | None, list[str] | None, int]] = [
             (want.path.derived, want.names, len(want.places)) for want in wants
         ]
+
+    @property
+    def plan(self) -> Plan | None:
+        """For messages of plain numbers."""
+        if any(derived is not None or count != 1 for derived, _, count in self._derived):
+            return None
+        sec, nanosec, numbers = -1, -1, [places[0] for places in self._places[self._first :]]
+        if self._stamped:
+            (sec, _), (nanosec, _) = self._places[0][0], self._places[1][0]
+        if any(code not in "fd" for _, code in numbers) or (self._stamped and nanosec != sec + 4):
+            return None
+        mask, want = bytearray(self._size), bytearray(self._size)
+        for start, stop, under, wanted in self._shape:
+            mask[start:stop] = under.to_bytes(stop - start, "little")
+            want[start:stop] = wanted.to_bytes(stop - start, "little")
+        return Plan(bytes(mask), bytes(want), sec, tuple(numbers))
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]] | None:
         """Stamp and values; None where the message looks otherwise."""
@@ -349,7 +386,9 @@ def _shape(data: bytes, places: list[tuple[int, int]]) -> list[tuple[int, int, i
     for start, size in sorted(places):
         stop = start + size
         if stretches and start - stretches[-1][1] < _NEAR:
-            stretches[-1] = (stretches[-1][0], stop, [*stretches[-1][2], (start, stop)])
+            begin, _, parts = stretches[-1]
+            parts.append((start, stop))
+            stretches[-1] = begin, stop, parts
         else:
             stretches.append((start, stop, [(start, stop)]))
     found = []

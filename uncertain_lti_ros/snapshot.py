@@ -12,15 +12,38 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Protocol
 
 from uncertain_lti.errors import ModelError, UncertainLTIError
 from uncertain_lti.mcap_writer import McapWriter
-from uncertain_lti.monitor import Verdict
 from uncertain_lti.verdict_messages import FALSE, JUDGED, TOPICS, TRUE, NamedVector
 from uncertain_lti_ros.messages import definition
 
 _OVERHEAD = 800  # bytes that one kept message takes beside its data, a verdict on it included
 _PER_STATE = 200  # and for each state of a verdict
+
+
+class Told(Protocol):
+    """What a file tells of a verdict; `Verdict` is one."""
+
+    @property
+    def t_ns(self) -> int:
+        """The sample's instant."""
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+
+    @property
+    def judged(self) -> bool:
+        """Whether there is a verdict."""
+
+    @property
+    def outside_domain(self) -> bool:
+        """The sample before lies outside the ranges seen in the fit."""
+
+    def packed(self, name: str) -> bytes:
+        """One of `NUMBERS` as little-endian doubles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +54,7 @@ class Entry:
     arrival_ns: int
     topic: str
     data: bytes
-    verdicts: Sequence[Verdict]
+    verdicts: Sequence[Told]
     alarm: bool
 
 

@@ -13,7 +13,7 @@ from uncertain_lti.monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.sampler import Sampler, Status, all_finite, to_ns
 from uncertain_lti.signals import FieldPath, TypeFields
 from uncertain_lti_ros.arming import Arming, Condition
-from uncertain_lti_ros.layout import MessageReader, UnreadableError
+from uncertain_lti_ros.layout import MessageReader, Plan, UnreadableError
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of diagnostic_msgs/DiagnosticStatus."""
@@ -282,6 +282,37 @@ class Watch:
             verdicts.append(verdict)
             self._count(verdict, before, now)
         return verdicts, sampler.counters["samples"] > samples
+
+    def plan(self, topic: str) -> Plan | None:
+        """Where the numbers of a topic's messages stand, as far as that is known and simple."""
+        return self._readers[topic].plan
+
+    @property
+    def calm(self) -> bool:
+        """Verdicts within their bounds change nothing but counts, as there is no alarm, and each counts for one."""
+        if self.latched or not self.monitor.calm or self.enable_topic in self._readers:
+            return False
+        latest = self.sampler.latest()
+        return latest is not None and self.arming.counts_from(latest[0])
+
+    def have_been_contained(
+        self, count: int, outside_domain: int, judged: float, topics: Mapping[str, tuple[int, float]]
+    ) -> None:
+        """So many samples were judged elsewhere while all was calm, the last one at `judged`, and lay within bounds.
+
+        topics: messages that came on each topic, and when the last one did.
+        """
+        for topic, (received, heard) in topics.items():
+            if received:
+                self.received[topic] += received
+                self._heard[topic] = heard
+        if count:
+            self.sampler.counters["samples"] += count
+            self.monitor.contained(count)
+            self._judged = judged
+            self.verdicts += count
+            self._period.verdicts += count
+            self._period.outside += outside_domain
 
     def _learn_condition(self, topic: str, data: bytes) -> None:
         assert self._reads_condition is not None
