@@ -960,6 +960,8 @@ Course_pause(Course *self, PyObject *Py_UNUSED(ignored))
     if (!topics)
         return NULL;
     self->running = 0;
+    Py_CLEAR(self->arrival);
+    Py_CLEAR(self->log);
     {
         PyObject *failure = self->failure ? self->failure : Py_NewRef(Py_None);
         self->failure = NULL;

@@ -20,6 +20,7 @@ from zlib import crc32
 
 import numpy as np
 
+from uncertain_lti.sampler import all_finite
 from uncertain_lti.verdict_messages import JUDGED, NamedVector
 from uncertain_lti_ros.layout import Plan
 from uncertain_lti_ros.snapshot import Entry
@@ -128,7 +129,9 @@ class Course:
         watch = self.watch
         standing = watch.sampler.standing() if watch.calm else None
         plans = [watch.plan(topic) for topic in self._topics]
-        if standing is None or None in plans or any(len(kept) > _KEPT for *_, kept in standing.topics.values()):
+        if standing is None or None in plans or not all_finite(standing.sample[1]):
+            return False
+        if any(len(kept) > _KEPT for *_, kept in standing.topics.values()):
             return False
         topics = []
         for topic, plan in zip(self._topics, plans, strict=True):

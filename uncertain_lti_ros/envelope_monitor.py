@@ -55,6 +55,7 @@ _SUMMARY = (
 )
 VECTORS = ("flags", *JUDGED, "predicted_lower", "predicted_upper")
 """Topics below the node's name that carry one number per state as sensor_msgs/JointState."""
+_TICK = 0.2  # s between two looks at what goes by time
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
 _NOTE = 0.05  # s between two looks for what the log should say
 _OUTPUT_DEPTH = 1000
@@ -97,6 +98,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         declare(self, PARAMETERS)
+        self._reals: dict[str, float] = {}
         self.watch: Watch | None = None
         self.active = False
         self._reason = ""  # why the last configure failed
@@ -127,7 +129,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._on_have_set)
-        tick = min(0.1, self._real("heartbeat") / 4, self._real("diagnostics_period") / 2)
+        tick = min(_TICK, self._real("heartbeat") / 4, self._real("diagnostics_period") / 2)
         self.create_timer(tick, self._on_tick, clock=self._steady)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
@@ -135,7 +137,9 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- parameters ---
 
     def _real(self, name: str) -> float:
-        return float(self.get_parameter(name).value)
+        if name not in self._reals:  # to ask rclpy takes 10 µs
+            self._reals[name] = float(self.get_parameter(name).value)
+        return self._reals[name]
 
     def _rule(self, changes: dict[str, Any]) -> Rule:
         return Rule(**{name: changes.get(name, self.get_parameter(name).value) for name in RULE})
@@ -197,6 +201,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _on_have_set(self, parameters: Sequence[Parameter]) -> None:
+        self._reals.clear()
         if any(p.name == "largest_message" for p in parameters):
             self._largest = round(self._real("largest_message") * _MIB)
         candidate, self._candidate = self._candidate, None
@@ -530,7 +535,14 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._enable_problem = ""
 
     def _keep_reporting(self) -> None:
-        if time.monotonic() - self._reported >= self._real("diagnostics_period"):
+        now = time.monotonic()
+        if now - self._reported < self._real("diagnostics_period"):
+            return
+        if self.watch is not None and self.active and not self._diagnostics.get_subscription_count():
+            self._reported = now
+            self.watch.pass_over(now)
+            self._note_told()
+        else:
             self._report()
 
     def _keep_journal(self) -> None:
@@ -623,8 +635,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             reports = [Report(level, "monitor", message, {"unexpected errors": str(self._failures)})]
             if self.watch is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.watch.model.state_names]
-        self._failures_told = self._failures
-        self._told = {topic: (subscription.lost, subscription.late) for topic, subscription in self._inputs.items()}
+        self._note_told()
         full_name = self.get_fully_qualified_name().lstrip("/")
         hardware = str(self.get_parameter("hardware_id").value) or self.get_name()
         message = DiagnosticArray()
@@ -642,6 +653,10 @@ class EnvelopeMonitorNode(LifecycleNode):
                 )
             )
         self._diagnostics.publish(message)
+
+    def _note_told(self) -> None:
+        self._failures_told = self._failures
+        self._told = {topic: (subscription.lost, subscription.late) for topic, subscription in self._inputs.items()}
 
     # --- services ---
 

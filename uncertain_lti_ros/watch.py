@@ -101,6 +101,14 @@ def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> di
     return types
 
 
+def _held(model: UncertainLTI, signals: Sequence[int]) -> float:
+    """How long the last values of these signals may be used, s."""
+    if any(i < model.n for i in signals):
+        return 0.0
+    holds = [model.signals.signals[i].max_hold for i in signals]
+    return max(math.inf if hold is None else hold for hold in holds)
+
+
 class Watch:
     """Samples and judges the messages of one model, and keeps count.
 
@@ -149,6 +157,7 @@ class Watch:
             topic: make_reader(types[topic], [FieldPath(signals.signals[i].field) for i in signals.on(topic)])
             for topic in signals.topics
         }
+        self._held = {topic: _held(model, signals.on(topic)) for topic in signals.topics}
         self._unknown = {topic: [math.nan] * len(signals.on(topic)) for topic in signals.topics}
         self.arming = arming if arming is not None else Arming(None, 0)
         self.follow(rule)
@@ -371,13 +380,7 @@ class Watch:
 
     def held(self, topic: str) -> float:
         """Seconds that what a topic said last may be used for; infinite where the model sets no limit."""
-        if topic not in self._readers:
-            return math.inf  # that of the enable condition
-        signals = self.model.signals
-        chosen = [signals.signals[i] for i in signals.on(topic)]
-        if any(signal in signals.states for signal in chosen):
-            return 0.0
-        return max(math.inf if signal.max_hold is None else signal.max_hold for signal in chosen)
+        return self._held.get(topic, math.inf)  # infinite for that of the enable condition
 
     def without_verdict(self, now: float) -> float:
         """Seconds since the last verdict, or since the start."""
@@ -387,17 +390,22 @@ class Watch:
         """Seconds since the last message of the clock topic."""
         return now - self._heard.get(self.sampler.clock, self._began)
 
+    def pass_over(self, now: float) -> _Period:
+        """The next report is of what happens from now on; returns what has happened until now."""
+        period, self._period = self._period, _Period(now)
+        self._period.alarm = self.alarm
+        self._period.late = self.late
+        self._period.unreadable = self.unreadable.total()
+        self._period.future = self.future.total()
+        return period
+
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
         """Statuses of the monitor and of each state since the last call.
 
         A state without a verdict for state_timeout s is STALE, never contained. problems are what the outside has
         to say (publishers that cannot be heard, lost messages); they make the monitor's status at least WARN.
         """
-        period, self._period = self._period, _Period(now)
-        self._period.alarm = self.alarm
-        self._period.late = self.late
-        self._period.unreadable = self.unreadable.total()
-        self._period.future = self.future.total()
+        period = self.pass_over(now)
         without = self.without_verdict(now)
         reports = [self._report_monitor(period, now, without, state_timeout, problems)]
         for i, name in enumerate(self.model.state_names):
