@@ -25,9 +25,13 @@ KEPT_OVER_A_JUMP = 100
 """Messages kept per topic, whatever has been chosen, once its time has stepped back and the clock's has not yet."""
 
 
+LONGEST_NS = 2**62
+"""Longer than any recording; what is longer still counts as this."""
+
+
 def to_ns(seconds: float) -> int:
-    """Seconds to whole nanoseconds; infinity becomes a step longer than any recording."""
-    return round(seconds * 1e9) if math.isfinite(seconds) else 2**62
+    """Seconds to whole nanoseconds, `LONGEST_NS` at most."""
+    return min(round(seconds * 1e9), LONGEST_NS) if math.isfinite(seconds) else LONGEST_NS
 
 
 class Status(StrEnum):
@@ -308,7 +312,9 @@ class Sampler:
             topic: slice(where[0], where[-1] + 1) if where == list(range(where[0], where[-1] + 1)) else None
             for topic, where in self._where.items()
         }
-        self._max_age = [skew_ns] * n + [2**62 if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls]
+        self._max_age = [skew_ns] * n + [
+            LONGEST_NS if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls
+        ]
         self._least_max_age = {t: min(self._max_age[i] for i in where) for t, where in self._where.items()}
         self._one_topic = all(s.topic == self.clock for s in signals.states)
         self._clock_is_x = self._where[self.clock] == list(range(n))

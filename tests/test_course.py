@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -147,6 +148,12 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             rclpy.try_shutdown()
 
 
+def end(nodes: list[Node]) -> None:
+    for node in nodes:
+        node.finish()
+        node.destroy_node()
+
+
 def saved(path: Path, n: int, rng: np.random.Generator, margin: float = 1.0, clock: str = "header") -> UncertainLTI:
     """n states; two controls by stamps, one by arrival; bounds that the signals of `stream` seldom leave."""
     steady, scale = rng.normal(size=n + 3), rng.uniform(0.5, 2.0, n + 3)
@@ -266,9 +273,7 @@ def test_it_publishes_and_counts_what_python_does(
         assert nodes[0].sent == nodes[1].sent
         taken += nodes[0].taken
         assert nodes[1].taken == 0 < nodes[1].watch.verdicts
-        for node in nodes:
-            node.finish()
-            node.destroy_node()
+        end(nodes)
     assert taken > (5 if rate > 0.1 else 100)
 
 
@@ -296,9 +301,7 @@ def test_an_alarm_is_raised_latched_and_reset_as_by_python(ros: None, tmp_path: 
     assert nodes[0].standing() == nodes[1].standing()
     assert nodes[0].sent == nodes[1].sent
     assert nodes[0].watch.alarms == 1 and nodes[0].taken > 100
-    for node in nodes:
-        node.finish()
-        node.destroy_node()
+    end(nodes)
 
 
 @needs_compiled
@@ -322,8 +325,7 @@ def test_an_output_that_fails_is_told_and_the_node_goes_on(ros: None, tmp_path: 
         node.arrive(*message)
     assert node._failures == node.watch.failures > 0
     assert node.watch.verdicts > 45 and node.taken > 30
-    node.finish()
-    node.destroy_node()
+    end([node])
 
 
 @needs_compiled
@@ -343,5 +345,65 @@ def test_what_does_not_fit_together_is_refused_and_nothing_is_read_beyond_a_mess
         compiled.resume((1, 1, bytes(8)), (), None, None)
     with pytest.raises(TypeError):
         compiled.sample("text")
-    node.finish()
-    node.destroy_node()
+    end([node])
+
+
+@needs_compiled
+def test_formats_that_come_and_go_are_learnt_as_by_python(ros: None, tmp_path: Path) -> None:
+    """A message taken by compiled code pays for a layout as one taken by Python does."""
+    rng = np.random.default_rng(9)
+    model = saved(tmp_path / "model.json", 3, rng)
+    nodes = [Node(tmp_path / "model.json", compiled) for compiled in (True, False)]
+    for k, (at, topic, data) in enumerate(stream(model, rng, 6000, 0.0)):
+        if topic == STATE:
+            x = np.frombuffer(data[-40:-16])
+            data = vector(at, {f"x{i}": x[i] for i in range(3)}, "f" * (k // 100 % 20))
+        for node in nodes:
+            node.arrive(at, topic, data)
+            if k % 10 == 0:
+                node._on_tick()
+    assert nodes[0].standing() == nodes[1].standing()
+    assert nodes[0].watch.decoded == nodes[1].watch.decoded
+    assert nodes[0].taken > 0.6 * nodes[1].watch.verdicts
+    end(nodes)
+
+
+@needs_compiled
+@pytest.mark.parametrize("name", ["max_hold", "max_gap", "dt_median"])
+def test_durations_without_end_are_as_good_as_others(ros: None, tmp_path: Path, name: str) -> None:
+    rng = np.random.default_rng(10)
+    model = saved(tmp_path / "model.json", 3, rng)
+    said = json.loads((tmp_path / "model.json").read_text())
+    if name == "max_hold":
+        said["controls"][0][name] = 1e10
+    else:
+        said["sampling"][name] = 1e10
+    (tmp_path / "model.json").write_text(json.dumps(said))
+    nodes = [Node(tmp_path / "model.json", compiled) for compiled in (True, False)]
+    for k, message in enumerate(stream(model, rng, 60, 0.0)):
+        for node in nodes:
+            node.arrive(*message)
+            if k % 10 == 0:
+                node._on_tick()
+    assert nodes[0].standing() == nodes[1].standing()
+    assert nodes[0].sent == nodes[1].sent
+    assert not nodes[0]._failures and (nodes[0].taken > 20 or name == "dt_median")
+    end(nodes)
+
+
+@needs_compiled
+def test_a_clock_that_fails_is_told_and_the_sampler_starts_anew(ros: None, tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    model = saved(tmp_path / "model.json", 3, rng)
+    nodes = [Node(tmp_path / "model.json", compiled) for compiled in (True, False)]
+    for k, message in enumerate(stream(model, rng, 60, 0.0)):
+        for node in nodes:
+            if k == 60:
+                node._clock.now = lambda: 1 / 0
+            node.arrive(*message)
+            node._clock = Clock()
+            node._on_tick()
+    assert nodes[0].standing() == nodes[1].standing()
+    assert nodes[0].sent == nodes[1].sent
+    assert nodes[0].watch.failures == nodes[0]._failures == 1 and nodes[0].taken > 20
+    end(nodes)

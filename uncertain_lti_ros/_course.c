@@ -723,12 +723,18 @@ Course_sample(Course *self, PyObject *data)
     }
     if (!self->running)
         Py_RETURN_FALSE;
-    if (!times(self, &arrival, &now))
-        return NULL;
+    if (!times(self, &arrival, &now)) {
+        if (!PyErr_ExceptionMatches(PyExc_Exception))
+            return NULL;
+        PyErr_Clear(); /* whoever takes the message meets the same */
+        self->running = 0;
+        Py_RETURN_FALSE;
+    }
     done = read_message(&self->topic[0], PyBytes_AS_STRING(data), PyBytes_GET_SIZE(data), arrival, &opened, self->fresh);
     if (done)
         done = judge(self, &opened, now, data);
-    self->running = done == 1;
+    if (done != 1)
+        self->running = 0;
     if (done < 0) { /* the sample is judged all the same */
         PyObject *type, *value, *trace;
         PyErr_Fetch(&type, &value, &trace);
@@ -760,8 +766,13 @@ Course_other(Course *self, PyObject *const *args, Py_ssize_t given)
     }
     if (!self->running)
         Py_RETURN_FALSE;
-    if (!times(self, &arrival, &now))
-        return NULL;
+    if (!times(self, &arrival, &now)) {
+        if (!PyErr_ExceptionMatches(PyExc_Exception))
+            return NULL;
+        PyErr_Clear(); /* whoever takes the message meets the same */
+        self->running = 0;
+        Py_RETURN_FALSE;
+    }
     self->running = keep(&self->topic[k], PyBytes_AS_STRING(args[1]), PyBytes_GET_SIZE(args[1]), arrival, now,
                          self->max_gap);
     if (self->running && note(self, k, args[1], arrival, now, NULL))
@@ -814,6 +825,10 @@ Course_resume(Course *self, PyObject *args)
     long long stamp, arrival;
     const char *from;
     Topic *clock = &self->topic[0];
+    if (!self->open_values) {
+        PyErr_SetString(PyExc_RuntimeError, "not made yet");
+        return NULL;
+    }
     if (!PyArg_ParseTuple(args, "(LLS)O!OO", &stamp, &arrival, &values, &PyTuple_Type, &topics, &tells,
                           &log))
         return NULL;

@@ -20,7 +20,7 @@ from zlib import crc32
 
 import numpy as np
 
-from uncertain_lti.sampler import all_finite
+from uncertain_lti.sampler import LONGEST_NS, all_finite, to_ns
 from uncertain_lti.verdict_messages import JUDGED, NamedVector
 from uncertain_lti_ros.layout import Plan
 from uncertain_lti_ros.snapshot import Entry
@@ -108,7 +108,7 @@ class Course:
             margin=rule.margin,
             max_gap=sampler.max_gap_ns,
             min_step=sampler.min_step_ns,
-            usual_step=-1 if dt is None else round(dt * 1e9),
+            usual_step=-1 if dt is None else to_ns(dt),
             usual_dt=math.nan if dt is None else dt,
             plain=(plain.template, plain.position),
             marked=(marked.template, marked.position, marked.velocity),
@@ -127,7 +127,9 @@ class Course:
         remember: what comes is wanted from `entries`.
         """
         watch = self.watch
-        standing = watch.sampler.standing() if watch.calm else None
+        dt = watch.model.sampling.dt_median
+        usual = dt is None or to_ns(dt) < LONGEST_NS  # further on there is no stamp for what is predicted
+        standing = watch.sampler.standing() if usual and watch.calm else None
         plans = [watch.plan(topic) for topic in self._topics]
         if standing is None or None in plans or not all_finite(standing.sample[1]):
             return False

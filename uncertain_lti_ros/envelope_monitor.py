@@ -413,12 +413,12 @@ class EnvelopeMonitorNode(LifecycleNode):
         turned = watch.alarm != alarm
         if turned:
             self._journal.turned(watch, verdicts, now)
-        if verdicts or opened or turned:
-            self._publish(watch, verdicts, opened, now, turned)
         if self._recent is not None:
             self._recent.add(Entry(now, arrival, topic, data, verdicts, watch.alarm))
             if watch.alarms > alarms and self._snapshot_due is None:
                 self._snapshot_due = now + self._real("snapshot.after")
+        if verdicts or opened or turned:
+            self._publish(watch, verdicts, opened, now, turned)
 
     def _publish(self, watch: Watch, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
         """Publish what is listened to; turned: the alarm did, which is said in any case.

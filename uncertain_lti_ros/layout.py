@@ -115,6 +115,10 @@ class MessageReader:
             self._learn(data, stamp, values)
         return stamp, values
 
+    def fitted(self, count: int) -> None:
+        """So many messages fitted `plan` elsewhere."""
+        self._budget = min(float(_BUDGET), self._budget + 0.01 * count)
+
     def _learn(self, data: bytes, stamp: int | None, values: list[float]) -> None:
         try:
             layout = _Layout(data, self.type_name, self._paths, self._fields)
@@ -188,16 +192,18 @@ class _Layout:
         """For messages of plain numbers."""
         if any(derived is not None or count != 1 for derived, _, count in self._derived):
             return None
-        sec, nanosec, numbers = -1, -1, [places[0] for places in self._places[self._first :]]
+        numbers, stamp = [places[0] for places in self._places[self._first :]], -1
         if self._stamped:
-            (sec, _), (nanosec, _) = self._places[0][0], self._places[1][0]
-        if any(code not in "fd" for _, code in numbers) or (self._stamped and nanosec != sec + 4):
+            (stamp, seconds), nanoseconds = self._places[0][0], self._places[1][0]
+            if seconds != "i" or nanoseconds != (stamp + 4, "I"):
+                return None
+        if any(code not in "fd" for _, code in numbers):
             return None
         mask, want = bytearray(self._size), bytearray(self._size)
         for start, stop, under, wanted in self._shape:
             mask[start:stop] = under.to_bytes(stop - start, "little")
             want[start:stop] = wanted.to_bytes(stop - start, "little")
-        return Plan(bytes(mask), bytes(want), sec, tuple(numbers))
+        return Plan(bytes(mask), bytes(want), stamp, tuple(numbers))
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]] | None:
         """Stamp and values; None where the message looks otherwise."""

@@ -315,6 +315,7 @@ class Watch:
             if received:
                 self.received[topic] += received
                 self._heard[topic] = heard
+                self._readers[topic].fitted(received)
         if count:
             self.sampler.counters["samples"] += count
             self.monitor.contained(count)
