@@ -1,6 +1,7 @@
 """The live monitor beside a bare rclpy node on the same topics: CPU per sample, time to the flag, losses, memory.
 
     ./run python benchmarks/live_monitor.py                        # the table: rates 500 Hz and 1 kHz, n = 5 and 50
+    ./run python benchmarks/live_monitor.py --left 0.003           # the same, three in a thousand samples out of bounds
     ./run python benchmarks/live_monitor.py --soak 600             # ten minutes at 1 kHz: memory and counters
 
 What the ratios are held against: with every output heard at most 0.6 times the CPU of the bare node on the default
@@ -63,8 +64,8 @@ def save_model(path: Path, n: int, rate: float) -> None:
 # --- the processes ------------------------------------------------------------------------------------------
 
 
-def publish(n: int, rate: float, seconds: float) -> None:
-    """Prints how many samples it sent, once both topics have a subscriber."""
+def publish(n: int, rate: float, seconds: float, left: float) -> None:
+    """Prints how many samples it sent, once both topics have a subscriber; left: share of them out of bounds."""
     import rclpy
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
@@ -81,6 +82,7 @@ def publish(n: int, rate: float, seconds: float) -> None:
     x, u = NamedVector([f"x{i}" for i in range(n)]), NamedVector([f"u{j}" for j in range(CONTROLS[n])])
     rng = np.random.default_rng(2)
     values = rng.uniform(-0.05, 0.05, (1000, n + CONTROLS[n]))
+    values[rng.random(1000) < left, 0] = 10.0
     rows = [(row[:n].tobytes(), row[n:].tobytes()) for row in values]
     began, sent = time.perf_counter(), 0
     print("begins", flush=True)
@@ -303,8 +305,8 @@ def status(domain: int) -> dict[str, Any]:
 class Run:
     """One subject, one rate, one size: the processes, and what was measured of them."""
 
-    def __init__(self, n: int, rate: float, seconds: float) -> None:
-        self.n, self.rate, self.seconds = n, rate, seconds
+    def __init__(self, n: int, rate: float, seconds: float, left: float = 0.0) -> None:
+        self.n, self.rate, self.seconds, self.left = n, rate, seconds, left
         self.domain = random.randint(1, 100)
         self.env = os.environ | {
             "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -340,7 +342,8 @@ class Run:
                 else:
                     subject = self.part("delay" if delays else "take", executor)
                     subject.line()
-                publisher = self.part("publish", str(self.n), str(self.rate), str(self.seconds + WARM_UP))
+                length = str(self.seconds + WARM_UP)
+                publisher = self.part("publish", str(self.n), str(self.rate), length, str(self.left))
                 publisher.line()
                 time.sleep(WARM_UP)
                 cpu, began = subject.cpu, time.perf_counter()
@@ -374,7 +377,7 @@ LIMITS = (
 )
 
 
-def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int) -> None:
+def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, left: float) -> None:
     from uncertain_lti.report import table
 
     rows, held = [], []
@@ -384,13 +387,13 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int) 
             late = {"bare": float("inf"), "monitor": float("inf")}  # p99, ms
             for _ in range(repeats):
                 for name, subject in SUBJECTS.items():
-                    found = Run(n, rate, seconds).measure(*subject)
+                    found = Run(n, rate, seconds, left).measure(*subject)
                     if "delays" in found:
                         late["monitor"] = min(late["monitor"], float(np.percentile(found["delays"][100:], 99)) / 1e6)
                     known = best.get(name, found)
                     worst = {key: max(found[key], known[key]) for key in ("missed", "unheard") if key in found}
                     best[name] = (found if found["cpu"] <= known["cpu"] else known) | worst
-                delay = Run(n, rate, seconds).measure("take", "events", [], delays=True)["delays"]
+                delay = Run(n, rate, seconds, left).measure("take", "events", [], delays=True)["delays"]
                 late["bare"] = min(late["bare"], float(np.percentile(delay[100:], 99)) / 1e6)
             default, events = best["bare, default executor"]["cpu"], best["bare, events executor"]["cpu"]
             for name, found in best.items():
@@ -453,7 +456,7 @@ def soak(seconds: float, rate: float, n: int) -> dict[str, Any]:
             hearer = run.part("hear", *OUTPUTS)
             hearer.line()
             status(run.domain)
-            publisher = run.part("publish", str(n), str(rate), str(seconds))
+            publisher = run.part("publish", str(n), str(rate), str(seconds), "0")
             publisher.line()
             began, memory = time.perf_counter(), []
             warm = min(60.0, seconds / 3)
@@ -503,13 +506,14 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--rates", type=float, nargs="+", default=[500.0, 1000.0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[5, 50], choices=list(CONTROLS))
+    parser.add_argument("--left", type=float, default=0.0, metavar="SHARE", help="of samples out of bounds")
     parser.add_argument("--soak", type=float, metavar="S", help="instead, run the monitor for S seconds at 1 kHz")
     parser.add_argument("--part", nargs="+", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.part:
         kind, *rest = args.part
         if kind == "publish":
-            publish(int(rest[0]), float(rest[1]), float(rest[2]))
+            publish(int(rest[0]), *map(float, rest[1:]))
         elif kind == "hear":
             hear(rest)
         elif kind == "relay":
@@ -521,7 +525,7 @@ def main() -> None:
         if not (found["exact"] and found["growth"] < 1.0):
             raise SystemExit(1)
     else:
-        compare(args.rates, args.sizes, args.seconds, args.repeats)
+        compare(args.rates, args.sizes, args.seconds, args.repeats, args.left)
 
 
 if __name__ == "__main__":

@@ -301,14 +301,19 @@ class EnvelopeMonitor:
         return Verdict(step, outside, self.alarm, judgement)
 
     @property
-    def calm(self) -> bool:
-        """No alarm, and no violation among the verdicts that the alarm looks at."""
-        return not (self.alarm or self._violations)
+    def window(self) -> bytes:
+        """The verdicts that the alarm looks at, oldest first; 1 for a violation that counts."""
+        return bytes(self._recent)
 
-    def contained(self, count: int) -> None:
-        """So many verdicts were given elsewhere while all was calm, and none was a violation."""
-        room = self.rule.window - len(self._recent)
-        self._recent.extend([False] * min(count, room))
+    def go_on(self, window: bytes) -> None:
+        """The verdicts that the alarm looks at were given elsewhere, and the alarm has not turned."""
+        self._recent = deque(map(bool, window))
+        self._violations = sum(window)
+
+    @property
+    def counted(self) -> bytes:
+        """Of each state whether its violations count for the alarm (n,)."""
+        return self._counted.tobytes()
 
     @property
     def rows(self) -> tuple[Array, Array, Array, Array, Array]:

@@ -98,12 +98,18 @@ Told = tuple[int, int]
 class Standing:
     """Where a sampler stands whose messages have come in order; see `Sampler.standing`.
 
-    sample: the clock message that opened sample k, and its values. topics: of each other topic the instant of its
-    last message, the last closed sample, and the messages that may still be chosen with their values.
+    sample: the clock message that opened sample k, and its values. dt: the step to it, s. before: [x; u] of sample k-1.
+    topics: of each topic but the clock's the instant of its last message, the last closed sample, and the messages
+    that may still be chosen with their values. previous: of each topic the last of its angles that are unwrapped.
+    lines: of each delayed control its values at the samples closed last, as many as the delay.
     """
 
     sample: tuple[Told, Sequence[float]]
+    dt: float
+    before: Sequence[float]
     topics: Mapping[str, tuple[int | None, Told | None, Sequence[tuple[Told, Sequence[float]]]]]
+    previous: Mapping[str, Sequence[float]]
+    lines: Sequence[Sequence[float]]
 
 
 @dataclass(slots=True)
@@ -129,6 +135,7 @@ class _Topic:
         "kept",
         "forgotten",
         "last",
+        "left",
         "ahead",
         "behind",
         "leave",
@@ -143,6 +150,7 @@ class _Topic:
         self.kept: deque[_Message] = deque()
         self.forgotten: dict[bool, tuple[int, int]] = {}  # first and last stamp, arrival of what there was no room for
         self.last: dict[bool, int] = {}  # instant of the last message with a stamp, and of the last one without
+        self.left = False, 0  # whether by stamps, and the instant from which its time last stepped back
         self.ahead = False  # its time has stepped back, the clock's perhaps not yet
         self.behind = False  # the clock's time has stepped back, its own not yet
         self.leave: tuple[_Message, _Message] | None = None  # a sample of the pass before, and what it has chosen
@@ -157,7 +165,12 @@ class _Topic:
         instant = message.arrival if message.stamp is None else message.stamp
         last = self.last.get(stamped, instant)
         self.last[stamped] = instant
-        return instant < last - limit
+        if instant < last - limit:
+            self.left = stamped, last
+            return True
+        if self.ahead and self.left[0] is stamped and instant >= self.left[1]:
+            self.ahead = False  # single messages had stepped back, and no time
+        return False
 
     def came_late(self, message: _Message) -> bool:
         """Whether a closed sample would have chosen this message."""
@@ -212,7 +225,7 @@ class _Topic:
         self.kept.clear()
         self.forgotten.clear()
         self.closed.clear()
-        self.ahead, self.behind = True, False
+        self.ahead, self.behind = not self.behind, False
         self.previous = list(self.steady)
 
     def close(self, sample: _Message, chosen: _Message | None, reset: bool) -> None:
@@ -470,9 +483,20 @@ class Sampler:
                     self.counters[f"missing {signal.name}"] += 1
         return z
 
-    def places(self, topic: str) -> tuple[list[int], list[int]]:
-        """Where the values of a topic stand in [x; u], and the age up to which each may be used, ns."""
-        return list(self._where[topic]), [self._max_age[i] for i in self._where[topic]]
+    def places(self, topic: str) -> tuple[list[int], list[int], list[int]]:
+        """Where a topic's values stand in [x; u], the age up to which each may be used, ns, and which are unwrapped."""
+        where = self._where[topic]
+        return list(where), [self._max_age[i] for i in where], list(self._topics[topic].unwrap)
+
+    @property
+    def delays(self) -> list[tuple[int, int]]:
+        """Place in [x; u] of each delayed control, and by how many samples."""
+        return list(self._delays)
+
+    @property
+    def one_topic(self) -> bool:
+        """All states are on the clock topic; otherwise a step is decided when its second sample closes."""
+        return self._one_topic
 
     def latest(self) -> tuple[int, list[float]] | None:
         """(t_ns, [x; u] (n + m)) of the open sample with what is known so far; None before the first sample."""
@@ -481,17 +505,19 @@ class Sampler:
         return self._instant(self._open), self._fix(self._open, final=False)
 
     def standing(self) -> Standing | None:
-        """What is needed to go on elsewhere; None where messages do not come in order, or are more than numbers.
-
-        That is, where states are on several topics, and controls with a delay, angles unwrapped, or a step back of
-        time not over.
-        """
+        """What is needed to go on elsewhere; None where messages have not come in order, or not yet long enough."""
         others = {topic: state for topic, state in self._topics.items() if topic != self.clock}
-        simple = self._one_topic and not self._delays and not any(state.unwrap for state in self._topics.values())
-        if self._open is None or not simple or not all(state.in_order for state in others.values()):
+        if self._open is None or not all(state.in_order for state in others.values()):
+            return None
+        lines = [self._history.get(i, ()) for i, _ in self._delays]
+        if any(len(line) < delay for line, (_, delay) in zip(lines, self._delays, strict=True)):
+            return None
+        if not self._one_topic and (self._open_status is not Status.OK or self._before is None):
             return None
         return Standing(
             (self._open.tell(), self._open.values),
+            self._open_dt,
+            self._unknown if self._before is None else self._before,
             {
                 topic: (
                     state.last.get(state.header),
@@ -500,30 +526,24 @@ class Sampler:
                 )
                 for topic, state in others.items()
             },
+            {topic: [state.previous[i] for i in state.unwrap] for topic, state in self._topics.items()},
+            [list(line)[-delay:] for line, (_, delay) in zip(lines, self._delays, strict=True)],
         )
 
     def go_on(
         self,
-        sample: tuple[Told, Sequence[float]],
         topics: Mapping[str, tuple[int | None, Sequence[tuple[Told, Sequence[float]]], Sequence[tuple[Told, Told]]]],
-        step: tuple[float, Sequence[float]] | None,
-    ) -> Step | None:
-        """Go on from where messages were taken to elsewhere since `standing`; what they count for is told apart.
+        previous: Mapping[str, Sequence[float]],
+    ) -> None:
+        """Messages were taken to elsewhere since `standing`; what they count for is told apart.
 
         Parameters
         ----------
-        sample : tuple
-            As in `Standing`.
         topics : mapping
-            Of each other topic the instant of its last message, the messages that may still be chosen, and each
-            sample closed meanwhile beside the message that it chose, `REMEMBERED_SAMPLES` of them at most.
-        step : (float, sequence of float) or None
-            dt and [x; u] of the transition that ends in the open sample; None where none was opened.
-
-        Returns
-        -------
-        Step or None
-            That transition.
+            Of each topic but the clock's the instant of its last message, the messages that may still be chosen, and
+            each sample closed meanwhile beside the message that it chose, `REMEMBERED_SAMPLES` of them at most.
+        previous : mapping
+            As in `Standing`.
         """
         for topic, (last, kept, closed) in topics.items():
             state = self._topics[topic]
@@ -531,12 +551,23 @@ class Sampler:
                 state.last[state.header] = last
             state.kept = deque(_Message.told(*message) for message in kept)
             state.closed.extend((_Message.told(told), _Message.told(chosen)) for told, chosen in closed)
-        if step is None:
-            return None
-        self._open = message = _Message.told(*sample)
-        self._open_status, self._open_dt, self._before = Status.OK, step[0], list(step[1])
-        x_next = self._states_of(message)
-        return Step(Status.OK, self._instant(message), message.arrival, step[0], self._before, x_next)
+        for topic, angles in previous.items():
+            state = self._topics[topic]
+            for i, angle in zip(state.unwrap, angles, strict=True):
+                state.previous[i] = angle
+
+    def go_on_from(
+        self,
+        sample: tuple[Told, Sequence[float]],
+        dt: float,
+        before: Sequence[float],
+        lines: Sequence[Sequence[float]],
+    ) -> None:
+        """A sample was opened elsewhere; sample, dt, before and lines as in `Standing`."""
+        self._open = _Message.told(*sample)
+        self._open_status, self._open_dt, self._before = Status.OK, dt, list(before)
+        for (i, delay), line in zip(self._delays, lines, strict=True):
+            self._history[i] = deque(line, maxlen=delay + 1)
 
 
 def all_finite(values: Sequence[float]) -> bool:

@@ -1,4 +1,4 @@
-"""Compiled code takes the usual course of messages: what it publishes and counts is what Python would, bit by bit."""
+"""Compiled code takes messages that come in order and complete, and publishes and counts what Python would."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from ros_processes import own_domain
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import Float64MultiArray, Int32
 
 from uncertain_lti import SignalMap, UncertainLTI
 from uncertain_lti.model import Alarm, Domain, Sampling
@@ -94,6 +94,9 @@ class Node(envelope_monitor.EnvelopeMonitorNode):
 
     def _keep_reporting(self) -> None:
         """Never, likewise."""
+
+    def _keep_album(self) -> None:
+        """Never: what is remembered is only looked at."""
 
     def _go_on(self) -> None:
         if self.compiled:
@@ -297,6 +300,7 @@ def test_an_alarm_is_raised_latched_and_reset_as_by_python(ros: None, tmp_path: 
             if k % 10 == 0:
                 node._on_tick()
             if k == 350:
+                node._settle()
                 node.watch.reset()
     assert nodes[0].standing() == nodes[1].standing()
     assert nodes[0].sent == nodes[1].sent
@@ -336,13 +340,20 @@ def test_what_does_not_fit_together_is_refused_and_nothing_is_read_beyond_a_mess
         node.arrive(*message)
         node._on_tick()
     compiled = node._course._course
-    for places in ((0, 10**6), (10**6, 0), (-8, 0)):
-        plan = (bytes(100), bytes(100), places[0], np.array([places[1]] * 3).tobytes(), b"ddd")
+    once = np.ones(3, np.int64).tobytes()
+    for stamp, place, condition in (
+        (0, 10**6, None),
+        (10**6, 0, None),
+        (-1, -8, None),
+        (-1, 4, (98, "d", 0, 0.0, True)),
+    ):
+        plan = (bytes(100), bytes(100), stamp, once, np.array([place] * 3).tobytes(), b"ddd", (None,) * 3, condition)
+        topics = ((plan, None, None, [], b""),) * 3
         with pytest.raises(ValueError, match="outside of its message"):
-            compiled.resume((1, 1, bytes(24)), ((plan, None, None, []),) * 3, None, None)
+            compiled.resume((1, 1, bytes(24), 0.01, bytes(48)), topics, (), (b"", False, False, 0), None, None)
         assert compiled.sample(b"") is False
     with pytest.raises(ValueError, match="numbers"):
-        compiled.resume((1, 1, bytes(8)), (), None, None)
+        compiled.resume((1, 1, bytes(8), 0.01, bytes(48)), (), (), (b"", False, False, 0), None, None)
     with pytest.raises(TypeError):
         compiled.sample("text")
     end([node])
@@ -407,3 +418,132 @@ def test_a_clock_that_fails_is_told_and_the_sampler_starts_anew(ros: None, tmp_p
     assert nodes[0].sent == nodes[1].sent
     assert nodes[0].watch.failures == nodes[0]._failures == 1 and nodes[0].taken > 20
     end(nodes)
+
+
+IMU, MODE = "/imu", "/mode"
+OPTIONS = (
+    set[str](),
+    {"delays"},
+    {"angles"},
+    {"several"},
+    {"delays", "angles", "several"},
+    {"enable on the clock", "delays"},
+    {"enable on a control", "several"},
+    {"enable elsewhere"},
+)
+
+
+def saved_with(path: Path, options: set[str], rng: np.random.Generator, alarm: Alarm) -> UncertainLTI:
+    """Joints, and of an inertial unit an angle and a norm; a control of whole numbers; left bounds are no rarity."""
+    hold = 0.1
+    states = [
+        Signal("x0", STATE, "position[x0]", type=VECTOR),
+        Signal("x1", STATE, "unwrap(position[x1])" if "angles" in options else "velocity[x1]", type=VECTOR),
+    ]
+    where = IMU if "several" in options else STATE
+    if where == IMU:
+        states += [
+            Signal("yaw", IMU, "unwrap(yaw(orientation))", type="sensor_msgs/msg/Imu"),
+            Signal("rate", IMU, "norm(angular_velocity)", type="sensor_msgs/msg/Imu"),
+        ]
+    controls = [
+        Signal("u0", CONTROL, "position[u0]", type=VECTOR, max_hold=hold, delay=3 if "delays" in options else 0),
+        Signal("level", "/level", "data", type="std_msgs/msg/Int32", delay=1 if "delays" in options else 0),
+    ]
+    if "several" not in options:
+        controls.append(Signal("tilt", IMU, "pitch(orientation)", type="sensor_msgs/msg/Imu", max_hold=hold))
+    n, m = len(states), len(controls)
+    time = {STATE: "header", CONTROL: "header", IMU: "header", "/level": "log"}
+    signals = SignalMap(tuple(states), tuple(controls), clock=STATE, max_gap=0.055, min_step=0.002, time=time)
+    model = UncertainLTI(
+        rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.uniform(0, 0.3, (n, n)), rng.uniform(0, 0.3, (n, m)),
+        v=np.array([0.18, 0.5, 0.6, 0.22][:n]),
+        domain=Domain(np.full(n, -3.0), np.full(n, 3.0), np.full(m, -3.0), np.full(m, 3.0)),
+        signals=signals,
+        sampling=Sampling(STATE, VECTOR, time, dt_median=0.01, max_gap=0.055),
+        alarm=alarm,
+    )  # fmt: skip
+    model.save(path)
+    return model
+
+
+def imu(t_ns: int, yaw: float, pitch: float, rate: np.ndarray) -> bytes:
+    message = Imu()
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 10**9)
+    half = np.array([pitch, yaw]) / 2
+    (sp, sy), (cp, cy) = np.sin(half), np.cos(half)
+    message.orientation.x, message.orientation.y = -sp * sy, sp * cy
+    message.orientation.z, message.orientation.w = cp * sy, cp * cy
+    message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z = rate
+    return serialize_message(message)
+
+
+def stream_with(rng: np.random.Generator, count: int, rate: float) -> Iterator[tuple[int, str, bytes]]:
+    t, on, frame = START_NS, True, ""
+    faults = ("gap", "reset", "nan", "equal", "no imu", "no control", "back imu", "frame", "wild", "off", "mode")
+    for k in range(count):
+        fault = str(rng.choice(faults)) if rng.random() < rate else ""
+        t += STEP_NS + int(rng.integers(-(10**6), 10**6)) + {"gap": 10**8, "reset": -(10**9)}.get(fault, 0)
+        on ^= fault == "off"
+        frame = "base" if fault == "frame" else frame
+        turned = 0.05 * k + rng.normal(0, 0.1)
+        if rng.random() < 0.1 or k == 0:
+            yield t - 900_000, "/level", serialize_message(Int32(data=int(rng.integers(-2, 3))))
+        if rng.random() < 0.2 or k == 0:
+            yield t - 800_000, MODE, serialize_message(Int32(data=int(on) if fault != "mode" else 7))
+        if fault != "no control":
+            yield t - 700_000, CONTROL, vector(t - 750_000, {"u0": rng.normal(0, 0.1) + (0 if on else -5.0)})
+        if fault != "no imu":
+            at = t - 10**9 if fault == "back imu" and k > 0.8 * count else t - int(rng.integers(-1, 2)) * 300_000
+            yield t - 600_000, IMU, imu(at, turned, rng.normal(0, 0.1), rng.normal(0, 0.1, 3))
+        x = rng.normal(0, 0.05, 2)
+        x[0] += {"nan": np.nan, "wild": 1e300}.get(fault, 0.0)
+        message = JointState(name=["x0", "x1"], position=[x[0], np.remainder(turned + np.pi, 2 * np.pi) - np.pi])
+        message.velocity, message.effort, message.header.frame_id = x.tolist(), [float(on)], frame
+        stamp = t - STEP_NS if fault == "equal" else t
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        yield t, STATE, serialize_message(message)
+
+
+@needs_compiled
+@pytest.mark.parametrize("options", OPTIONS, ids=lambda options: ", ".join(sorted(options)) or "plain")
+@pytest.mark.parametrize("rate", [0.0, 0.03])
+def test_alarms_delays_angles_and_states_on_several_topics_are_as_in_python(
+    ros: None, tmp_path: Path, options: set[str], rate: float
+) -> None:
+    alarms = taken = judged = 0
+    for seed, rule in enumerate((Alarm(1, 1), Alarm(3, 8), Alarm(6, 40, 0.9), Alarm(2, 2, 1.2))):
+        rng = np.random.default_rng([seed, len(options)])
+        saved_with(tmp_path / "model.json", options, rng, rule)
+        nodes = [Node(tmp_path / "model.json", compiled) for compiled in (True, False)]
+        enable = {
+            "enable on the clock": f"{STATE} effort[0] > 0.5",
+            "enable on a control": f"{CONTROL} position[u0] >= -2.5",
+            "enable elsewhere": f"{MODE} data == 1",
+        }
+        said = [Parameter("enable", value=enable[option]) for option in options if option in enable]
+        said += [Parameter("enable_type", value="std_msgs/msg/Int32")] if "enable elsewhere" in options else []
+        said += [Parameter("latch", value=seed == 1), Parameter("grace", value=0.15 * (seed == 2))]
+        said += [Parameter("masked", value="x0" if seed == 3 else "")]
+        for node in nodes:
+            assert all(result.successful for result in node.set_parameters(said))
+        for k, (at, topic, data) in enumerate(stream_with(rng, 400, rate)):
+            for node in nodes:
+                if topic in node._inputs:
+                    node.arrive(at, topic, data)
+            if rng.random() < 0.1:
+                for node in nodes:
+                    node._on_tick()
+            if k % 100 == 0:
+                assert nodes[0].standing() == nodes[1].standing()
+            if k % 600 == 599:
+                for node in nodes:
+                    node._settle()
+                    node.watch.reset()
+        assert nodes[0].standing() == nodes[1].standing()
+        assert nodes[0].sent == nodes[1].sent
+        assert not nodes[0]._failures
+        alarms += nodes[0].watch.alarms
+        taken, judged = taken + nodes[0].taken, judged + nodes[0].watch.verdicts
+        end(nodes)
+    assert alarms > 1 and taken > 0.6 * judged > 800

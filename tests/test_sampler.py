@@ -156,15 +156,36 @@ class Reference:
         """The last message with which the topic stepped back before the sample closed; -1 without any."""
         return max([i for i in self.jumps[topic] if i < sample.closed_by], default=-1)
 
+    def lag(self, topic: str, until: int) -> tuple[bool, bool]:
+        """Whether a topic's time has stepped back and the clock's not yet, and the other way round.
+
+        A topic whose time reaches the instant again that it left has sent single messages of another time.
+        """
+        resets = {s.index for s in self.samples if s.status is Status.RESET}
+        ahead = behind = False
+        last: dict[bool, int] = {}
+        left: tuple[bool, int] | None = None
+        for i in range(until):
+            if i in resets:
+                ahead, behind = False, not ahead
+            if self.sent[i].topic != topic:
+                continue
+            stamp = self.stamp(i)
+            instant, stamped = self.sent[i].arrival if stamp is None else stamp, stamp is not None
+            if i in self.jumps[topic]:
+                ahead, behind, left = not behind, False, (stamped, last[stamped])
+            elif left is not None and left[0] is stamped and instant >= left[1]:
+                ahead = False
+            last[stamped] = instant
+        return ahead, behind
+
     def passed_over(self, topic: str, before: Sample) -> set[int]:
         gone: set[int] = set()
         for sample, closing in zip(self.samples, self.samples[1:], strict=False):
             if sample is before:
                 break
-            reset = max(
-                [s.index for s in self.samples if s.status is Status.RESET and s.index < closing.index], default=-1
-            )
-            if closing.status is Status.RESET or self.jump(sample, topic) > reset:
+            ahead, _ = self.lag(topic, closing.index)
+            if closing.status is Status.RESET or ahead or self._left(sample, topic):
                 continue
             arrived = [i for i in self.by_topic[topic] if self.jump(sample, topic) <= i < sample.closed_by]
             gone |= {i for i in arrived if self.age(sample, i) >= 0} - {sample.chosen[topic]}
@@ -177,20 +198,16 @@ class Reference:
 
     def _left(self, sample: Sample, topic: str) -> tuple[int, int] | None:
         """What an open sample had chosen when its topic stepped back before the clock did: of the same pass."""
-        resets = [s.index for s in self.samples if s.status is Status.RESET]
-        ahead = behind = False
         begin = 0
-        for event in sorted({*resets, *self.jumps[topic]}):
-            if event in resets:
-                ahead, behind = False, not ahead
-                continue
+        for event in self.jumps[topic]:
+            _, behind = self.lag(topic, event)
             if sample.index < event < sample.closed_by and not behind:
                 candidates = {i for i in self.by_topic[topic] if begin <= i < event}
                 if self.forgets:
                     candidates -= self.passed_over(topic, sample)
                 if best := self._best(sample, sorted(candidates)):
                     return best
-            ahead, behind, begin = True, False, event
+            begin = event
         return None
 
     def _close(self, sample: Sample) -> None:
@@ -520,6 +537,28 @@ def test_the_verdict_of_a_transition_never_waits_for_the_next_control() -> None:
     decided, _ = run(signals, [at("/u", 1, 1), at("/c", 1, 1), at("/u", 2, 2), at("/c", 2, 2)])
     assert [len(d) for d in decided] == [0, 1, 0, 1]
     assert only(decided)[1].status is Status.OK
+
+
+@pytest.mark.parametrize("control_first", [True, False])
+def test_nothing_of_a_step_back_of_time_stays_once_it_is_over(control_first: bool) -> None:
+    """Otherwise a hundred old messages are kept and looked through at every sample from there on."""
+    sampler = Sampler(two_topics())
+    for _ in range(3):
+        for k in range(100, 150):
+            pair = [at("/u", k, k), at("/c", k, k)]
+            for message in pair if control_first else reversed(pair):
+                sampler.push(*message)
+        assert sampler.standing() is not None
+    assert sampler.counters["resets"] == 2
+
+
+def test_single_messages_of_another_time_leave_nothing_behind() -> None:
+    sampler = Sampler(two_topics())
+    for k in range(100, 500):
+        odd = {150: -100, 200: 100}.get(k, 0)  # one stamp too old, one too far ahead
+        sampler.push(*at("/u", k, k + odd))
+        sampler.push(*at("/c", k, k))
+        assert (sampler.standing() is None) == (k == 150 or 201 <= k < 300)
 
 
 def test_states_of_two_topics_are_judged_when_the_sample_closes() -> None:

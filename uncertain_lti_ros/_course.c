@@ -1,9 +1,10 @@
-/* Course: messages that come in order, complete and within their bounds, from serialised message to published verdict.
+/* Course: messages that come in order and complete, from serialised message to published verdict.
 
    On a robot at work nearly every message is of this kind, and Python takes several times as long over one of them
    as the middleware takes to deliver it. What is done here is what MessageReader, Sampler, EnvelopeMonitor and
    NamedVector do, with the same operations on each number in the same order, for the same bits. Whatever is not of
-   this kind is refused and leaves no trace here: course.py then hands everything over to them, and they go on.
+   this kind, and whatever turns the alarm, is refused and leaves no trace here: course.py then hands everything over
+   to them, and they go on.
 
    No numpy, and no header but Python's. To be compiled without contraction of a * b + c, which would change bits. */
 
@@ -20,6 +21,9 @@
 #define KEPT 512       /* messages of a topic that wait for a later sample */
 #define CLOSED 100     /* REMEMBERED_SAMPLES of the sampler */
 #define FUTURE 1000000000LL
+#define TOPICS 64
+#define LONGEST 10000  /* window and delays; handed to and fro at every stop */
+#define TWO_PI 6.283185307179586
 
 enum { FLAGS, LOWER, UPPER, STATE, UTILISATION, PREDICTED_LOWER, PREDICTED_UPPER, VIOLATION, OUTPUTS };
 
@@ -33,13 +37,23 @@ typedef struct {
     int header;
     int64_t *where;   /* place of each value in z */
     int64_t *max_age; /* ns, of each value */
+    Py_ssize_t angles; /* values that are unwrapped */
+    int64_t *angle;
+    double *previous; /* of each value */
     /* layout of its messages */
     Py_ssize_t size;
     unsigned char *mask, *want; /* both `size` long */
     int stamped;
     int64_t stamp_at;
-    int64_t *offset;
-    char *code; /* 'f' or 'd' */
+    int64_t *parts; /* numbers that each value is made of */
+    int64_t *offset; /* of each number */
+    char *code;      /* as in Python's struct */
+    PyObject *derived; /* tuple of what makes a value of its parts; None: its one part is it */
+    /* what it says of the enable condition; `conditional` 0: nothing */
+    int conditional, relation, holds;
+    int64_t condition_at;
+    char condition_code;
+    double condition_value;
     /* messages that may be chosen; not of the clock topic */
     Py_ssize_t kept;
     Instant *instant; /* KEPT */
@@ -54,8 +68,16 @@ typedef struct {
 } Topic;
 
 typedef struct {
+    Py_ssize_t place, delay; /* of a control in z; its value of so many samples before counts */
+    double *line;            /* the last `delay` values */
+    Py_ssize_t at;           /* of the oldest */
+    double raw;              /* of the sample that closes */
+} Delayed;
+
+typedef struct {
     PyObject_HEAD
     Py_ssize_t n, size, topics; /* size = n + m */
+    int several; /* states are on several topics: a sample is judged when it closes */
     double *nominal, *spread;   /* [A B], [dA dB]: n x size */
     double *c, *dc, *v;         /* n */
     double *steady, *scale, *least, *greatest; /* size */
@@ -66,15 +88,24 @@ typedef struct {
     Py_ssize_t plain_size, marked_size, plain_at, marked_at, marks_at;
     PyObject *send[OUTPUTS]; /* NULL: nobody listens */
     int listening;
+    Delayed *delayed;
+    Py_ssize_t delays;
+    /* the alarm: the verdicts it looks at, and how many of them are violations */
+    unsigned char *counted, *recent, *inside; /* n, window, n */
+    Py_ssize_t needed, window, filled, oldest, violating;
+    int64_t from; /* instant from which verdicts count */
+    int alarm, said; /* of the window; what ~/violation says */
     /* the open sample, and the one before with what became of it */
     int running, cut; /* cut: a sample, since it goes on */
-    Instant open;
-    double *open_values;   /* of the clock topic's count */
-    double *fresh, *z, *closing, *zn, *size_of, *x_next; /* size; z is [x; u] of the last transition */
+    Instant open, judged_at;
+    double open_dt;
+    double *open_values; /* of the clock topic's count */
+    double *fresh, *z, *before, *closing, *zn, *size_of, *x_next; /* size; z is [x; u] of the last transition,
+                                                                     before that of the last closed sample */
     double *centre, *half, *low, *high;
     double dt;
     /* counts since the last `counts` */
-    int64_t samples, outside;
+    int64_t samples, outside, *violations; /* n */
     double judged, published;
     int has_published;
     PyObject *arrival; /* tells the time of arrival, ns; NULL: the computer's clock does */
@@ -128,10 +159,12 @@ forget_layout(Topic *topic)
 {
     PyMem_Free(topic->mask);
     PyMem_Free(topic->want);
+    PyMem_Free(topic->parts);
     PyMem_Free(topic->offset);
     PyMem_Free(topic->code);
+    Py_CLEAR(topic->derived);
     topic->mask = topic->want = NULL;
-    topic->offset = NULL;
+    topic->parts = topic->offset = NULL;
     topic->code = NULL;
     topic->size = -1;
 }
@@ -144,10 +177,15 @@ Course_dealloc(Course *self)
         forget_layout(topic);
         PyMem_Free(topic->where);
         PyMem_Free(topic->max_age);
+        PyMem_Free(topic->angle);
+        PyMem_Free(topic->previous);
         PyMem_Free(topic->instant);
         PyMem_Free(topic->values);
     }
     PyMem_Free(self->topic);
+    for (Py_ssize_t i = 0; self->delayed && i < self->delays; i++)
+        PyMem_Free(self->delayed[i].line);
+    PyMem_Free(self->delayed);
     for (int i = 0; i < self->blocks; i++)
         PyMem_Free(self->memory[i]);
     for (int i = 0; i < OUTPUTS; i++)
@@ -164,8 +202,9 @@ static int
 Course_init(Course *self, PyObject *args, PyObject *kwargs)
 {
     static char *names[] = {"n", "size", "rows", "point", "margin", "max_gap", "min_step",
-                            "usual_step", "usual_dt", "plain", "marked", "topics", NULL};
-    PyObject *rows, *point, *plain, *marked, *topics;
+                            "usual_step", "usual_dt", "plain", "marked", "topics", "several", "delays",
+                            "counted", "alarm", NULL};
+    PyObject *rows, *point, *plain, *marked, *topics, *delays, *counted;
     long long max_gap, min_step, usual_step;
     const char *from;
     Py_ssize_t n, size;
@@ -174,12 +213,16 @@ Course_init(Course *self, PyObject *args, PyObject *kwargs)
         return -1;
     }
     if (!PyArg_ParseTupleAndKeywords(
-            args, kwargs, "nnOOdLLLdO!O!O!", names, &n, &size, &rows, &point, &self->margin,
+            args, kwargs, "nnOOdLLLdO!O!O!pO!O(nn)", names, &n, &size, &rows, &point, &self->margin,
             &max_gap, &min_step, &usual_step, &self->usual_dt, &PyTuple_Type, &plain, &PyTuple_Type, &marked,
-            &PyTuple_Type, &topics))
+            &PyTuple_Type, &topics, &self->several, &PyTuple_Type, &delays, &counted, &self->needed, &self->window))
         return -1;
-    if (n < 1 || size < n || size > 100000 || PyTuple_GET_SIZE(topics) < 1) {
+    if (n < 1 || size < n || size > 100000 || PyTuple_GET_SIZE(topics) < 1 || PyTuple_GET_SIZE(topics) > TOPICS) {
         PyErr_SetString(PyExc_ValueError, "n, size or topics out of range");
+        return -1;
+    }
+    if (self->needed < 1 || self->window < self->needed || self->window > LONGEST) {
+        PyErr_SetString(PyExc_ValueError, "the alarm's rule is out of range");
         return -1;
     }
     self->n = n;
@@ -227,9 +270,10 @@ Course_init(Course *self, PyObject *args, PyObject *kwargs)
         memcpy(self->marked, text, (size_t)length);
         self->marked_size = length;
     }
-    if (!(self->z = block(self, sizeof(double) * (size_t)(5 * size + 5 * n))))
+    if (!(self->z = block(self, sizeof(double) * (size_t)(6 * size + 5 * n))))
         return -1;
-    self->closing = self->z + size;
+    self->before = self->z + size;
+    self->closing = self->before + size;
     self->zn = self->closing + size;
     self->size_of = self->zn + size;
     self->fresh = self->size_of + size;
@@ -238,6 +282,30 @@ Course_init(Course *self, PyObject *args, PyObject *kwargs)
     self->half = self->centre + n;
     self->low = self->half + n;
     self->high = self->low + n;
+    if (numbers(counted, n, 1, "counted", &from))
+        return -1;
+    if (!(self->counted = block(self, (size_t)(2 * n + self->window))))
+        return -1;
+    memcpy(self->counted, from, (size_t)n);
+    self->inside = self->counted + n;
+    self->recent = self->inside + n;
+    if (!(self->violations = block(self, sizeof(int64_t) * (size_t)n)))
+        return -1;
+    if (!(self->delayed = PyMem_Calloc((size_t)PyTuple_GET_SIZE(delays) + 1, sizeof(Delayed)))) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    for (; self->delays < PyTuple_GET_SIZE(delays); self->delays++) {
+        Delayed *one = &self->delayed[self->delays];
+        if (!PyArg_ParseTuple(PyTuple_GET_ITEM(delays, self->delays), "nn", &one->place, &one->delay))
+            return -1;
+        if (one->place < n || one->place >= size || one->delay < 1 || one->delay > LONGEST)
+            goto misplaced;
+        if (!(one->line = PyMem_Calloc((size_t)one->delay, sizeof(double)))) {
+            PyErr_NoMemory();
+            return -1;
+        }
+    }
     self->topics = PyTuple_GET_SIZE(topics);
     if (!(self->topic = PyMem_Calloc((size_t)self->topics, sizeof(Topic)))) {
         PyErr_NoMemory();
@@ -245,8 +313,8 @@ Course_init(Course *self, PyObject *args, PyObject *kwargs)
     }
     for (Py_ssize_t k = 0; k < self->topics; k++) {
         Topic *topic = &self->topic[k];
-        PyObject *where, *max_age;
-        if (!PyArg_ParseTuple(PyTuple_GET_ITEM(topics, k), "pSS", &topic->header, &where, &max_age))
+        PyObject *where, *max_age, *angles;
+        if (!PyArg_ParseTuple(PyTuple_GET_ITEM(topics, k), "pSSS", &topic->header, &where, &max_age, &angles))
             return -1;
         topic->count = PyBytes_GET_SIZE(where) / 8;
         if (numbers(where, topic->count, 8, "where", &from))
@@ -260,6 +328,18 @@ Course_init(Course *self, PyObject *args, PyObject *kwargs)
         for (Py_ssize_t i = 0; i < topic->count; i++)
             if (topic->where[i] < 0 || topic->where[i] >= size)
                 goto misplaced;
+        topic->angles = PyBytes_GET_SIZE(angles) / 8;
+        if (numbers(angles, topic->angles, 8, "angles", &from))
+            return -1;
+        if (!(topic->angle = copied(from, (size_t)topic->angles * 8)))
+            return -1;
+        for (Py_ssize_t i = 0; i < topic->angles; i++)
+            if (topic->angle[i] < 0 || topic->angle[i] >= topic->count)
+                goto misplaced;
+        if (!(topic->previous = PyMem_Calloc((size_t)topic->count + 1, sizeof(double)))) {
+            PyErr_NoMemory();
+            return -1;
+        }
         topic->size = -1;
         if (k && (!(topic->instant = PyMem_Calloc(KEPT, sizeof(Instant))) ||
                   !(topic->values = PyMem_Calloc((size_t)(KEPT * (topic->count + 1)), sizeof(double))))) {
@@ -277,11 +357,86 @@ misplaced:
 
 /* --- reading a message ---------------------------------------------------------------------------------------- */
 
-/* Whether it fits; then its instant and numbers. */
+/* A number at its place in a message, as Python's struct and float() have it. */
+static double
+number_at(const char *at, char code)
+{
+#define AS(kind) { kind value; memcpy(&value, at, sizeof value); return (double)value; }
+    switch (code) {
+    case 'd': AS(double)
+    case 'f': AS(float)
+    case 'b': AS(int8_t)
+    case 'B': AS(uint8_t)
+    case 'h': AS(int16_t)
+    case 'H': AS(uint16_t)
+    case 'i': AS(int32_t)
+    case 'I': AS(uint32_t)
+    case 'q': AS(int64_t)
+    default: AS(uint64_t)
+    }
+#undef AS
+}
+
+/* Bytes that a number takes; 0 for a code that is none. */
+static int
+width_of(char code)
+{
+    switch (code) {
+    case 'd': case 'q': case 'Q': return 8;
+    case 'f': case 'i': case 'I': return 4;
+    case 'h': case 'H': return 2;
+    case 'b': case 'B': return 1;
+    default: return 0;
+    }
+}
+
+/* A value made of several numbers; -1 with an exception where that fails. */
+static int
+derive(PyObject *made_by, const char *data, const int64_t *offset, const char *code, Py_ssize_t parts, double *value)
+{
+    PyObject *made, *list = PyList_New(parts);
+    for (Py_ssize_t i = 0; list && i < parts; i++) {
+        PyObject *part = PyFloat_FromDouble(number_at(data + offset[i], code[i]));
+        if (!part)
+            Py_CLEAR(list);
+        else
+            PyList_SET_ITEM(list, i, part);
+    }
+    if (!list)
+        return -1;
+    made = PyObject_CallOneArg(made_by, list);
+    Py_DECREF(list);
+    if (!made)
+        return -1;
+    *value = PyFloat_AsDouble(made);
+    Py_DECREF(made);
+    return *value == -1.0 && PyErr_Occurred() ? -1 : 0;
+}
+
+/* Whether the enable condition holds by this value; -1 where it is not a number. */
+static int
+holds(const Topic *topic, double value)
+{
+    double other = topic->condition_value;
+    if (value != value)
+        return -1;
+    switch (topic->relation) {
+    case 0: return value == other;
+    case 1: return value != other;
+    case 2: return value <= other;
+    case 3: return value >= other;
+    case 4: return value < other;
+    default: return value > other;
+    }
+}
+
+/* Whether it fits; then its instant and numbers. -1 with an exception where Python's part of it fails. */
 static int
 read_message(const Topic *topic, const char *data, Py_ssize_t size, int64_t arrival, Instant *instant, double *values)
 {
     const unsigned char *bytes = (const unsigned char *)data;
+    const int64_t *offset = topic->offset;
+    const char *code = topic->code;
     unsigned char differs = 0;
     int64_t stamp = 0;
     if (size != topic->size)
@@ -289,6 +444,8 @@ read_message(const Topic *topic, const char *data, Py_ssize_t size, int64_t arri
     for (Py_ssize_t i = 0; i < size; i++)
         differs |= (unsigned char)((bytes[i] & topic->mask[i]) ^ topic->want[i]);
     if (differs)
+        return 0;
+    if (topic->conditional && holds(topic, number_at(data + topic->condition_at, topic->condition_code)) != topic->holds)
         return 0;
     if (topic->stamped) {
         int32_t seconds;
@@ -304,18 +461,32 @@ read_message(const Topic *topic, const char *data, Py_ssize_t size, int64_t arri
     instant->stamp = topic->header ? stamp : 0;
     instant->arrival = arrival;
     for (Py_ssize_t i = 0; i < topic->count; i++) {
-        if (topic->code[i] == 'd') {
-            memcpy(&values[i], data + topic->offset[i], 8);
-        }
-        else {
-            float value;
-            memcpy(&value, data + topic->offset[i], 4);
-            values[i] = value;
-        }
+        PyObject *made_by = PyTuple_GET_ITEM(topic->derived, i);
+        if (made_by == Py_None)
+            values[i] = number_at(data + *offset, *code);
+        else if (derive(made_by, data, offset, code, topic->parts[i], &values[i]))
+            return -1;
+        offset += topic->parts[i];
+        code += topic->parts[i];
         if (!isfinite(values[i]))
             return 0;
     }
+    for (Py_ssize_t i = 0; i < topic->angles; i++) {
+        double *value = &values[topic->angle[i]];
+        /* + 0.0: a turn of -0 is one of 0, as it is for Python's whole numbers */
+        *value += TWO_PI * (rint((topic->previous[topic->angle[i]] - *value) / TWO_PI) + 0.0);
+        if (!isfinite(*value))
+            return 0;
+    }
     return 1;
+}
+
+/* Its angles are those that the next ones are held against. */
+static void
+unwrapped(Topic *topic, const double *values)
+{
+    for (Py_ssize_t i = 0; i < topic->angles; i++)
+        topic->previous[topic->angle[i]] = values[topic->angle[i]];
 }
 
 /* Age of a message at a sample, ns. */
@@ -327,18 +498,19 @@ behind(const Instant *sample, const Instant *message)
     return sample->arrival - message->arrival;
 }
 
-/* Take a message of another topic than the clock's; 0 where it is not of the usual kind. */
+/* Take a message of another topic than the clock's; 0 where it is not of the usual kind, -1 with an exception. */
 static int
 keep(Topic *topic, const char *data, Py_ssize_t size, int64_t arrival, double now, int64_t max_gap)
 {
     Instant instant;
     double *values;
     int64_t when;
+    int fits;
     if (topic->kept == KEPT)
         return 0;
     values = topic->values + topic->kept * topic->count;
-    if (!read_message(topic, data, size, arrival, &instant, values))
-        return 0;
+    if ((fits = read_message(topic, data, size, arrival, &instant, values)) != 1)
+        return fits;
     when = instant.stamp ? instant.stamp : instant.arrival;
     if (topic->has_last && when < topic->last - max_gap)
         return 0; /* its time has stepped back */
@@ -346,6 +518,7 @@ keep(Topic *topic, const char *data, Py_ssize_t size, int64_t arrival, double no
         if (behind(&topic->closed[(topic->closings + CLOSED - 1) % CLOSED], &instant) >= 0)
             return 0; /* perhaps too late for a closed sample */
     }
+    unwrapped(topic, values);
     topic->has_last = 1;
     topic->last = when;
     topic->instant[topic->kept++] = instant;
@@ -482,7 +655,7 @@ utilisation(double difference, double half)
     if (difference == 0.0)
         return 0.0;
     if (half == 0.0)
-        return copysign(INFINITY, difference);
+        return copysign(INFINITY, difference); /* no NaN: bounds and sample are finite */
     return difference / half;
 }
 
@@ -520,11 +693,14 @@ static PyObject *
 flags(Course *self, int64_t t_ns, int outside)
 {
     char *at;
-    double mark = outside;
+    const double one = 1.0;
     PyObject *message = message_of(self->marked, self->marked_size, t_ns, &at);
-    if (message)
-        for (Py_ssize_t i = 0; outside && i < self->n; i++)
-            memcpy(at + self->marks_at + 8 * i, &mark, 8);
+    for (Py_ssize_t i = 0; message && i < self->n; i++) {
+        if (!self->inside[i])
+            memcpy(at + self->marked_at + 8 * i, &one, 8);
+        if (outside)
+            memcpy(at + self->marks_at + 8 * i, &one, 8);
+    }
     return message;
 }
 
@@ -577,13 +753,14 @@ note(Course *self, Py_ssize_t k, PyObject *data, int64_t arrival, double now, Py
     return done;
 }
 
-/* Bounds, sample and utilisation as little-endian doubles, with the instant and whether z was outside of the domain. */
+/* Bounds, sample, utilisation and flags as little-endian doubles, with the instant and whether z was outside of the
+   domain. */
 static PyObject *
 verdict(Course *self, int64_t t_ns, int outside)
 {
-    PyObject *packed[4];
-    char *at[4];
-    for (int k = 0; k < 4; k++) {
+    PyObject *packed[5];
+    char *at[5];
+    for (int k = 0; k < 5; k++) {
         if (!(packed[k] = PyBytes_FromStringAndSize(NULL, 8 * self->n))) {
             while (k)
                 Py_DECREF(packed[--k]);
@@ -596,23 +773,56 @@ verdict(Course *self, int64_t t_ns, int outside)
             double value = number(self, LOWER + k, i, self->x_next);
             memcpy(at[k] + 8 * i, &value, 8);
         }
-    return Py_BuildValue("(LNNNNN)", (long long)t_ns, PyBool_FromLong(outside), packed[0], packed[1], packed[2],
-                         packed[3]);
+    for (Py_ssize_t i = 0; i < self->n; i++) {
+        double value = !self->inside[i];
+        memcpy(at[4] + 8 * i, &value, 8);
+    }
+    return Py_BuildValue("(LNNNNNN)", (long long)t_ns, PyBool_FromLong(outside), packed[0], packed[1], packed[2],
+                         packed[3], packed[4]);
 }
 
-/* Judge the sample that this message opens and publish; 0, and nothing has changed, where it is not of the usual kind.
-   The message's numbers stand in self->fresh. */
+/* What becomes of the alarm's window by a verdict: how many of it are then violations, or -1 where the alarm turns. */
+static Py_ssize_t
+violating(const Course *self, int armed, int hit)
+{
+    Py_ssize_t found = 0;
+    if (armed) {
+        found = self->violating + hit;
+        if (self->filled == self->window)
+            found -= self->recent[self->oldest];
+    }
+    return (found >= self->needed) == self->alarm ? found : -1;
+}
+
+static void
+count(Course *self, int armed, int hit, Py_ssize_t violating)
+{
+    self->violating = violating;
+    if (!armed) {
+        self->filled = self->oldest = 0;
+        return;
+    }
+    if (self->filled == self->window)
+        self->oldest = (self->oldest + 1) % self->window;
+    else
+        self->filled++;
+    self->recent[(self->oldest + self->filled - 1) % self->window] = (unsigned char)hit;
+}
+
+/* Judge the sample that this message opens, or closes where states are on several topics, and publish; 0, and nothing
+   has changed, where it is not of the usual kind. The message's numbers stand in self->fresh. */
 static int
 judge(Course *self, const Instant *opened, double now, PyObject *data)
 {
     Topic *clock = &self->topic[0];
-    Py_ssize_t n = self->n, chosen[64];
-    int64_t step = when(opened) - when(&self->open), t_ns = when(opened);
+    Py_ssize_t n = self->n, chosen[TOPICS], hits;
+    int64_t step = when(opened) - when(&self->open), t_ns;
     double dt = (double)step * 1e-9;
-    int outside = 0, made = 0;
+    const double *before = self->several ? self->before : self->closing;
+    int outside = 0, made = 0, hit = 0, armed;
     PyObject *message[OUTPUTS], *(*send)[OUTPUTS] = &self->send;
     int kind[OUTPUTS];
-    if (step <= 0 || step < self->min_step || step > self->max_gap || self->topics > 64)
+    if (step <= 0 || step < self->min_step || step > self->max_gap)
         return 0;
     /* z = [x; u] of the sample that this one closes */
     for (Py_ssize_t i = 0; i < clock->count; i++)
@@ -622,24 +832,52 @@ judge(Course *self, const Instant *opened, double now, PyObject *data)
         if (!put(&self->topic[k], chosen[k], &self->open, self->closing))
             return 0;
     }
-    for (Py_ssize_t i = 0; i < clock->count; i++)
-        if (clock->where[i] < n)
-            self->x_next[clock->where[i]] = self->fresh[i];
-    bound(self, self->closing, dt);
+    for (Py_ssize_t i = 0; i < self->delays; i++) {
+        Delayed *one = &self->delayed[i];
+        one->raw = self->closing[one->place];
+        self->closing[one->place] = one->line[one->at];
+        if (!isfinite(one->line[one->at]))
+            return 0;
+    }
+    if (self->several)
+        memcpy(self->x_next, self->closing, sizeof(double) * (size_t)n);
+    else
+        for (Py_ssize_t i = 0; i < clock->count; i++)
+            if (clock->where[i] < n)
+                self->x_next[clock->where[i]] = self->fresh[i];
+    t_ns = when(self->several ? &self->open : opened);
+    bound(self, before, self->several ? self->open_dt : dt);
     for (Py_ssize_t i = 0; i < n; i++) {
         double x_next = (self->x_next[i] - self->steady[i]) / self->scale[i];
-        if (!(self->low[i] <= x_next && x_next <= self->high[i]))
+        if (!isfinite(self->low[i]) || !isfinite(self->high[i]) || !isfinite(x_next))
             return 0;
+        self->inside[i] = self->low[i] <= x_next && x_next <= self->high[i];
+        hit |= self->counted[i] && !self->inside[i];
     }
     for (Py_ssize_t j = 0; j < self->size; j++)
         outside |= (self->zn[j] < self->least[j]) | (self->zn[j] > self->greatest[j]);
+    armed = t_ns >= self->from;
+    if ((hits = violating(self, armed, hit)) < 0)
+        return 0;
     /* from here on it is done */
+    count(self, armed, hit, hits);
+    for (Py_ssize_t i = 0; i < n; i++)
+        self->violations[i] += !self->inside[i];
     for (Py_ssize_t k = 1; k < self->topics; k++)
         close_sample(&self->topic[k], &self->open, chosen[k]);
-    memcpy(self->z, self->closing, sizeof(double) * (size_t)self->size);
+    for (Py_ssize_t i = 0; i < self->delays; i++) {
+        Delayed *one = &self->delayed[i];
+        one->line[one->at] = one->raw;
+        one->at = (one->at + 1) % one->delay;
+    }
+    unwrapped(clock, self->fresh);
+    self->judged_at = self->several ? self->open : *opened;
+    self->dt = self->several ? self->open_dt : dt;
+    memcpy(self->z, before, sizeof(double) * (size_t)self->size);
+    memcpy(self->before, self->closing, sizeof(double) * (size_t)self->size);
     memcpy(self->open_values, self->fresh, sizeof(double) * (size_t)clock->count);
     self->open = *opened;
-    self->dt = dt;
+    self->open_dt = dt;
     self->cut = 1;
     self->samples++;
     self->outside += outside;
@@ -668,12 +906,16 @@ judge(Course *self, const Instant *opened, double now, PyObject *data)
             z[clock->where[i]] = self->open_values[i];
         for (Py_ssize_t k = 1; known && k < self->topics; k++)
             known = put(&self->topic[k], choose(&self->topic[k], opened), opened, z);
+        for (Py_ssize_t i = 0; known && i < self->delays; i++) {
+            z[self->delayed[i].place] = self->delayed[i].line[self->delayed[i].at];
+            known = isfinite(z[self->delayed[i].place]);
+        }
         if (known) {
             bound(self, z, self->usual_dt);
             for (int k = PREDICTED_LOWER; k <= PREDICTED_UPPER; k++) {
                 if (!(*send)[k])
                     continue;
-                message[made] = vector(self, k, t_ns + self->usual_step, NULL);
+                message[made] = vector(self, k, when(opened) + self->usual_step, NULL);
                 kind[made] = k;
                 if (!message[made])
                     goto failed;
@@ -682,7 +924,8 @@ judge(Course *self, const Instant *opened, double now, PyObject *data)
         }
     }
     if ((*send)[VIOLATION]) {
-        if (!(message[made] = PyBytes_FromStringAndSize("\x00\x01\x00\x00\x00", 5)))
+        if (!(message[made] = PyBytes_FromStringAndSize(self->said ? "\x00\x01\x00\x00\x01" : "\x00\x01\x00\x00\x00",
+                                                        5)))
             goto failed;
         kind[made++] = VIOLATION;
         self->published = now;
@@ -710,6 +953,17 @@ failed:
     return -1;
 }
 
+/* Leave a message to Python, which meets the same error; one that is to end the process goes on. */
+static PyObject *
+refuse(Course *self)
+{
+    self->running = 0;
+    if (!PyErr_ExceptionMatches(PyExc_Exception))
+        return NULL;
+    PyErr_Clear();
+    Py_RETURN_FALSE;
+}
+
 static PyObject *
 Course_sample(Course *self, PyObject *data)
 {
@@ -723,14 +977,11 @@ Course_sample(Course *self, PyObject *data)
     }
     if (!self->running)
         Py_RETURN_FALSE;
-    if (!times(self, &arrival, &now)) {
-        if (!PyErr_ExceptionMatches(PyExc_Exception))
-            return NULL;
-        PyErr_Clear(); /* whoever takes the message meets the same */
-        self->running = 0;
-        Py_RETURN_FALSE;
-    }
+    if (!times(self, &arrival, &now))
+        return refuse(self);
     done = read_message(&self->topic[0], PyBytes_AS_STRING(data), PyBytes_GET_SIZE(data), arrival, &opened, self->fresh);
+    if (done < 0)
+        return refuse(self);
     if (done)
         done = judge(self, &opened, now, data);
     if (done != 1)
@@ -754,6 +1005,7 @@ Course_other(Course *self, PyObject *const *args, Py_ssize_t given)
     Py_ssize_t k;
     int64_t arrival;
     double now;
+    int taken;
     if (given != 2 || !PyBytes_Check(args[1])) {
         PyErr_SetString(PyExc_TypeError, "a topic's number and a serialised message are wanted");
         return NULL;
@@ -766,18 +1018,15 @@ Course_other(Course *self, PyObject *const *args, Py_ssize_t given)
     }
     if (!self->running)
         Py_RETURN_FALSE;
-    if (!times(self, &arrival, &now)) {
-        if (!PyErr_ExceptionMatches(PyExc_Exception))
-            return NULL;
-        PyErr_Clear(); /* whoever takes the message meets the same */
-        self->running = 0;
-        Py_RETURN_FALSE;
-    }
-    self->running = keep(&self->topic[k], PyBytes_AS_STRING(args[1]), PyBytes_GET_SIZE(args[1]), arrival, now,
-                         self->max_gap);
-    if (self->running && note(self, k, args[1], arrival, now, NULL))
+    if (!times(self, &arrival, &now))
+        return refuse(self);
+    taken = keep(&self->topic[k], PyBytes_AS_STRING(args[1]), PyBytes_GET_SIZE(args[1]), arrival, now, self->max_gap);
+    if (taken < 0)
+        return refuse(self);
+    self->running = taken;
+    if (taken && note(self, k, args[1], arrival, now, NULL))
         return NULL;
-    return PyBool_FromLong(self->running);
+    return PyBool_FromLong(taken);
 }
 
 /* --- from and to Python --------------------------------------------------------------------------------------- */
@@ -818,21 +1067,143 @@ Course_listen(Course *self, PyObject *sends)
     Py_RETURN_NONE;
 }
 
+/* What tells how a topic's messages look: mask, want, place of the stamp or -1, then of all values how many numbers each
+   is made of, the numbers' places and codes, what makes values of them, and the enable condition or None. */
+static int
+take_layout(Topic *topic, PyObject *layout)
+{
+    PyObject *mask, *want, *parts, *offset, *code, *derived, *condition;
+    const char *masks, *wants, *from;
+    long long stamp_at;
+    Py_ssize_t numbers_in_all = 0, size;
+    if (!PyArg_ParseTuple(layout, "SSLSSSO!O", &mask, &want, &stamp_at, &parts, &offset, &code, &PyTuple_Type, &derived,
+                          &condition))
+        return -1;
+    forget_layout(topic);
+    size = PyBytes_GET_SIZE(mask);
+    masks = PyBytes_AS_STRING(mask);
+    if (numbers(want, size, 1, "want", &wants))
+        return -1;
+    if (!(topic->mask = copied(masks, (size_t)size)) || !(topic->want = copied(wants, (size_t)size)))
+        return -1;
+    topic->stamped = stamp_at >= 0;
+    topic->stamp_at = stamp_at;
+    if (stamp_at > size - 8)
+        goto misplaced;
+    if (numbers(parts, topic->count, 8, "parts", &from) || !(topic->parts = copied(from, (size_t)topic->count * 8)))
+        return -1;
+    if (PyTuple_GET_SIZE(derived) != topic->count) {
+        PyErr_SetString(PyExc_ValueError, "what makes values of numbers is missing");
+        return -1;
+    }
+    for (Py_ssize_t i = 0; i < topic->count; i++) {
+        if (topic->parts[i] < 0 || topic->parts[i] > size ||
+            (PyTuple_GET_ITEM(derived, i) == Py_None && topic->parts[i] != 1))
+            goto misplaced;
+        numbers_in_all += topic->parts[i];
+    }
+    if (numbers(offset, numbers_in_all, 8, "offset", &from) ||
+        !(topic->offset = copied(from, (size_t)numbers_in_all * 8)))
+        return -1;
+    if (numbers(code, numbers_in_all, 1, "code", &from) || !(topic->code = copied(from, (size_t)numbers_in_all)))
+        return -1;
+    for (Py_ssize_t i = 0; i < numbers_in_all; i++) {
+        int width = width_of(topic->code[i]);
+        if (!width || topic->offset[i] < 4 || topic->offset[i] > size - width)
+            goto misplaced;
+    }
+    topic->conditional = condition != Py_None;
+    if (topic->conditional) {
+        long long at;
+        int letter, width;
+        if (!PyArg_ParseTuple(condition, "LCidp", &at, &letter, &topic->relation, &topic->condition_value,
+                              &topic->holds))
+            return -1;
+        topic->condition_code = (char)letter;
+        topic->condition_at = at;
+        width = letter < 128 ? width_of((char)letter) : 0;
+        if (!width || at < 4 || at > size - width)
+            goto misplaced;
+    }
+    topic->derived = Py_NewRef(derived);
+    topic->size = size;
+    return 0;
+misplaced:
+    PyErr_SetString(PyExc_ValueError, "a number stands outside of its message");
+    return -1;
+}
+
+/* Of another topic than the clock's: the instant of its last message, the last closed sample, messages that may be
+   chosen. */
+static int
+take_messages(Topic *topic, PyObject *last, PyObject *closed, PyObject *kept)
+{
+    long long stamp, arrival;
+    PyObject *values;
+    const char *from;
+    Py_ssize_t count = topic->count;
+    topic->has_last = last != Py_None;
+    if (topic->has_last && (topic->last = PyLong_AsLongLong(last)) == -1 && PyErr_Occurred())
+        return -1;
+    topic->has_closed = closed != Py_None;
+    if (topic->has_closed) {
+        Instant *place = &topic->closed[CLOSED - 1]; /* where the one before the first is looked for */
+        if (!PyArg_ParseTuple(closed, "LL", &stamp, &arrival))
+            return -1;
+        place->stamp = stamp;
+        place->arrival = arrival;
+    }
+    if (PyList_GET_SIZE(kept) > KEPT / 2) {
+        PyErr_SetString(PyExc_ValueError, "too many messages are kept");
+        return -1;
+    }
+    topic->kept = 0;
+    for (Py_ssize_t i = 0; i < PyList_GET_SIZE(kept); i++) {
+        if (!PyArg_ParseTuple(PyList_GET_ITEM(kept, i), "LLS", &stamp, &arrival, &values) ||
+            numbers(values, count, 8, "values", &from))
+            return -1;
+        topic->instant[i].stamp = stamp;
+        topic->instant[i].arrival = arrival;
+        memcpy(topic->values + i * count, from, (size_t)count * 8);
+        topic->kept++;
+    }
+    return 0;
+}
+
+static int
+take_delays(Course *self, PyObject *lines)
+{
+    const char *from;
+    if (PyTuple_GET_SIZE(lines) != self->delays) {
+        PyErr_SetString(PyExc_ValueError, "a delay is missing");
+        return -1;
+    }
+    for (Py_ssize_t i = 0; i < self->delays; i++) {
+        Delayed *one = &self->delayed[i];
+        if (numbers(PyTuple_GET_ITEM(lines, i), one->delay, 8, "line", &from))
+            return -1;
+        memcpy(one->line, from, (size_t)one->delay * 8);
+        one->at = 0;
+    }
+    return 0;
+}
+
 static PyObject *
 Course_resume(Course *self, PyObject *args)
 {
-    PyObject *values, *topics, *tells, *log;
-    long long stamp, arrival;
+    PyObject *values, *before, *topics, *lines, *recent, *tells, *log;
+    long long stamp, arrival, from_ns;
     const char *from;
     Topic *clock = &self->topic[0];
     if (!self->open_values) {
         PyErr_SetString(PyExc_RuntimeError, "not made yet");
         return NULL;
     }
-    if (!PyArg_ParseTuple(args, "(LLS)O!OO", &stamp, &arrival, &values, &PyTuple_Type, &topics, &tells,
-                          &log))
-        return NULL;
     self->running = 0;
+    if (!PyArg_ParseTuple(args, "(LLSdS)O!O!(SppL)OO", &stamp, &arrival, &values, &self->open_dt, &before,
+                          &PyTuple_Type, &topics, &PyTuple_Type, &lines, &recent, &self->alarm, &self->said, &from_ns,
+                          &tells, &log))
+        return NULL;
     if (log != Py_None && !PyList_Check(log)) {
         PyErr_SetString(PyExc_TypeError, "the log is a list");
         return NULL;
@@ -844,73 +1215,40 @@ Course_resume(Course *self, PyObject *args)
     memcpy(self->open_values, from, (size_t)clock->count * 8);
     self->open.stamp = stamp;
     self->open.arrival = arrival;
+    if (numbers(before, self->size, 8, "before", &from))
+        return NULL;
+    memcpy(self->before, from, (size_t)self->size * 8);
     if (PyTuple_GET_SIZE(topics) != self->topics) {
         PyErr_SetString(PyExc_ValueError, "a topic is missing");
         return NULL;
     }
     for (Py_ssize_t k = 0; k < self->topics; k++) {
         Topic *topic = &self->topic[k];
-        PyObject *mask, *want, *offset, *code, *last, *closed, *kept;
-        Py_ssize_t count = topic->count;
-        const char *masks, *wants;
-        long long stamp_at;
-        if (!PyArg_ParseTuple(PyTuple_GET_ITEM(topics, k), "(SSLSS)OOO!", &mask, &want, &stamp_at, &offset, &code,
-                              &last, &closed, &PyList_Type, &kept))
+        PyObject *layout, *last, *closed, *kept, *previous;
+        if (!PyArg_ParseTuple(PyTuple_GET_ITEM(topics, k), "O!OOO!O", &PyTuple_Type, &layout, &last, &closed,
+                              &PyList_Type, &kept, &previous))
             return NULL;
-        forget_layout(topic);
-        masks = PyBytes_AS_STRING(mask);
-        if (numbers(want, PyBytes_GET_SIZE(mask), 1, "want", &wants))
+        if (take_layout(topic, layout) || numbers(previous, topic->angles, 8, "previous", &from))
             return NULL;
-        if (!(topic->mask = copied(masks, (size_t)PyBytes_GET_SIZE(mask))) ||
-            !(topic->want = copied(wants, (size_t)PyBytes_GET_SIZE(mask))))
-            return NULL;
-        topic->stamped = stamp_at >= 0;
-        topic->stamp_at = stamp_at;
-        if (numbers(offset, count, 8, "offset", &from) || !(topic->offset = copied(from, (size_t)count * 8)))
-            return NULL;
-        if (numbers(code, count, 1, "code", &from) || !(topic->code = copied(from, (size_t)count)))
-            return NULL;
-        for (Py_ssize_t i = 0; i < count; i++) {
-            int width = topic->code[i] == 'd' ? 8 : topic->code[i] == 'f' ? 4 : 0;
-            if (!width || topic->offset[i] < 4 || topic->offset[i] + width > PyBytes_GET_SIZE(mask)) {
-                PyErr_SetString(PyExc_ValueError, "a number stands outside of its message");
-                return NULL;
-            }
-        }
-        if (stamp_at > PyBytes_GET_SIZE(mask) - 8) {
-            PyErr_SetString(PyExc_ValueError, "the stamp stands outside of its message");
-            return NULL;
-        }
-        topic->size = PyBytes_GET_SIZE(mask);
+        for (Py_ssize_t i = 0; i < topic->angles; i++)
+            memcpy(&topic->previous[topic->angle[i]], from + 8 * i, 8);
         topic->closings = 0;
-        if (!k)
-            continue;
-        topic->has_last = last != Py_None;
-        if (topic->has_last && (topic->last = PyLong_AsLongLong(last)) == -1 && PyErr_Occurred())
+        if (k && take_messages(topic, last, closed, kept))
             return NULL;
-        topic->has_closed = closed != Py_None;
-        if (topic->has_closed) {
-            Instant *place = &topic->closed[CLOSED - 1]; /* where the one before the first is looked for */
-            if (!PyArg_ParseTuple(closed, "LL", &stamp, &arrival))
-                return NULL;
-            place->stamp = stamp;
-            place->arrival = arrival;
-        }
-        if (PyList_GET_SIZE(kept) > KEPT / 2) {
-            PyErr_SetString(PyExc_ValueError, "too many messages are kept");
-            return NULL;
-        }
-        topic->kept = 0;
-        for (Py_ssize_t i = 0; i < PyList_GET_SIZE(kept); i++) {
-            if (!PyArg_ParseTuple(PyList_GET_ITEM(kept, i), "LLS", &stamp, &arrival, &values) ||
-                numbers(values, count, 8, "values", &from))
-                return NULL;
-            topic->instant[i].stamp = stamp;
-            topic->instant[i].arrival = arrival;
-            memcpy(topic->values + i * count, from, (size_t)count * 8);
-            topic->kept++;
-        }
     }
+    if (take_delays(self, lines))
+        return NULL;
+    if (PyBytes_GET_SIZE(recent) > self->window) {
+        PyErr_SetString(PyExc_ValueError, "more verdicts than the alarm looks at");
+        return NULL;
+    }
+    self->oldest = self->violating = 0;
+    self->filled = PyBytes_GET_SIZE(recent);
+    for (Py_ssize_t i = 0; i < self->filled; i++) {
+        self->recent[i] = PyBytes_AS_STRING(recent)[i] != 0;
+        self->violating += self->recent[i];
+    }
+    self->from = from_ns;
     Py_CLEAR(self->failure);
     self->cut = 0;
     self->running = 1;
@@ -930,9 +1268,10 @@ Course_counts(Course *self, PyObject *Py_UNUSED(ignored))
     }
     if (!topics)
         return NULL;
-    counts = Py_BuildValue("(LLddN)", (long long)self->samples, (long long)self->outside, self->judged,
-                           self->has_published ? self->published : 0.0, topics);
+    counts = Py_BuildValue("(LLy#ddN)", (long long)self->samples, (long long)self->outside, (char *)self->violations,
+                           8 * self->n, self->judged, self->has_published ? self->published : 0.0, topics);
     if (counts) {
+        memset(self->violations, 0, sizeof(int64_t) * (size_t)self->n);
         self->samples = self->outside = 0;
         self->has_published = 0;
         for (Py_ssize_t k = 0; k < self->topics; k++)
@@ -941,48 +1280,98 @@ Course_counts(Course *self, PyObject *Py_UNUSED(ignored))
     return counts;
 }
 
+/* Of one topic: the instant of its last message, messages that may be chosen, samples closed beside what they chose,
+   and the angles that the next ones are held against. */
+static PyObject *
+tell_topic(const Topic *topic)
+{
+    PyObject *kept = PyList_New(0), *closed = PyList_New(0), *previous = PyList_New(0), *last, *one = NULL;
+    for (Py_ssize_t i = 0; kept && i < topic->kept; i++) {
+        PyObject *message = Py_BuildValue("(NN)", told(&topic->instant[i]),
+                                          doubles(topic->values + i * topic->count, topic->count));
+        if (!message || PyList_Append(kept, message))
+            Py_CLEAR(kept);
+        Py_XDECREF(message);
+    }
+    for (Py_ssize_t i = topic->closings > CLOSED ? topic->closings - CLOSED : 0; closed && i < topic->closings; i++) {
+        PyObject *pair = Py_BuildValue("(NN)", told(&topic->closed[i % CLOSED]), told(&topic->chosen[i % CLOSED]));
+        if (!pair || PyList_Append(closed, pair))
+            Py_CLEAR(closed);
+        Py_XDECREF(pair);
+    }
+    for (Py_ssize_t i = 0; previous && i < topic->angles; i++) {
+        PyObject *value = PyFloat_FromDouble(topic->previous[topic->angle[i]]);
+        if (!value || PyList_Append(previous, value))
+            Py_CLEAR(previous);
+        Py_XDECREF(value);
+    }
+    last = topic->has_last ? PyLong_FromLongLong(topic->last) : Py_NewRef(Py_None);
+    if (last && kept && closed && previous)
+        one = PyTuple_Pack(4, last, kept, closed, previous);
+    Py_XDECREF(last);
+    Py_XDECREF(kept);
+    Py_XDECREF(closed);
+    Py_XDECREF(previous);
+    return one;
+}
+
+static PyObject *
+tell_delays(const Course *self)
+{
+    PyObject *lines = PyTuple_New(self->delays);
+    for (Py_ssize_t i = 0; lines && i < self->delays; i++) {
+        const Delayed *one = &self->delayed[i];
+        PyObject *line = PyList_New(one->delay);
+        for (Py_ssize_t j = 0; line && j < one->delay; j++) {
+            PyObject *value = PyFloat_FromDouble(one->line[(one->at + j) % one->delay]);
+            if (!value)
+                Py_CLEAR(line);
+            else
+                PyList_SET_ITEM(line, j, value);
+        }
+        if (!line)
+            Py_CLEAR(lines);
+        else
+            PyTuple_SET_ITEM(lines, i, line);
+    }
+    return lines;
+}
+
+/* The verdicts that the alarm looks at, oldest first. */
+static PyObject *
+tell_window(const Course *self)
+{
+    PyObject *window = PyBytes_FromStringAndSize(NULL, self->filled);
+    for (Py_ssize_t i = 0; window && i < self->filled; i++)
+        PyBytes_AS_STRING(window)[i] = (char)self->recent[(self->oldest + i) % self->window];
+    return window;
+}
+
 static PyObject *
 Course_pause(Course *self, PyObject *Py_UNUSED(ignored))
 {
-    PyObject *topics = PyTuple_New(self->topics - 1);
-    for (Py_ssize_t k = 1; topics && k < self->topics; k++) {
-        Topic *topic = &self->topic[k];
-        PyObject *kept = PyList_New(0), *closed = PyList_New(0), *one = NULL;
-        for (Py_ssize_t i = 0; kept && i < topic->kept; i++) {
-            PyObject *message = Py_BuildValue("(NN)", told(&topic->instant[i]),
-                                              doubles(topic->values + i * topic->count, topic->count));
-            if (!message || PyList_Append(kept, message))
-                Py_CLEAR(kept);
-            Py_XDECREF(message);
-        }
-        for (Py_ssize_t i = topic->closings > CLOSED ? topic->closings - CLOSED : 0; closed && i < topic->closings;
-             i++) {
-            PyObject *pair = Py_BuildValue("(NN)", told(&topic->closed[i % CLOSED]), told(&topic->chosen[i % CLOSED]));
-            if (!pair || PyList_Append(closed, pair))
-                Py_CLEAR(closed);
-            Py_XDECREF(pair);
-        }
-        if (kept && closed)
-            one = topic->has_last ? Py_BuildValue("(LOO)", (long long)topic->last, kept, closed)
-                                  : Py_BuildValue("(OOO)", Py_None, kept, closed);
-        Py_XDECREF(kept);
-        Py_XDECREF(closed);
+    PyObject *topics = PyTuple_New(self->topics), *failure;
+    for (Py_ssize_t k = 0; topics && k < self->topics; k++) {
+        PyObject *one = tell_topic(&self->topic[k]);
         if (!one)
             Py_CLEAR(topics);
         else
-            PyTuple_SET_ITEM(topics, k - 1, one);
+            PyTuple_SET_ITEM(topics, k, one);
     }
     if (!topics)
         return NULL;
     self->running = 0;
     Py_CLEAR(self->arrival);
     Py_CLEAR(self->log);
-    {
-        PyObject *failure = self->failure ? self->failure : Py_NewRef(Py_None);
-        self->failure = NULL;
-        return Py_BuildValue("(NNdNNN)", told(&self->open), doubles(self->open_values, self->topic[0].count), self->dt,
-                             self->cut ? doubles(self->z, self->size) : Py_NewRef(Py_None), topics, failure);
-    }
+    failure = self->failure ? self->failure : Py_NewRef(Py_None);
+    self->failure = NULL;
+    if (!self->cut)
+        return Py_BuildValue("(NON)", topics, Py_None, failure);
+    return Py_BuildValue("(N(NNdNNNLLdNN)N)", topics, told(&self->open),
+                         doubles(self->open_values, self->topic[0].count), self->open_dt,
+                         doubles(self->before, self->size), tell_delays(self), tell_window(self),
+                         (long long)when(&self->judged_at), (long long)self->judged_at.arrival, self->dt,
+                         doubles(self->z, self->size), doubles(self->x_next, self->n), failure);
 }
 
 static PyMethodDef methods[] = {
@@ -1001,14 +1390,14 @@ static PyTypeObject CourseType = {
     .tp_basicsize = sizeof(Course),
     .tp_dealloc = (destructor)Course_dealloc,
     .tp_flags = Py_TPFLAGS_DEFAULT,
-    .tp_doc = "Messages that come in order, complete and within their bounds.",
+    .tp_doc = "Messages that come in order and complete.",
     .tp_methods = methods,
     .tp_init = (initproc)Course_init,
     .tp_new = PyType_GenericNew,
 };
 
 static struct PyModuleDef module = {
-    PyModuleDef_HEAD_INIT, "_course", "Messages that come in order, complete and within their bounds.", -1, NULL,
+    PyModuleDef_HEAD_INIT, "_course", "Messages that come in order and complete.", -1, NULL,
     NULL, NULL, NULL, NULL,
 };
 

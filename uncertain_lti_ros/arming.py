@@ -15,6 +15,8 @@ _OPERATORS: Mapping[str, Callable[[float, float], bool]] = {
 }  # fmt: skip
 _TEXT = re.compile(r"\s*(?P<topic>[~/\w]+)\s+(?P<field>.+?)\s*(?P<operator>==|!=|<=|>=|<|>)\s*(?P<value>\S+)\s*")
 _WORDS = {"true": 1.0, "false": 0.0}
+NEVER = 2**63 - 1
+"""ns; later than any sample."""
 
 
 @dataclass(frozen=True)
@@ -99,9 +101,13 @@ class Arming:
             self._from = t_ns + self._grace
         return t_ns >= self._from
 
-    def counts_from(self, t_ns: int) -> bool:
-        """Whether every verdict from this instant on counts, until something is learnt or time jumps back."""
-        return bool(self.on) and self._from is not None and t_ns >= self._from
+    @property
+    def counts_from(self) -> int | None:
+        """The instant from which verdicts count, until something is learnt or time jumps back; `NEVER` for none.
+
+        None where the next sample decides it.
+        """
+        return self._from if self.on else NEVER
 
     def why_off(self) -> str:
         """What keeps alarms off, in words; empty where they are on."""

@@ -13,6 +13,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 from uncertain_lti.signals import NORM, Derived, FieldPath, FieldType, TypeFields
@@ -44,13 +45,14 @@ class Plan:
     """Where stamp and numbers stand in messages of one length.
 
     A message is of the kind where each of its bytes under mask is that of want. stamp: where sec and nanosec begin,
-    -1 without a header. places: offset and code, f or d, of each number.
+    -1 without a header. values: of each value its places, (offset, code of struct) of each number, and what makes a
+    value of these numbers; None where there is but one, which is the value.
     """
 
     mask: bytes
     want: bytes
     stamp: int
-    places: tuple[tuple[int, str], ...]
+    values: tuple[tuple[tuple[tuple[int, str], ...], Callable[[Sequence[float]], float] | None], ...]
 
 
 class MessageReader:
@@ -151,6 +153,10 @@ class _Parts:
         self.__dict__.update(zip(names, values, strict=True))
 
 
+def _derive(derived: Derived, names: Sequence[str] | None, parts: Sequence[float]) -> float:
+    return float(derived.of(parts if names is None else _Parts(names, parts)))
+
+
 class _Want:
     """One path on its way down into the message, and the places it ends in."""
 
@@ -187,23 +193,24 @@ class _Layout:
             (want.path.derived, want.names, len(want.places)) for want in wants
         ]
 
-    @property
+    @cached_property
     def plan(self) -> Plan | None:
-        """For messages of plain numbers."""
-        if any(derived is not None or count != 1 for derived, _, count in self._derived):
-            return None
-        numbers, stamp = [places[0] for places in self._places[self._first :]], -1
+        """None where a value has no place, or a computed one is made of whole numbers."""
+        values, stamp = [], -1
+        for places, (derived, names, _) in zip(self._places[self._first :], self._derived, strict=True):
+            plain = len(places) == 1 if derived is None else all(code in "fd" for _, code in places)
+            if not plain:
+                return None
+            values.append((tuple(places), None if derived is None else partial(_derive, derived, names)))
         if self._stamped:
             (stamp, seconds), nanoseconds = self._places[0][0], self._places[1][0]
             if seconds != "i" or nanoseconds != (stamp + 4, "I"):
                 return None
-        if any(code not in "fd" for _, code in numbers):
-            return None
         mask, want = bytearray(self._size), bytearray(self._size)
         for start, stop, under, wanted in self._shape:
             mask[start:stop] = under.to_bytes(stop - start, "little")
             want[start:stop] = wanted.to_bytes(stop - start, "little")
-        return Plan(bytes(mask), bytes(want), stamp, tuple(numbers))
+        return Plan(bytes(mask), bytes(want), stamp, tuple(values))
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]] | None:
         """Stamp and values; None where the message looks otherwise."""
@@ -227,8 +234,7 @@ class _Layout:
             if derived is None:
                 values.append(float(picked[first]) if count else math.nan)
             else:
-                parts = picked[first : first + count]
-                values.append(float(derived.of(parts if names is None else _Parts(names, parts))))
+                values.append(_derive(derived, names, picked[first : first + count]))
             first += count
         return stamp, values
 

@@ -297,32 +297,54 @@ class Watch:
         return self._readers[topic].plan
 
     @property
-    def calm(self) -> bool:
-        """Verdicts within their bounds change nothing but counts, as there is no alarm, and each counts for one."""
-        if self.latched or not self.monitor.calm or self.enable_topic in self._readers:
+    def plan_of_condition(self) -> Plan | None:
+        """The same for the field of the enable condition."""
+        return self._reads_condition.plan if self._reads_condition is not None else None
+
+    def tells_nothing_new(self, topic: str, data: bytes, now: float) -> bool:
+        """Take a message that the enable condition alone wants; False, and it is not taken, where that may change."""
+        condition, reader = self.arming.condition, self._reads_condition
+        if condition is None or reader is None or topic in self._readers:
             return False
-        latest = self.sampler.latest()
-        return latest is not None and self.arming.counts_from(latest[0])
+        try:
+            (value,) = reader.read(data)[1]
+        except UnreadableError:
+            return False
+        if condition.holds(value) is not self.arming.on:
+            return False
+        self.received[topic] += 1
+        self._heard[topic] = now
+        return True
 
-    def have_been_contained(
-        self, count: int, outside_domain: int, judged: float, topics: Mapping[str, tuple[int, float]]
+    def have_been_judged(
+        self,
+        count: int,
+        outside_domain: int,
+        violations: Sequence[int],
+        judged: float,
+        topics: Mapping[str, tuple[int, float]],
     ) -> None:
-        """So many samples were judged elsewhere while all was calm, the last one at `judged`, and lay within bounds.
+        """So many samples were judged elsewhere, the last one at `judged`, and the alarm has not turned.
 
-        topics: messages that came on each topic, and when the last one did.
+        violations: of each state (n,). topics: messages that came on each topic, and when the last one did.
         """
         for topic, (received, heard) in topics.items():
             if received:
                 self.received[topic] += received
                 self._heard[topic] = heard
                 self._readers[topic].fitted(received)
+                if topic == self.enable_topic and self._reads_condition is not None:
+                    self._reads_condition.fitted(received)
         if count:
             self.sampler.counters["samples"] += count
-            self.monitor.contained(count)
             self._judged = judged
             self.verdicts += count
             self._period.verdicts += count
             self._period.outside += outside_domain
+            for i, violated in enumerate(violations):
+                if violated:
+                    self.violations[i] += violated
+                    self._period.violations[i] += violated
 
     def _learn_condition(self, topic: str, data: bytes) -> None:
         assert self._reads_condition is not None
