@@ -53,14 +53,14 @@ def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) 
     BagError
         A topic is not there or cannot be read.
     SignalError
-        A field is not in the message type, is not one number, or names what no message has.
+        A field is not in the message type, is not one number, or looks up a name or an element that no message has.
     """
     paths = _paths(bag, signals)
     try:
         columns = read_columns(bag, signals.topics, paths, progress)
     except RepeatedNamesError:
         return read_stream_by_message(bag, signals, progress)
-    _refuse_absent_names(bag, signals, paths, columns.values)
+    _refuse_absent(bag, signals, paths, columns.values)
     return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
 
 
@@ -82,7 +82,7 @@ def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | No
         stamp.append(header_stamp_ns(message) or -1)
         values[where].extend([path.read(message) for path in paths[where]])
     arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
-    _refuse_absent_names(bag, signals, paths, arrays)
+    _refuse_absent(bag, signals, paths, arrays)
     return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
 
 
@@ -94,25 +94,20 @@ def _paths(bag: Bag, signals: SignalMap) -> list[list[FieldPath]]:
     return [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics]
 
 
-def _refuse_absent_names(
+def _refuse_absent(
     bag: Bag, signals: SignalMap, paths: Sequence[Sequence[FieldPath]], values: Sequence[NDArray[np.float64]]
 ) -> None:
-    """A name that the first message lacks, and that gave no number in any other, is a mistake in the map."""
+    """What the first message lacks, and what gave no number in any other, is a mistake in the map."""
     for name, columns, read in zip(signals.topics, paths, values, strict=True):
         for path, column in zip(columns, read.T, strict=True):
-            by_name = any(kind == "name" for kind, _ in path.steps)
-            if not by_name or not len(column) or not math.isnan(column[0]) or not np.isnan(column).all():
+            looked_up = any(kind != "attribute" for kind, _ in path.steps)
+            if not looked_up or not len(column) or not math.isnan(column[0]) or not np.isnan(column).all():
                 continue
             said = bag.said
             _, _, first = next(iter(bag.messages([name])))
             bag.tell(*said)
-            if missing := path.missing_name(first):
-                wanted, there = missing
-                raise SignalError(
-                    f"field '{path.text}' of {name} in {bag.path}: there is no '{wanted}' in the message's names"
-                    f"{meant(wanted, there)}; "
-                    f"names there: {', '.join(there) or 'none'}"
-                )
+            if absent := path.absent(first):
+                raise SignalError(f"field '{path.text}' of {name} in {bag.path}: {absent}")
 
 
 def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, str]:

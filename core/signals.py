@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from uncertain_lti.errors import SignalError
 from uncertain_lti.files import kind_of
-from uncertain_lti.wording import meant
+from uncertain_lti.wording import meant, plural
 
 LONGEST_DELAY = 1_000_000
 """Samples by which a control may be delayed at most."""
@@ -221,22 +221,25 @@ class FieldPath:
                 return index
         return -1
 
-    def missing_name(self, message: Any) -> tuple[str, list[str]] | None:
-        """(name, names there) where this path looks up a name that the message's `name` array lacks."""
-        value, parent = message, message
+    def absent(self, message: Any) -> str:
+        """What this path looks up and the message has not, in words, with what is there; empty where it has."""
+        value, parent, name = message, message, ""
         for kind, key in self.steps:
             if kind == "attribute":
-                parent, value = value, getattr(value, key)  # type: ignore[arg-type]
-            elif kind == "name":
-                names = [str(name) for name in parent.name]
-                if key not in names:
-                    return str(key), names
-                value = value[names.index(str(key))] if names.index(str(key)) < len(value) else None
-            else:
-                value = value[key] if key < len(value) else None  # type: ignore[operator]
-            if value is None:
-                return None
-        return None
+                parent, value, name = value, getattr(value, key), str(key)  # type: ignore[arg-type]
+                continue
+            names = [str(one) for one in parent.name] if kind == "name" else []
+            if kind == "name" and key not in names:
+                there = ", ".join(names) or "none"
+                return f"there is no '{key}' in the message's names{meant(key, names)}; names there: {there}"
+            index = names.index(str(key)) if kind == "name" else int(key)
+            if index >= len(value):
+                if not len(value):
+                    return f"'{name}' has no element in the message; choose a field that is filled"
+                there = f"elements there: 0 to {len(value) - 1}"
+                return f"'{name}' has {plural(len(value), 'element')} in the message; {there}"
+            value = value[index]
+        return ""
 
     def check(self, topic: str, type_name: str, type_fields: TypeFields) -> None:
         """Hold the path against a message type.

@@ -379,9 +379,16 @@ def test_wrong_options_are_refused():
 
 
 def test_nothing_usable_is_said():
-    x = np.full((20, 1), np.nan)
-    with pytest.raises(FitError, match="no usable transition among 20 samples"):
-        fit(Transient(np.arange(20) * 0.1, x, np.zeros((20, 1)), name="silent.mcap"))
+    t, some, none = np.arange(20) * 0.1, np.zeros((20, 1)), np.full((20, 1), np.nan)
+    every_other = np.where(np.arange(20)[:, None] % 2, np.nan, 0.0)
+    for x, u, max_gap, words in (
+        (none, some, 1.0, "among 20 samples; x1 has no value in any of them .* check its field"),
+        (none, none, 1.0, "x1, u1 have no value in any of them"),
+        (every_other, some, 1.0, "no two in a row have every signal; there is a value of x1 in 10 of them"),
+        (some, some, 0.01, "no two in a row are at most max_gap and at least min_step apart"),
+    ):
+        with pytest.raises(FitError, match=words):
+            fit(Transient(t, x, u, max_gap=max_gap, name="silent.mcap"))
 
 
 def test_moments_are_plain_sums():

@@ -457,6 +457,8 @@ def joints(folder: Path, values: Sequence[float] = (1.0, 2.0), names: Sequence[s
         (("x", "/x", "position"), "is not one number but an array; give an index, for example \\[0\\]; numeric field"),
         (("x", "/x", "position[hub]"), "there is no 'hub' in the message's names; names there: fan, core"),
         (("x", "/x", "velocity[hub]"), "there is no 'hub' in the message's names; names there: fan, core"),
+        (("x", "/x", "position[9]"), "'position' has 2 elements in the message; elements there: 0 to 1"),
+        (("x", "/x", "velocity[fan]"), "'velocity' has no element in the message; choose a field that is filled"),
         (("x", "/x", "name[0]"), "not one number but a string; numeric field paths of /x: header.stamp.sec"),
         (("x", "/s", "data"), "not one number but a string; numeric field paths of /s: none"),
         (("x", "/s", "norm(data)"), "wants a vector"),

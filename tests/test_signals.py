@@ -191,11 +191,22 @@ def test_a_name_that_moves_in_the_name_array_is_followed(side: str) -> None:
 
 
 @both
-def test_missing_name_says_what_is_there(side: str) -> None:
+def test_absent_says_what_is_there(side: str) -> None:
     message = MESSAGES[side]("sensor_msgs/msg/JointState", JOINTS)
-    assert FieldPath("position[hub]").missing_name(message) == ("hub", JOINTS["name"])
-    for field in ("position[fan]", "position[0]", "position[99]", "velocity[left wheel]", "header.stamp.sec"):
-        assert FieldPath(field).missing_name(message) is None
+    there = ", ".join(JOINTS["name"])
+    assert FieldPath("position[hub]").absent(message) == (
+        f"there is no 'hub' in the message's names; names there: {there}"
+    )
+    count = len(JOINTS["position"])
+    assert FieldPath("position[99]").absent(message) == (
+        f"'position' has {count} elements in the message; elements there: 0 to {count - 1}"
+    )
+    assert "elements there: 0 to 1" in FieldPath("velocity[left wheel]").absent(message)
+    empty = MESSAGES[side]("sensor_msgs/msg/JointState", JOINTS | {"effort": []})
+    for field in ("effort[0]", "effort[fan]"):
+        assert FieldPath(field).absent(empty) == "'effort' has no element in the message; choose a field that is filled"
+    for field in ("position[fan]", "position[0]", "header.stamp.sec"):
+        assert FieldPath(field).absent(message) == ""
 
 
 # --- angles -------------------------------------------------------------------------------------------------
@@ -279,7 +290,7 @@ def test_paths_by_the_grammar_lead_where_they_say(case: tuple[str, Any, float]) 
     assert FieldPath(f"  {text} ").read(message) == value
     assert FieldPath(f"unwrap({text})").read(message) == value
     assert FieldPath(text) == FieldPath(text) and hash(FieldPath(text)) == hash(FieldPath(text))
-    assert FieldPath(text).missing_name(message) is None
+    assert FieldPath(text).absent(message) == ""
 
 
 @pytest.mark.parametrize(

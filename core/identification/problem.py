@@ -279,9 +279,8 @@ def assemble(
     if not len(k) and not empty:
         names = ", ".join(t.name for t in transients)
         raise FitError(
-            f"{names}: no usable transition among {plural(sum(len(t) for t in transients), 'sample')}; signals "
-            "are missing, "
-            f"not finite or too old (see max_gap, max_hold, max_skew), so check the signals file"
+            f"{names}: no usable transition among {plural(sum(len(t) for t in transients), 'sample')}; "
+            f"{_without_values(transients)}"
         )
     dt = np.concatenate([s.dt for s in steps])
     p = n + len(point.u_s)
@@ -301,6 +300,27 @@ def assemble(
         factors = factors[source]
         chosen = factors[:, None] * chosen if chosen.ndim < 3 else factors[:, None, None] * chosen
     return Problem(z, x_next, dt, source, k, chosen, columns)
+
+
+def _without_values(transients: Sequence[Transient]) -> str:
+    """Why there may be no usable transition, by signal."""
+    first, total = transients[0], sum(len(t) for t in transients)
+    known = sum(np.isfinite(np.concatenate([t.x, t.u], axis=1)).sum(axis=0) for t in transients)
+    counts = dict(zip((*first.state_names, *first.control_names), np.asarray(known).tolist(), strict=True))
+    never = [name for name, count in counts.items() if not count]
+    if never:
+        many = len(never) > 1
+        return (
+            f"{', '.join(never)} {'have' if many else 'has'} no value in any of them (missing, not finite or too old, "
+            f"see max_hold and max_skew), so check {'their fields' if many else 'its field'} in the signals file"
+        )
+    seldom = [f"{name} in {count}" for name, count in counts.items() if count < total]
+    if seldom:
+        return (
+            f"no two in a row have every signal; there is a value of {', '.join(seldom)} of them (otherwise missing, "
+            f"not finite or too old, see max_hold and max_skew), so check the signals file"
+        )
+    return "no two in a row are at most max_gap and at least min_step apart, so check these in the signals file"
 
 
 def _factors(
