@@ -323,6 +323,7 @@ class Plant:
         self.t_ns = EPOCH_NS
         self.x = np.zeros(model.n)
         self.u = np.full(model.m, 0.2)
+        self.padding: list[float] = []  # makes messages on the state topic large
 
     def subscribed(self) -> Plant:
         self.world.subscribed(self.state, self.control)
@@ -332,7 +333,8 @@ class Plant:
         """Samples on the centre of their bounds, or `off` half-widths beside it."""
         point = self.model.operating_point
         for _ in range(samples):
-            message = JointState(name=["a", "b"], position=point.recorded_x(self.x).tolist())
+            position = point.recorded_x(self.x).tolist()
+            message = JointState(name=["a", "b"], position=position, effort=self.padding)
             control = Vector3Stamped()
             recorded = point.u_s + point.U * self.u
             control.vector.x, control.vector.y = float(recorded[0]), float(recorded[1])
