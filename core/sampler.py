@@ -215,11 +215,16 @@ class _Topic:
                     self.forgotten[by_stamp] = min(first, instant), max(last, instant)
         self.kept.append(message)
 
-    def start_anew(self, sample: _Message | None) -> None:
-        """The topic's time has stepped back, as in a bag that is played again: what was kept is of the last pass.
+    def start_anew(self, sample: _Message | None, message: _Message) -> None:
+        """The topic's time has stepped back to a message, as in a bag that is played again; the last pass is forgotten.
 
-        The open sample may be of that pass too, where the clock has not stepped back yet.
+        The open sample may be of that pass too, where the clock has not stepped back yet: not since the topic last did,
+        or there is the topic that never followed, and the sample is nearer to the time that it leaves only now.
         """
+        if self.behind and sample is not None:
+            instant = sample.stamp if self.left[0] else sample.arrival
+            if instant is not None and abs(instant - self.left[1]) < abs(_behind(sample, message)):
+                self.behind = False
         held = None if sample is None or self.behind else self.choose(sample)
         self.leave = (sample, held) if sample is not None and held is not None else None
         self.kept.clear()
@@ -262,8 +267,8 @@ class _Topic:
 
     @property
     def in_order(self) -> bool:
-        """Nothing has been forgotten, and no time has stepped back that another may follow."""
-        return not (self.forgotten or self.leave or self.ahead or self.behind)
+        """Nothing has been forgotten, and the topic's time has not stepped back before that of the clock."""
+        return not (self.forgotten or self.leave or self.ahead)
 
     def unwrapped(self, values: list[float]) -> list[float]:
         for i in self.unwrap:
@@ -372,7 +377,7 @@ class Sampler:
         if topic == self.clock:
             return self._push_clock(state, message)
         if state.steps_back(message, self.max_gap_ns):
-            state.start_anew(self._open)
+            state.start_anew(self._open, message)
         elif state.came_late(message):
             self.counters[f"late {topic}"] += 1
         if state.unwrap:
@@ -488,6 +493,10 @@ class Sampler:
         where = self._where[topic]
         return list(where), [self._max_age[i] for i in where], list(self._topics[topic].unwrap)
 
+    def kept(self, topic: str) -> list[tuple[Told, Sequence[float]]]:
+        """Messages of a topic that may still be chosen, in order of arrival."""
+        return [(message.tell(), message.values) for message in self._topics[topic].kept]
+
     @property
     def delays(self) -> list[tuple[int, int]]:
         """Place in [x; u] of each delayed control, and by how many samples."""
@@ -522,7 +531,7 @@ class Sampler:
                 topic: (
                     state.last.get(state.header),
                     state.closed[-1][0].tell() if state.closed else None,
-                    [(message.tell(), message.values) for message in state.kept],
+                    self.kept(topic),
                 )
                 for topic, state in others.items()
             },

@@ -126,6 +126,7 @@ class Node(envelope_monitor.EnvelopeMonitorNode):
             "judged": (watch.verdicts, watch.violations, watch.alarms, watch.alarm, watch.failures),
             "window": (list(watch.monitor._recent), watch.monitor._violations),
             "latest": repr(watch.sampler.latest()),
+            "enable": (watch.arming.on, watch.arming.value),
             "last": last and (last.t_ns, last.outside_domain, last.alarm),
             "last numbers": last and [last.packed(name) for name in NUMBERS],
             "remembered": [
@@ -333,6 +334,53 @@ def test_an_output_that_fails_is_told_and_the_node_goes_on(ros: None, tmp_path: 
 
 
 @needs_compiled
+def test_an_interrupt_while_something_is_sent_ends_the_process(ros: None, tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    model = saved(tmp_path / "model.json", 3, rng)
+    node = Node(tmp_path / "model.json", True)
+    *messages, last = stream(model, rng, 60, 0.0)
+
+    def interrupt(data: bytes) -> None:
+        raise KeyboardInterrupt
+
+    for message in messages:
+        node._on_tick()
+        node.arrive(*message)
+    node._settle()
+    node._outputs["upper"].send = interrupt
+    node._go_on()
+    with pytest.raises(KeyboardInterrupt):
+        node.arrive(*last)
+    assert not node._failures
+    end([node])
+
+
+@needs_compiled
+def test_the_shortest_messages_are_taken(ros: None, tmp_path: Path) -> None:
+    """A UInt8 takes five bytes; rclpy sends eight of them, others need not."""
+    level = Signal("u", SETPOINT, "data", type="std_msgs/msg/UInt8")
+    signals = SignalMap(
+        (Signal("x0", STATE, "position[x0]", type=VECTOR),), (level,), clock=STATE, max_gap=0.055,
+        time={STATE: "header", SETPOINT: "log"},
+    )  # fmt: skip
+    sampling = Sampling(STATE, VECTOR, dict(signals.time), dt_median=0.01, max_gap=0.055)
+    UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], v=[1.0], signals=signals, sampling=sampling).save(
+        tmp_path / "model.json"
+    )
+    nodes = [Node(tmp_path / "model.json", compiled) for compiled in (True, False)]
+    for k in range(60):
+        at = START_NS + k * STEP_NS
+        state = vector(at, {"x0": 3.0 * (k % 7 == 0)})
+        for node in nodes:
+            node.arrive(at, SETPOINT, bytes([0, 1, 0, 0, k]))
+            node.arrive(at, STATE, state)
+            node._on_tick()
+    assert nodes[0].standing() == nodes[1].standing() and nodes[0].sent == nodes[1].sent
+    assert nodes[0].taken > 20 and not any(node._failures for node in nodes)
+    end(nodes)
+
+
+@needs_compiled
 def test_what_does_not_fit_together_is_refused_and_nothing_is_read_beyond_a_message(ros: None, tmp_path: Path) -> None:
     model = saved(tmp_path / "model.json", 3, np.random.default_rng(7))
     node = Node(tmp_path / "model.json", True)
@@ -435,7 +483,7 @@ OPTIONS = (
 
 def saved_with(path: Path, options: set[str], rng: np.random.Generator, alarm: Alarm) -> UncertainLTI:
     """Joints, and of an inertial unit an angle and a norm; a control of whole numbers; left bounds are no rarity."""
-    hold = 0.1
+    hold = 0.015 if "delays" in options else 0.1
     states = [
         Signal("x0", STATE, "position[x0]", type=VECTOR),
         Signal("x1", STATE, "unwrap(position[x1])" if "angles" in options else "velocity[x1]", type=VECTOR),

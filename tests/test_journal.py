@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, Plant, by_hand, joint_s
 from uncertain_lti_ros.journal import Journal
 from uncertain_lti_ros.layout import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
-from uncertain_lti_ros.watch import OK, WARN, Rule, Watch, topic_types
+from uncertain_lti_ros.watch import OK, STALE, WARN, Rule, Watch, topic_types
 
 TIMEOUT = 1.0
 STEP = STEP_NS * 1e-9
@@ -118,6 +119,88 @@ def test_masked_states_are_not_named_and_a_latched_alarm_says_what_ends_it() -> 
     rig.watch.reset()
     rig.wait(0.1)
     assert [line[:21] for line in rig.lines] == ["the alarm is over aft"]
+
+
+def test_a_narrow_miss_is_told_with_the_digits_that_show_it() -> None:
+    rig = Rig()
+    rig.x = np.full(rig.model.n, 200.0)
+    rig.send(10)
+    rig.lines.clear()
+    rig.send(3, off=1.0000001)
+    (line,) = (line for line in rig.lines if line.startswith("alarm"))
+    (_, value, by, _, upper) = re.findall(r"(\w) = (\S+) is (\S+) above its bounds (\S+) to ([\d.]+)", line)[0]
+    assert 0 < float(by) < 1e-4 and float(value) - float(upper) == pytest.approx(float(by), rel=0.02)
+
+
+def test_a_new_rule_keeps_what_is_known_and_a_standing_alarm_where_it_latches() -> None:
+    rig = Rig(enable=f"{CONTROL} vector.x > -1e9")
+    rig.send(10)
+    watch = rig.watch
+    assert watch.arming.on
+    watch.follow(replace(watch.rule, enable=f"{CONTROL} vector.x < -1e9"))  # the same field: held against what it said
+    assert watch.arming.on is False
+    watch.follow(replace(watch.rule, enable=f"{CONTROL} vector.y > -1e9"))
+    assert watch.arming.on is None
+    rig.wait(0.1)
+    watch.follow(replace(watch.rule, enable=""))
+    rig.wait(0.1)
+    assert rig.lines[-1] == "alarms count from now on: there is no condition any more"
+    rig.send(5, off=2.0)
+    assert watch.alarm
+    watch.follow(watch.rule)  # the rule that there is
+    assert watch.alarm and not watch.latched
+    watch.follow(replace(watch.rule, latch=True))
+    assert watch.alarm and watch.latched
+    watch.follow(replace(watch.rule, masked="b", margin=9.0))
+    assert watch.alarm
+    watch.follow(replace(watch.rule, latch=False))
+    assert not watch.alarm
+
+
+def test_a_watch_goes_on_with_the_controls_in_force_and_a_latched_alarm() -> None:
+    rig = Rig(latch=True, enable=f"{CONTROL} vector.x > -1e9")
+    rig.send(10)
+    rig.send(5, off=2.0)
+    old = rig.watch
+    rig.watch = Watch(rig.model, old.rule, old.types, live_fields, old._make_reader, rig.now, old.arming)
+    rig.watch.go_on_from(old)
+    assert rig.watch.alarm and rig.watch.latched and rig.watch.arming.on and rig.watch.heard(CONTROL) is not None
+    rig.send(3, control=False)
+    assert rig.watch.verdicts == 2 and rig.watch.sampler.counters["missing"] == 0
+
+
+def test_an_enable_condition_without_a_number_is_told_from_one_that_is_silent() -> None:
+    rig = Rig(enable=f"{STATE} effort[3] > 0")
+    rig.wait(0.1)
+    assert rig.lines[-1] == f"alarms are off: it is not known whether {STATE} effort[3] > 0"
+    rig.send(3)
+    assert rig.watch.arming.why_off() == f"alarms are off: {STATE} comes without a number in effort[3]"
+
+
+def test_an_alarm_that_stands_through_silence_is_told_in_the_reports() -> None:
+    rig = Rig()
+    rig.send(10)
+    rig.send(5, off=2.0)
+    rig.watch.report(rig.now, TIMEOUT)
+    rig.wait(5.0)
+    monitor, *states = rig.watch.report(rig.now, TIMEOUT)
+    assert monitor.level == STALE and "alarm: it stood at the last verdict" in monitor.message
+    assert f"no message on {STATE}" in monitor.message and all(one.level == STALE for one in states)
+    rig.watch.reset()
+    assert "alarm" not in rig.watch.report(rig.now, TIMEOUT)[0].message
+
+
+def test_signals_without_a_value_are_named_in_the_reports() -> None:
+    rig = Rig()
+    rig.send(10)
+    rig.watch.report(rig.now, TIMEOUT)
+    rig.wait(1.0)
+    rig.send(20, control=False)
+    assert "a signal is missing, stale or not finite (p, q)" in rig.watch.report(rig.now, TIMEOUT)[0].message
+    rig.send(3)
+    rig.watch.report(rig.now, TIMEOUT)
+    rig.send(3)
+    assert rig.watch.report(rig.now, TIMEOUT)[0].level == OK
 
 
 def test_a_flapping_alarm_does_not_flood_the_log_and_its_state_is_told_in_the_end() -> None:

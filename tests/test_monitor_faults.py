@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -481,6 +482,41 @@ def test_reload_reads_the_file_again_or_says_why_not(world: World, tmp_path: Pat
     assert np.isnan(got[0]) and got[1:] == [0, 0]
 
 
+def test_a_control_that_is_sent_once_and_a_latched_alarm_outlive_a_reload(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    signals = replace(model.signals, controls=tuple(replace(c, max_hold=None) for c in model.signals.controls))
+    model = UncertainLTI(
+        model.A, model.B, model.dA, model.dB, v=model.v, signals=signals, sampling=model.sampling, alarm=Alarm(2, 3)
+    )
+    path = saved(model, tmp_path)
+    mode_type = {"enable": "/machine/mode data == 3", "enable_type": "std_msgs/msg/UInt8"}
+    process = world.monitor(path, latch=True, **mode_type)
+    outputs = Outputs.of(world)
+    flags, violation = outputs.topics["flags"], outputs.topics["violation"]
+    mode = world.publisher(UInt8, "/machine/mode", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    mode.publish(UInt8(data=3))
+    until(lambda: world.status()["armed"], "the mode")
+    plant = Plant(world, model).subscribed()
+    plant.send(30)
+    plant.control.publish = lambda _: None  # type: ignore[method-assign]
+    plant.send(3, off=2.0)
+    plant.send(5)
+    flags.count(38)
+    until(lambda: violation.messages[-1].data, "the alarm")
+    assert trigger(world, "reload")[0]
+    plant.send(5)
+    assert [m.position[0] for m in flags.count(43)[39:]] == [0, 0, 0, 0]
+    assert world.set(margin=1.5) == (True, "") and world.status()["alarm"]
+    assert world.set(enable="/machine/mode data >= 3") == (True, "") and world.status()["armed"] is True
+    assert world.set(enable="/machine/mode data > 3") == (True, "") and world.status()["armed"] is False
+    plant.send(5)
+    assert [m.position[0] for m in flags.count(48)[44:]] == [0, 0, 0, 0]
+    assert violation.messages[-1].data and world.status()["latched"]
+    assert trigger(world, "reset")[0] and not world.status()["alarm"]
+    process.says("the alarm is over after")
+    assert ", by ~/reset" in process.output
+
+
 # --- snapshots ----------------------------------------------------------------------------------------------
 
 
@@ -566,6 +602,32 @@ def test_an_alarm_takes_a_snapshot_when_asked_to(world: World, tmp_path: Path) -
     finally:
         folder.chmod(0o700)
     assert process.running
+
+
+def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(world: World, tmp_path: Path) -> None:
+    folder = tmp_path / "snapshots"
+    model = by_hand()
+    signals = replace(model.signals, controls=tuple(replace(c, max_hold=None) for c in model.signals.controls))
+    model = UncertainLTI(model.A, model.B, model.dA, model.dB, v=model.v, signals=signals, sampling=model.sampling)
+    path = saved(model, tmp_path)
+    options: dict[str, Any] = {"snapshot.on_alarm": True, "snapshot.after": 0.1, "snapshot.seconds": 1.0}
+    world.monitor(path, **{"snapshot.folder": str(folder)}, **options)
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(20)
+    plant.control.publish = lambda _: None  # type: ignore[method-assign]
+    plant.send(300)
+    for _ in range(8):
+        plant.send(1, off=2.0)
+        plant.send(30)
+    flags.count(320 + 8 * 31)
+    (found,) = until(lambda: list(folder.glob("*.mcap")), "the file", 5)
+    verdicts = offline(path, found)
+    assert len(verdicts) < 300 and sum(not v.judged for v in verdicts) == 1 and any(v.violated for v in verdicts)
+    assert world.status()["snapshot"] == str(found), "one file as long as the alarm keeps coming back"
+    time.sleep(1.2)
+    plant.send(3, off=2.0)
+    until(lambda: len(list(folder.glob("*.mcap"))) == 2, "another after a while without", 5)
 
 
 def test_without_a_folder_there_are_no_snapshots(world: World, tmp_path: Path) -> None:

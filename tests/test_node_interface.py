@@ -389,7 +389,10 @@ def test_paths_that_a_user_gives_are_those_of_the_user(world: World, tmp_path: P
 
 def test_snapshots_on_alarm_without_a_folder_are_refused(world: World, tmp_path: Path) -> None:
     path = saved(by_hand(), tmp_path)
-    said = "parameter snapshot.on_alarm is true, and snapshot.folder is empty; start the node with a folder"
+    said = (
+        "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the node "
+        "with the other"
+    )
     process = world.run_node("envelope_monitor", {"model": str(path), "snapshot.on_alarm": True})
     process.says(f"not configured: {said}")
     process.kill()

@@ -173,11 +173,20 @@ class Reference:
             stamp = self.stamp(i)
             instant, stamped = self.sent[i].arrival if stamp is None else stamp, stamp is not None
             if i in self.jumps[topic]:
-                ahead, behind, left = not behind, False, (stamped, last[stamped])
+                ahead, behind, left = not (behind and self.follows(i)), False, (stamped, last[stamped])
             elif left is not None and left[0] is stamped and instant >= left[1]:
                 ahead = False
             last[stamped] = instant
         return ahead, behind
+
+    def follows(self, jump: int) -> bool:
+        """Whether the clock may have stepped back before a message: the open sample is as near to it as to the last."""
+        sample = max((s for s in self.samples if s.index < jump), key=lambda s: s.index)
+        stamped, topic = self.stamp(jump) is not None, self.sent[jump].topic
+        before = max(i for i in self.by_topic[topic] if i < jump and (self.stamp(i) is not None) == stamped)
+        here = self.stamp(sample.index) if stamped else self.sent[sample.index].arrival
+        gone = self.stamp(before) if stamped else self.sent[before].arrival
+        return here is None or abs(here - gone) >= abs(self.age(sample, jump))
 
     def passed_over(self, topic: str, before: Sample) -> set[int]:
         gone: set[int] = set()
@@ -201,7 +210,7 @@ class Reference:
         begin = 0
         for event in self.jumps[topic]:
             _, behind = self.lag(topic, event)
-            if sample.index < event < sample.closed_by and not behind:
+            if sample.index < event < sample.closed_by and not (behind and self.follows(event)):
                 candidates = {i for i in self.by_topic[topic] if begin <= i < event}
                 if self.forgets:
                     candidates -= self.passed_over(topic, sample)
@@ -552,6 +561,22 @@ def test_nothing_of_a_step_back_of_time_stays_once_it_is_over(control_first: boo
     assert sampler.counters["resets"] == 2
 
 
+def test_a_topic_that_is_heard_first_in_the_second_pass_joins_no_pass_to_another() -> None:
+    """The clock's first step back has no counterpart there; each later one comes after that of the topic."""
+    sampler = Sampler(two_topics())
+    steps = [*sampler.push(*at("/c", 298, 298)), *sampler.push(*at("/c", 299, 299))]
+    for k in range(1, 11):
+        begin = 300 * k
+        for tick in range(200):
+            if k > 1 or tick:
+                steps += sampler.push(*at("/u", begin + tick, 100 + tick, float(k)))
+            if tick == 0 and k > 1:  # the last sample of the pass before
+                steps += sampler.push(*at("/c", begin + tick, 300, float(k - 1)))
+            steps += sampler.push(*at("/c", begin + tick, 100 + tick, float(k)))
+    judged = [step for step in steps if step.status is Status.OK]
+    assert len(judged) > 1900 and all(step.before[0] == step.before[1] for step in judged)
+
+
 def test_single_messages_of_another_time_leave_nothing_behind() -> None:
     sampler = Sampler(two_topics())
     for k in range(100, 500):
@@ -559,6 +584,11 @@ def test_single_messages_of_another_time_leave_nothing_behind() -> None:
         sampler.push(*at("/u", k, k + odd))
         sampler.push(*at("/c", k, k))
         assert (sampler.standing() is None) == (k == 150 or 201 <= k < 300)
+    for k in range(500, 600):
+        odd = -100 if k == 550 else 0
+        sampler.push(*at("/u", k, k))
+        sampler.push(*at("/c", k, k + odd))
+        assert sampler.standing() is not None
 
 
 def test_states_of_two_topics_are_judged_when_the_sample_closes() -> None:

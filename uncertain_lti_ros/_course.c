@@ -53,7 +53,7 @@ typedef struct {
     int conditional, relation, holds;
     int64_t condition_at;
     char condition_code;
-    double condition_value;
+    double condition_value, condition_said; /* the limit, and what the field said last; NaN: nothing since it goes on */
     /* messages that may be chosen; not of the clock topic */
     Py_ssize_t kept;
     Instant *instant; /* KEPT */
@@ -317,6 +317,8 @@ Course_init(Course *self, PyObject *args, PyObject *kwargs)
         if (!PyArg_ParseTuple(PyTuple_GET_ITEM(topics, k), "pSSS", &topic->header, &where, &max_age, &angles))
             return -1;
         topic->count = PyBytes_GET_SIZE(where) / 8;
+        if (topic->count > size)
+            goto misplaced;
         if (numbers(where, topic->count, 8, "where", &from))
             return -1;
         if (!(topic->where = copied(from, (size_t)topic->count * 8)))
@@ -432,7 +434,7 @@ holds(const Topic *topic, double value)
 
 /* Whether it fits; then its instant and numbers. -1 with an exception where Python's part of it fails. */
 static int
-read_message(const Topic *topic, const char *data, Py_ssize_t size, int64_t arrival, Instant *instant, double *values)
+read_message(Topic *topic, const char *data, Py_ssize_t size, int64_t arrival, Instant *instant, double *values)
 {
     const unsigned char *bytes = (const unsigned char *)data;
     const int64_t *offset = topic->offset;
@@ -445,8 +447,12 @@ read_message(const Topic *topic, const char *data, Py_ssize_t size, int64_t arri
         differs |= (unsigned char)((bytes[i] & topic->mask[i]) ^ topic->want[i]);
     if (differs)
         return 0;
-    if (topic->conditional && holds(topic, number_at(data + topic->condition_at, topic->condition_code)) != topic->holds)
-        return 0;
+    if (topic->conditional) {
+        double said = number_at(data + topic->condition_at, topic->condition_code);
+        if (holds(topic, said) != topic->holds)
+            return 0;
+        topic->condition_said = said;
+    }
     if (topic->stamped) {
         int32_t seconds;
         uint32_t nanoseconds;
@@ -559,6 +565,15 @@ put(const Topic *topic, Py_ssize_t chosen, const Instant *sample, double *z)
         z[topic->where[i]] = values[i];
     }
     return 1;
+}
+
+/* The same with NaN for what is missing or too old. */
+static void
+put_known(const Topic *topic, Py_ssize_t chosen, const Instant *sample, double *z)
+{
+    int64_t age = chosen < 0 ? 0 : behind(sample, &topic->instant[chosen]);
+    for (Py_ssize_t i = 0; i < topic->count; i++)
+        z[topic->where[i]] = chosen < 0 || age > topic->max_age[i] ? NAN : topic->values[chosen * topic->count + i];
 }
 
 /* Forget what no later sample can choose, as the sampler does when a sample closes. */
@@ -904,12 +919,12 @@ judge(Course *self, const Instant *opened, double now, PyObject *data)
         int known = 1;
         for (Py_ssize_t i = 0; i < clock->count; i++)
             z[clock->where[i]] = self->open_values[i];
-        for (Py_ssize_t k = 1; known && k < self->topics; k++)
-            known = put(&self->topic[k], choose(&self->topic[k], opened), opened, z);
-        for (Py_ssize_t i = 0; known && i < self->delays; i++) {
+        for (Py_ssize_t k = 1; k < self->topics; k++)
+            put_known(&self->topic[k], choose(&self->topic[k], opened), opened, z);
+        for (Py_ssize_t i = 0; i < self->delays; i++)
             z[self->delayed[i].place] = self->delayed[i].line[self->delayed[i].at];
-            known = isfinite(z[self->delayed[i].place]);
-        }
+        for (Py_ssize_t j = 0; known && j < self->size; j++)
+            known = isfinite(z[j]);
         if (known) {
             bound(self, z, self->usual_dt);
             for (int k = PREDICTED_LOWER; k <= PREDICTED_UPPER; k++) {
@@ -986,6 +1001,8 @@ Course_sample(Course *self, PyObject *data)
         done = judge(self, &opened, now, data);
     if (done != 1)
         self->running = 0;
+    if (done < 0 && !PyErr_ExceptionMatches(PyExc_Exception))
+        return NULL;
     if (done < 0) { /* the sample is judged all the same */
         PyObject *type, *value, *trace;
         PyErr_Fetch(&type, &value, &trace);
@@ -1088,7 +1105,7 @@ take_layout(Topic *topic, PyObject *layout)
         return -1;
     topic->stamped = stamp_at >= 0;
     topic->stamp_at = stamp_at;
-    if (stamp_at > size - 8)
+    if (topic->stamped && stamp_at > size - 8)
         goto misplaced;
     if (numbers(parts, topic->count, 8, "parts", &from) || !(topic->parts = copied(from, (size_t)topic->count * 8)))
         return -1;
@@ -1113,6 +1130,7 @@ take_layout(Topic *topic, PyObject *layout)
             goto misplaced;
     }
     topic->conditional = condition != Py_None;
+    topic->condition_said = NAN;
     if (topic->conditional) {
         long long at;
         int letter, width;
@@ -1249,7 +1267,6 @@ Course_resume(Course *self, PyObject *args)
         self->violating += self->recent[i];
     }
     self->from = from_ns;
-    Py_CLEAR(self->failure);
     self->cut = 0;
     self->running = 1;
     Py_RETURN_NONE;
@@ -1281,11 +1298,11 @@ Course_counts(Course *self, PyObject *Py_UNUSED(ignored))
 }
 
 /* Of one topic: the instant of its last message, messages that may be chosen, samples closed beside what they chose,
-   and the angles that the next ones are held against. */
+   the angles that the next ones are held against, and what the enable condition's field said last, or None. */
 static PyObject *
 tell_topic(const Topic *topic)
 {
-    PyObject *kept = PyList_New(0), *closed = PyList_New(0), *previous = PyList_New(0), *last, *one = NULL;
+    PyObject *kept = PyList_New(0), *closed = PyList_New(0), *previous = PyList_New(0), *last, *said, *one = NULL;
     for (Py_ssize_t i = 0; kept && i < topic->kept; i++) {
         PyObject *message = Py_BuildValue("(NN)", told(&topic->instant[i]),
                                           doubles(topic->values + i * topic->count, topic->count));
@@ -1306,9 +1323,12 @@ tell_topic(const Topic *topic)
         Py_XDECREF(value);
     }
     last = topic->has_last ? PyLong_FromLongLong(topic->last) : Py_NewRef(Py_None);
-    if (last && kept && closed && previous)
-        one = PyTuple_Pack(4, last, kept, closed, previous);
+    said = topic->conditional && !isnan(topic->condition_said) ? PyFloat_FromDouble(topic->condition_said)
+                                                               : Py_NewRef(Py_None);
+    if (last && kept && closed && previous && said)
+        one = PyTuple_Pack(5, last, kept, closed, previous, said);
     Py_XDECREF(last);
+    Py_XDECREF(said);
     Py_XDECREF(kept);
     Py_XDECREF(closed);
     Py_XDECREF(previous);

@@ -66,28 +66,42 @@ class Arming:
     grace_ns : int
         No alarm this long, in the samples' own time, after the first sample, after time jumped back, and after
         the condition began to hold.
-    on : bool or None
-        What is known of the condition already.
+    value : float or None
+        What the condition's field said last, where that is known already.
 
     Attributes
     ----------
+    value : float or None
+        What the condition's field said last; None while nothing has come.
     on : bool or None
         Whether the condition holds; None while nothing, or nothing that is a number, is known. Without a condition
         True.
     """
 
-    def __init__(self, condition: Condition | None, grace_ns: int, on: bool | None = None) -> None:
-        self.condition = condition
-        self.on: bool | None = on if condition else True
+    def __init__(self, condition: Condition | None, grace_ns: int, value: float | None = None) -> None:
+        self.condition, self.value = condition, value
+        self.on: bool | None = None
+        if condition is None:
+            self.on = True
+        elif value is not None:
+            self.on = condition.holds(value)
         self._grace = grace_ns
         self._from: int | None = None  # the first instant that counts
 
     def learn(self, value: float) -> None:
         """The condition's field has this value."""
         assert self.condition is not None
+        self.value = value
         before, self.on = self.on, self.condition.holds(value)
         if self.on and not before:
             self._from = None
+
+    def said_on(self, condition: Condition | None) -> float | None:
+        """What is known of the field that another condition asks for."""
+        same = condition and self.condition and (condition.topic, condition.field) == (
+            self.condition.topic, self.condition.field
+        )  # fmt: skip
+        return self.value if same else None
 
     def restart(self) -> None:
         """The next sample is the first."""
@@ -111,6 +125,8 @@ class Arming:
 
     def why_off(self) -> str:
         """What keeps alarms off, in words; empty where they are on."""
+        if self.on is None and self.value is not None and self.condition is not None:
+            return f"alarms are off: {self.condition.topic} comes without a number in {self.condition.field.text}"
         if self.on is None:
             return f"alarms are off: it is not known whether {self.condition}"
         if not self.on:

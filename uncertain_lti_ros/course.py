@@ -215,6 +215,9 @@ class Course:
             {topic: others[:3] for topic, others in told.items() if topic != watch.sampler.clock},
             {topic: others[3] for topic, others in told.items()},
         )
+        for *_, said in topics:
+            if said is not None:
+                watch.arming.learn(said)  # nothing new, but the number
         if cut is not None:
             sample, values, open_dt, before, lines, window, t_ns, arrival, dt, z, x_next = cut
             watch.sampler.go_on_from((sample, values), open_dt, before, lines)

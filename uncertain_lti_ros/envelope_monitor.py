@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import os
 import struct
 import time
@@ -122,6 +123,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._recent: Recent | None = None  # kept while snapshots can be asked for
         self._album: Album | None = None
         self._snapshot_due: float | None = None
+        self._alarmed = -math.inf  # when an alarm was last over
         self._journal = Journal(self._log)
         self._noted = 0.0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -196,6 +198,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 Condition.parse(changes["enable"])
         except UncertainLTIError as error:
             self._candidate = None
+            self.get_logger().warning(f"parameters refused: {error}")
             return SetParametersResult(successful=False, reason=str(error))
         except Exception as error:  # a file can be wrong in ways that nobody thought of
             self._candidate = None
@@ -205,11 +208,16 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_have_set(self, parameters: Sequence[Parameter]) -> None:
         self._reals.clear()
+        self._look_at_clock()
         if any(p.name == "largest_message" for p in parameters):
             self._largest = round(self._real("largest_message") * _MIB)
         candidate, self._candidate = self._candidate, None
         if isinstance(candidate, Rule) and self.watch is not None:
+            if candidate == self.watch.rule:
+                return
             self.watch.follow(candidate)
+            self._journal.turned(self.watch, (), time.monotonic(), ", as its rule has changed")
+            self.get_logger().info(self.watch.whole_rule_text())
             if self.active:
                 self._subscribe()
         elif isinstance(candidate, Watch) and self.watch is not None:
@@ -219,13 +227,16 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _swap(self, watch: Watch) -> None:
         """Put another model in place, between two messages."""
+        if self.watch is not None and self.active:
+            watch.go_on_from(self.watch)
         self.watch = watch
         self._prepare_outputs()
         if self._recent is not None:
             self._recent.clear()
         if self.active:
             self._subscribe()
-        self.get_logger().info(f"model swapped: {watch.model}")
+        name = Path(str(self.get_parameter("model").value)).name
+        self.get_logger().info(f"model swapped: {name}: {watch.model}; {watch.whole_rule_text()}")
         self._journal.begin(watch, time.monotonic())
 
     # --- lifecycle ---
@@ -278,7 +289,8 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _hold_folder(self, on_alarm: bool) -> None:
         if on_alarm and not self.get_parameter("snapshot.folder").value:
             raise ModelError(
-                "parameter snapshot.on_alarm is true, and snapshot.folder is empty; start the node with a folder"
+                "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the "
+                "node with the other"
             )
 
     def _open_album(self) -> None:
@@ -307,7 +319,9 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._simulated = self._clock.ros_time_is_active
         self._subscribe()
         self._journal.begin(self.watch, time.monotonic())
-        self.get_logger().info(f"active: listening to {', '.join(self.watch.types)}")
+        resolved = {topic: self.resolve_topic_name(topic) for topic in self.watch.types}
+        topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
+        self.get_logger().info(f"active: listening to {', '.join(topics)}")
         self.active = True
         for output in self._outputs.values():
             output.look()
@@ -401,12 +415,16 @@ class EnvelopeMonitorNode(LifecycleNode):
             if not self.active or self.watch is None:
                 return
             self._take(self.watch, topic, data)
-            if self._tries >= 1.0 and topic == self.watch.sampler.clock:
-                self._tries -= 1.0
-                self._go_on()
         except Exception as error:
             self._settle()
             self._note_failed_message(topic, error)
+        else:
+            if self._tries >= 1.0 and topic == self.watch.sampler.clock:
+                self._tries -= 1.0
+                try:
+                    self._go_on()
+                except Exception as error:  # the message is dealt with
+                    self.note_failure("between messages", error)
 
     def _note_failed_message(self, topic: str, error: Exception) -> None:
         self.note_failure(f"on a message of {topic}", error)
@@ -424,10 +442,16 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._journal.turned(watch, verdicts, now)
         if self._recent is not None:
             self._recent.add(Entry(now, arrival, topic, data, verdicts, watch.alarm))
-            if watch.alarms > alarms and self._snapshot_due is None:
+            if watch.alarms > alarms and self._snapshot_due is None and self._is_first_alarm(now):
                 self._snapshot_due = now + self._real("snapshot.after")
+        if turned and not watch.alarm:
+            self._alarmed = now
         if verdicts or opened or turned:
             self._publish(watch, verdicts, opened, now, turned)
+
+    def _is_first_alarm(self, now: float) -> bool:
+        """There was none for as long as a snapshot goes back: one that flaps must not drive out the first file."""
+        return now - self._alarmed >= self._real("snapshot.seconds")
 
     def _publish(self, watch: Watch, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
         """Publish what is listened to; turned: the alarm did, which is said in any case.
@@ -465,11 +489,14 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Take a message of the enable condition's own topic that says what is known, beside compiled code at work."""
         assert self.watch is not None
         now = time.monotonic()
-        if not self.watch.tells_nothing_new(topic, data, now):
+        try:
+            arrival = self._clock.now().nanoseconds if self._simulated else time.time_ns()
+            if not self.watch.tells_nothing_new(topic, data, now):
+                return False
+        except Exception:  # the watch meets the same error
             return False
         if self._recent is not None:
             self._count()  # what came before it
-            arrival = self._clock.now().nanoseconds if self._simulated else time.time_ns()
             self._recent.add(Entry(now, arrival, topic, data, (), self.watch.alarm))
         return True
 
@@ -518,13 +545,18 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- heartbeat, graph, diagnostics ---
 
     def _on_tick(self) -> None:
-        self._simulated = self._clock.ros_time_is_active
+        self._look_at_clock()
         tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_album, self._keep_journal
         for task in (self._count, *tasks, self._go_on):
             try:
                 task()
             except Exception as error:
                 self.note_failure("between messages", error)
+
+    def _look_at_clock(self) -> None:
+        if self._simulated != self._clock.ros_time_is_active:
+            self._settle()
+            self._simulated = self._clock.ros_time_is_active
 
     def _keep_beating(self) -> None:
         if self.active and time.monotonic() - self._published >= self._real("heartbeat") / 2:
@@ -573,7 +605,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             return
         self._noted = now
         problems = [problem for subscription in self._inputs.values() for problem in subscription.problems]
-        problems += [self._enable_problem] if self._enable_problem else []
+        problems += self._lasting_problems()
         publishers = {topic: subscription.publishers for topic, subscription in self._inputs.items()}
         self._journal.look(self.watch, now, self._real("state_timeout"), publishers, problems)
 
@@ -615,6 +647,13 @@ class EnvelopeMonitorNode(LifecycleNode):
             },
         )
 
+    def _lasting_problems(self) -> list[str]:
+        """The same where no topic of the model is concerned, and only what lasts."""
+        problems = [self._enable_problem] if self._enable_problem else []
+        if self._clock.ros_time_is_active and not self._clock.now().nanoseconds:
+            problems.append("use_sim_time is true, and no time has come on /clock")
+        return problems
+
     def _problems(self) -> list[str]:
         """What keeps messages from coming, beside silence, and what went wrong here since the last report."""
         problems = []
@@ -625,8 +664,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 problems.append(f"{subscription.topic}: {subscription.lost - lost} messages lost on the way")
             if subscription.late > late:
                 problems.append(f"{subscription.topic}: {subscription.late - late} deadlines missed by its publishers")
-        if self._enable_problem:
-            problems.append(self._enable_problem)
+        problems += self._lasting_problems()
         if self._album is not None and self._album.problem:
             problems.append(self._album.problem)
         if self._failures > self._failures_told:
@@ -702,6 +740,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             raise ModelError("the node is not active, so there is no alarm to reset")
         response.message = "the alarm is reset" if self.watch.alarm else "there was no alarm; its window starts anew"
         self.watch.reset()
+        self._journal.turned(self.watch, (), time.monotonic(), ", by ~/reset")
         self._beat()
         response.success = True
 

@@ -71,8 +71,8 @@ class Journal:
             self._matters[name] = _Matter(True if name == "arming" else None)
         return self._matters[name]
 
-    def turned(self, watch: Watch, verdicts: Iterable[Verdict], now: float) -> None:
-        """The alarm may have turned; verdicts: those that did it."""
+    def turned(self, watch: Watch, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
+        """The alarm may have turned; verdicts: those that did it; why: what else did."""
         if watch.alarm == self._alarm:
             return
         self._alarm = watch.alarm
@@ -83,7 +83,7 @@ class Journal:
             line += "; it stands until ~/reset" if watch.rule.latch else ""
             self._alarm_since = now
         else:
-            level, line = OK, f"the alarm is over after {now - self._alarm_since:.3g} s"
+            level, line = OK, f"the alarm is over after {now - self._alarm_since:.3g} s{why}"
         if self._matter("alarm").may(now):
             self._say(level, f"{line}{self._passed_over()}")
         else:
@@ -112,7 +112,8 @@ class Journal:
             for problem in new[:_SHOWN]:
                 self._say(OK, problem)
         if self._matter("arming").becomes(watch.arming.on, now):
-            self._say(OK, watch.arming.why_off() or f"alarms count from now on: {watch.arming.condition}")
+            condition = watch.arming.condition or "there is no condition any more"
+            self._say(OK, watch.arming.why_off() or f"alarms count from now on: {condition}")
         for topic in watch.types:
             if topic != watch.sampler.clock:
                 self._look_at_topic(watch, topic, now, timeout, publishers.get(topic, 0))
@@ -176,6 +177,12 @@ class Journal:
         return "; ".join(found)
 
 
+def _digits(value: float, by: float) -> int:
+    """Digits of a value that show a difference."""
+    ratio = abs(value / by) if by else math.inf
+    return min(max(7, math.ceil(math.log10(ratio)) + 2), 17) if 1.0 < ratio < math.inf else 7
+
+
 def _left(watch: Watch, verdict: Verdict) -> str:
     """The states that left their bounds, and by how much."""
     numbers = zip(
@@ -185,8 +192,10 @@ def _left(watch: Watch, verdict: Verdict) -> str:
     for name, flag, value, lower, upper in numbers:
         if flag == 1.0 and name not in watch.monitor.masked:
             side, by = ("above", value - upper) if value > upper else ("below", lower - value)
+            digits = _digits(value, by)
             left.append(
-                f"{name} = {value:.7g} is {float(f'{by:.3g}'):.7g} {side} its bounds {lower:.7g} to {upper:.7g}"
+                f"{name} = {value:.{digits}g} is {float(f'{by:.3g}'):.7g} {side} its bounds "
+                f"{lower:.{digits}g} to {upper:.{digits}g}"
             )
     more = len(left) - _SHOWN
     return ", ".join(left[:_SHOWN]) + (f", and {more} more" if more > 0 else "")

@@ -27,7 +27,8 @@ _ENCAPSULATION = 4
 _MOST_LAYOUTS = 8
 _MOST_PARTS = 20_000  # of a message that a layout is made from
 _NEAR = 128  # bytes between two places that are compared in one go
-_BUDGET = 50  # layouts made at once at most; each message that fits one pays for a hundredth of another
+_LAYOUT = 100  # what making one costs; each message that fits one pays 1
+_BUDGET = 50 * _LAYOUT
 
 _SHAPED_ODDLY = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
@@ -81,7 +82,7 @@ class MessageReader:
         self._paths = tuple(paths)
         self._fields, self._decode = type_fields, decode
         self._layouts: list[_Layout] = []
-        self._budget = float(_BUDGET)
+        self._budget = _BUDGET
 
     @property
     def plan(self) -> Plan | None:
@@ -101,7 +102,7 @@ class MessageReader:
                 if position:
                     self._layouts.insert(0, self._layouts.pop(position))
                 if self._budget < _BUDGET:
-                    self._budget += 0.01
+                    self._budget += 1
                 return found
         self.decoded += 1
         try:
@@ -112,14 +113,14 @@ class MessageReader:
             stamp, values = stamp_ns(message), [path.read(message) for path in self._paths]
         except _SHAPED_ODDLY as error:
             raise UnreadableError(f"a field cannot be read: {error}") from None
-        if self._budget >= 1.0:
-            self._budget -= 1.0
+        if self._budget >= _LAYOUT:
+            self._budget -= _LAYOUT
             self._learn(data, stamp, values)
         return stamp, values
 
     def fitted(self, count: int) -> None:
         """So many messages fitted `plan` elsewhere."""
-        self._budget = min(float(_BUDGET), self._budget + 0.01 * count)
+        self._budget = min(_BUDGET, self._budget + count)
 
     def _learn(self, data: bytes, stamp: int | None, values: list[float]) -> None:
         try:

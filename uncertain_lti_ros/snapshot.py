@@ -59,11 +59,15 @@ class Entry:
 
 
 class Recent:
-    """The messages of the last `seconds` s that fit into `limit` bytes; the oldest go first."""
+    """The messages of the last `seconds` s that fit into `limit` bytes; the oldest go first.
+
+    Of each topic the last message before these is kept beside them: it is what was in force when they begin.
+    """
 
     def __init__(self, seconds: float, limit: int) -> None:
         self._seconds, self._limit = seconds, limit
         self._entries: deque[Entry] = deque()
+        self._before: dict[str, Entry] = {}
         self._bytes = 0
 
     def add(self, entry: Entry) -> None:
@@ -74,15 +78,17 @@ class Recent:
         oldest = entry.now - self._seconds
         while entries and (entries[0].now < oldest or self._bytes > self._limit):
             gone = entries.popleft()
+            self._before[gone.topic] = gone
             self._bytes -= len(gone.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in gone.verdicts)
 
     def entries(self) -> list[Entry]:
         """All, in order of arrival."""
-        return list(self._entries)
+        return [*sorted(self._before.values(), key=lambda entry: entry.now), *self._entries]
 
     def clear(self) -> None:
         """Forget all."""
         self._entries.clear()
+        self._before.clear()
         self._bytes = 0
 
 

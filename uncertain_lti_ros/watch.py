@@ -21,6 +21,7 @@ FUTURE = 1.0
 """s that a stamp may be ahead of the clock before it is reported."""
 
 _FUTURE_NS = to_ns(FUTURE)
+_SHOWN = 5  # signals that a report names
 _NOTHING: tuple[Verdict, ...] = ()
 
 MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
@@ -70,6 +71,7 @@ class _Period:
     alarm: bool = False
     violations: Counter[int] = field(default_factory=Counter)
     statuses: Counter[Status] = field(default_factory=Counter)
+    counters: Counter[str] = field(default_factory=Counter)  # at its beginning, as those below
     late: int = 0
     unreadable: int = 0
     future: int = 0
@@ -123,7 +125,7 @@ class Watch:
     now : float
         A steady time in s, as everywhere below.
     arming : Arming, optional
-        Of the watch before: where the condition stays the same, so does what is known of it.
+        Of the watch before: where the condition asks for the same field, what is known of that stays.
 
     Attributes
     ----------
@@ -160,7 +162,8 @@ class Watch:
         self._held = {topic: _held(model, signals.on(topic)) for topic in signals.topics}
         self._unknown = {topic: [math.nan] * len(signals.on(topic)) for topic in signals.topics}
         self.arming = arming if arming is not None else Arming(None, 0)
-        self.follow(rule)
+        self.latched, self.enable_topic, self.enable_type = False, "", ""
+        self._follow(rule)
         self.restart(now)
 
     def restart(self, now: float) -> None:
@@ -183,7 +186,8 @@ class Watch:
         self.arming.restart()
 
     def follow(self, rule: Rule) -> None:
-        """Judge by another alarm rule from now on; the alarm starts anew.
+        """Judge by another alarm rule from now on; the alarm starts anew, and one that stands is latched where that
+        rule says so. The rule that there is changes nothing.
 
         Raises
         ------
@@ -192,13 +196,39 @@ class Watch:
         SignalError
             The condition's field is not in its type.
         """
+        if rule != self.rule:
+            stands = self.alarm
+            self._follow(rule)
+            self.latched = rule.latch and stands
+
+    def _follow(self, rule: Rule) -> None:
         monitor, condition, enable_type, reader = self._prepared(rule)
         self.monitor, self.rule = monitor, rule
         self.enable_type, self._reads_condition = enable_type, reader
-        known = self.arming.on if self.arming.condition == condition else None
-        self.arming = Arming(condition, to_ns(rule.grace), known)
+        self.arming = Arming(condition, to_ns(rule.grace), self.arming.said_on(condition))
         self.enable_topic = condition.topic if condition else ""
-        self.latched = False
+
+    def go_on_from(self, other: Watch) -> None:
+        """Keep what the watch before knows: what is in force on topics that both read alike, and a latched alarm.
+
+        States start anew; controls would not come again where they are sent on a change only.
+        """
+        mine, theirs = self.model.signals, other.model.signals
+        for topic in self.types:
+            if topic in other._heard:
+                self._heard[topic] = other._heard[topic]
+        for topic in mine.topics:
+            fields = {theirs.signals[i].field: k for k, i in enumerate(theirs.on(topic))}
+            wanted = [mine.signals[i].field for i in mine.on(topic)]
+            alike = other._model_types.get(topic) == self._model_types[topic] and set(wanted) <= set(fields)
+            clocks = topic in (self.sampler.clock, other.sampler.clock)
+            if clocks or not alike or theirs.time.get(topic) != mine.time[topic]:
+                continue
+            for (stamp, arrival), values in other.sampler.kept(topic):
+                self.sampler.push(topic, arrival, stamp or None, [values[fields[field]] for field in wanted])
+        if other.enable_type and not self.enable_type and other.arming.said_on(self.arming.condition) is not None:
+            self.found_enable_type(other.enable_type)
+        self.latched = self.rule.latch and other.alarm
 
     def check(self, rule: Rule) -> None:
         """Raise what `follow` would raise."""
@@ -209,7 +239,8 @@ class Watch:
         condition = Condition.parse(rule.enable)
         enable_type, reader = "", None
         if condition is not None:
-            enable_type = rule.enable_type or self._model_types.get(condition.topic, "")
+            found = self.enable_type if condition.topic == self.enable_topic else ""
+            enable_type = rule.enable_type or self._model_types.get(condition.topic, found)
             if enable_type:
                 reader = self._condition_reader(condition, enable_type)
         return monitor, condition, enable_type, reader
@@ -312,6 +343,7 @@ class Watch:
             return False
         if condition.holds(value) is not self.arming.on:
             return False
+        self.arming.learn(value)
         self.received[topic] += 1
         self._heard[topic] = now
         return True
@@ -420,6 +452,7 @@ class Watch:
         self._period.late = self.late
         self._period.unreadable = self.unreadable.total()
         self._period.future = self.future.total()
+        self._period.counters = Counter(self.sampler.counters)
         return period
 
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
@@ -444,7 +477,8 @@ class Watch:
             complaints.append(f"outside the fitted domain in {period.outside} of {period.verdicts} verdicts")
         for status in (Status.GAP, Status.RESET, Status.MISSING):
             if period.statuses[status]:
-                complaints.append(f"{period.statuses[status]} samples without a verdict: {WHY[status]}")
+                which = f" ({self._lacking(period)})" if status is Status.MISSING else ""
+                complaints.append(f"{period.statuses[status]} samples without a verdict: {WHY[status]}{which}")
         dropped = sum(count for status, count in period.statuses.items() if status.dropped)
         if dropped:
             which = ", ".join(f"{status.value} {count}" for status, count in period.statuses.items() if status.dropped)
@@ -463,6 +497,8 @@ class Watch:
             complaints.insert(0, "alarm: latched until ~/reset")
         if without > timeout or not self.verdicts:
             level = ERROR if self.latched else STALE
+            if self.monitor.alarm:
+                complaints.insert(0, "alarm: it stood at the last verdict")
             silent = self.silent_for(now)
             if silent > timeout and self.sampler.clock in self._heard:
                 complaints.insert(0, f"no message on {self.sampler.clock} for {silent:.1f} s")
@@ -480,10 +516,27 @@ class Watch:
         message = "; ".join([*(complaints or [f"{well}, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
 
+    def _lacking(self, period: _Period) -> str:
+        """The signals that samples had no value of since a report."""
+        since = self.sampler.counters - period.counters
+        names = [s.name for s in self.model.signals.signals if since[f"missing {s.name}"]]
+        more = len(names) - _SHOWN
+        return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
     def rule_text(self) -> str:
         """The alarm rule in words."""
         rule = self.monitor.rule
         return f"at least {rule.violations} of {rule.window} verdicts violated"
+
+    def whole_rule_text(self) -> str:
+        """The same with everything that it depends on."""
+        rule = self.rule
+        parts = [f"alarm when {self.rule_text()}", f"margin {self.monitor.rule.margin:g}"]
+        parts += [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
+        parts += [f"as long as {self.arming.condition}"] if self.arming.condition else []
+        parts += [f"grace {rule.grace:g} s"] if rule.grace else []
+        parts += ["latched"] if rule.latch else []
+        return ", ".join(parts)
 
     def _report_state(self, i: int, name: str, period: _Period, without: float, timeout: float) -> Report:
         values = {"verdicts": str(self.verdicts), "violations": str(self.violations[i])}
