@@ -5,7 +5,7 @@ from __future__ import annotations
 from uncertain_lti_ros.arguments import Declared
 from uncertain_lti_ros.subscriptions import DEPTH, DURABILITY, RELIABILITY
 
-_ANEW = "Setting it starts the alarm anew."
+_ANEW = "Changing it starts the alarm anew, unless it is latched."
 RULE = ("violations", "window", "margin", "masked", "enable", "enable_type", "grace", "latch")
 """Parameters that make up the alarm rule."""
 PARAMETERS = (
@@ -42,7 +42,7 @@ PARAMETERS = (
         f"after `enable` began to hold. {_ANEW}",
         low=0.0, high=86400.0,
     ),
-    Declared("latch", False, f"An alarm stands until ~/reset is called. {_ANEW}"),
+    Declared("latch", False, "An alarm stands until ~/reset is called, also one that stands when this is set."),
     Declared(
         "heartbeat", 1.0,
         "~/violation is published at least this often, s of wall time; also the deadline it offers.",
@@ -77,7 +77,10 @@ PARAMETERS = (
         "Folder that ~/snapshot writes to, and nowhere else; empty: there are no snapshots.", fixed=True,
     ),
     Declared("snapshot.seconds", 10.0, "What a snapshot holds, s of wall time.", fixed=True, low=0.1, high=3600.0),
-    Declared("snapshot.on_alarm", False, "Write a snapshot when the alarm is raised."),
+    Declared(
+        "snapshot.on_alarm", False,
+        "Write a snapshot when the alarm is raised, if there was none for snapshot.seconds.",
+    ),
     Declared(
         "snapshot.after", 1.0, "How long after the alarm that snapshot ends, s of wall time.", low=0.0, high=3600.0
     ),
