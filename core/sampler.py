@@ -138,8 +138,6 @@ class _Topic:
         "left",
         "ahead",
         "behind",
-        "awaits",
-        "aside",
         "leave",
         "closed",
         "unwrap",
@@ -154,25 +152,21 @@ class _Topic:
         self.last: dict[bool, int] = {}  # instant of the last message with a stamp, and of the last one without
         self.left = False, 0  # whether by stamps, and the instant from which its time last stepped back
         self.ahead = False  # its time has stepped back, the clock's perhaps not yet
-        self.behind: _Message | None = None  # the sample that the clock stepped back from, its own time not yet
-        self.awaits = False  # its last message was then of the time that the clock left: any step back is the one
-        self.aside: deque[_Message] = deque()  # of the time that the clock left, for when it is there again
+        self.behind = False  # the clock's time has stepped back, its own not yet
         self.leave: tuple[_Message, _Message] | None = None  # a sample of the pass before, and what it has chosen
         self.closed: deque[tuple[_Message, _Message | None]] = deque(maxlen=REMEMBERED_SAMPLES)  # and what they chose
         self.unwrap = unwrap
         self.steady = steady
         self.previous = list(steady)
 
-    def steps_back(self, message: _Message, limit: int, sample: _Message | None) -> bool:
-        """Whether a message is more than limit before the last one on the same clock, or as awaited; sample is open."""
+    def steps_back(self, message: _Message, limit: int) -> bool:
+        """Whether a message is more than limit before the last one on the same clock."""
         stamped = message.stamp is not None
         instant = message.arrival if message.stamp is None else message.stamp
         last = self.last.get(stamped, instant)
         self.last[stamped] = instant
-        far = instant < last - limit
-        if far or (self.awaits and instant < last):
+        if instant < last - limit:
             self.left = stamped, last
-            self._start_anew(sample, message, far)
             return True
         if self.ahead and self.left[0] is stamped and instant >= self.left[1]:
             self.ahead = False  # single messages had stepped back, and no time
@@ -215,39 +209,32 @@ class _Topic:
                 self.kept.appendleft(held)
             for m in older:
                 if sample is None or _behind(sample, m) < 0:
-                    self._forget(m)
+                    by_stamp = self.clock_has_stamps and m.stamp is not None
+                    instant = m.arrival if m.stamp is None or not by_stamp else m.stamp
+                    first, last = self.forgotten.get(by_stamp, (instant, instant))
+                    self.forgotten[by_stamp] = min(first, instant), max(last, instant)
         self.kept.append(message)
 
-    def _forget(self, message: _Message) -> None:
-        by_stamp = self.clock_has_stamps and message.stamp is not None
-        instant = message.arrival if message.stamp is None or not by_stamp else message.stamp
-        first, last = self.forgotten.get(by_stamp, (instant, instant))
-        self.forgotten[by_stamp] = min(first, instant), max(last, instant)
-
-    def _start_anew(self, sample: _Message | None, message: _Message, far: bool) -> None:
+    def start_anew(self, sample: _Message | None, message: _Message) -> None:
         """The topic's time has stepped back to a message, as in a bag that is played again; the last pass is forgotten.
 
         The open sample may be of that pass too, where the clock has not stepped back yet: not since the topic last did,
         or there is the topic that never followed, and the sample is nearer to the time that it leaves only now.
-        A step back that is not far may be a message out of order: one that is far may still come after it.
         """
-        if far and self.behind is not None and sample is not None:
+        if self.behind and sample is not None:
             instant = sample.stamp if self.left[0] else sample.arrival
             if instant is not None and abs(instant - self.left[1]) < abs(_behind(sample, message)):
-                self.behind = None
-        held = None if sample is None or self.behind is not None else self.choose(sample)
+                self.behind = False
+        held = None if sample is None or self.behind else self.choose(sample)
         self.leave = (sample, held) if sample is not None and held is not None else None
         self.kept.clear()
-        self.aside.clear()
         self.forgotten.clear()
         self.closed.clear()
-        self.ahead, self.awaits = self.behind is None, False
-        if far:
-            self.behind = None
+        self.ahead, self.behind = not self.behind, False
         self.previous = list(self.steady)
 
-    def close(self, sample: _Message, chosen: _Message | None, opens: _Message, reset: bool) -> None:
-        """Forget what no later sample can choose; opens is the next one, reset says that the clock steps back to it.
+    def close(self, sample: _Message, chosen: _Message | None, reset: bool) -> None:
+        """Forget what no later sample can choose.
 
         Where time jumps, later samples are earlier: what came before them on the new time is kept.
         """
@@ -263,44 +250,11 @@ class _Topic:
             if self.forgotten:
                 self._forget_until(sample)
         if reset:
-            if not self.ahead:
-                self._fall_behind(sample, opens)
+            self.behind = not self.ahead
             self.ahead = False
             self.closed.clear()  # nothing of this pass can be late for a sample of the one before
-            return
-        self.closed.append((sample, chosen))
-        if self.behind is not None and _behind(opens, self.behind) >= 0:
-            self._catch_up(opens)
-
-    def _fall_behind(self, left: _Message, reset: _Message) -> None:
-        """The clock has stepped back first: what lies after its new sample is of the time that it left.
-
-        That is set aside, and with it all that came before it, which it has replaced; what came last is held.
-        """
-        if self.forgotten:  # perhaps after what is kept
-            for m in self.kept:
-                self._forget(m)
-            self.kept.clear()
-        held: deque[_Message] = deque()
-        while self.kept and _behind(reset, self.kept[-1]) >= 0:
-            held.appendleft(self.kept.pop())
-        self.aside += self.kept
-        self.kept = held
-        if self.behind is None or _behind(left, self.behind) > 0:
-            self.behind = left
-        self.awaits = any(
-            instant > (reset.stamp if stamped and reset.stamp is not None else reset.arrival)
-            for stamped, instant in self.last.items()
-        )
-
-    def _catch_up(self, sample: _Message) -> None:
-        """The clock is where it was before it stepped back, and there is no step back to come."""
-        messages = [*self.aside, *self.kept]
-        self.behind, self.awaits = None, False
-        self.aside.clear()
-        self.kept.clear()
-        for message in messages:
-            self.keep(message, sample)
+        else:
+            self.closed.append((sample, chosen))
 
     def _forget_until(self, sample: _Message) -> None:
         """What was forgotten of the time before a sample that has chosen matters to no later one."""
@@ -422,7 +376,9 @@ class Sampler:
             )
         if topic == self.clock:
             return self._push_clock(state, message)
-        if not state.steps_back(message, self.max_gap_ns, self._open) and state.came_late(message):
+        if state.steps_back(message, self.max_gap_ns):
+            state.start_anew(self._open, message)
+        elif state.came_late(message):
             self.counters[f"late {topic}"] += 1
         if state.unwrap:
             state.unwrapped(message.values)
@@ -451,7 +407,7 @@ class Sampler:
         if state.unwrap:
             state.unwrapped(message.values)
         if (closing := self._open) is not None:
-            z = self._fix(closing, opens=message, reset=status is Status.RESET)
+            z = self._fix(closing, final=True, reset=status is Status.RESET)
             if not self._one_topic:
                 steps.append(self._step(self._open_status, closing, self._open_dt, self._before, z[: self._n]))
             self._before = z
@@ -498,9 +454,8 @@ class Sampler:
             self.counters["missing"] += 1
         return Step(status, self._instant(message), message.arrival, dt, before, x_next)
 
-    def _fix(self, sample: _Message, opens: _Message | None = None, reset: bool = False) -> list[float]:
-        """z = [x; u] of the open sample from what has arrived; it closes where opens does, reset: by a step back."""
-        final = opens is not None
+    def _fix(self, sample: _Message, final: bool, reset: bool = False) -> list[float]:
+        """z = [x; u] of the open sample from what has arrived; final: the sample closes now; reset: by a step back."""
         z = self._unknown.copy()
         for topic, where in self._where.items():
             span = self._span[topic]
@@ -509,8 +464,8 @@ class Sampler:
             else:
                 state = self._topics[topic]
                 found = state.choose(sample)
-                if opens is not None:
-                    state.close(sample, found, opens, reset)
+                if final:
+                    state.close(sample, found, reset)
                 if found is None:
                     continue
                 chosen, age = found, _behind(sample, found)
@@ -556,7 +511,7 @@ class Sampler:
         """(t_ns, [x; u] (n + m)) of the open sample with what is known so far; None before the first sample."""
         if self._open is None:
             return None
-        return self._instant(self._open), self._fix(self._open)
+        return self._instant(self._open), self._fix(self._open, final=False)
 
     def standing(self) -> Standing | None:
         """What is needed to go on elsewhere; None where messages have not come in order, or not yet long enough."""

@@ -62,11 +62,10 @@ class Reference:
         self.n = len(signals.states)
         self.counters: Counter[str] = Counter()
         self.dropped: dict[int, tuple[Status, int]] = {}
-        self.left: dict[tuple[str, int], set[int]] = {}
         self.by_topic = {t: [i for i, m in enumerate(messages) if m.topic == t] for t in signals.topics}
+        self.jumps = {t: self._jumps(t) for t in signals.topics}
         self.others = [t for t in signals.topics if t != signals.clock]
         self.samples = self._samples()
-        self.jumps = {t: self._follow(t, len(messages))[0] for t in signals.topics}
         self.values = {t: self._values(t) for t in signals.topics}
         for sample in self.samples:
             if sample.closed_by is not None:
@@ -116,6 +115,17 @@ class Reference:
         self.dropped[index] = (status, instant)
         self.counters[status.value] += 1
 
+    def _jumps(self, topic: str) -> list[int]:
+        """Messages with which a topic's own time steps back by more than max_gap."""
+        found = []
+        for stamped in (True, False):
+            mine = [i for i in self.by_topic[topic] if (self.stamp(i) is not None) == stamped]
+            instants = [self.stamp(i) if stamped else self.sent[i].arrival for i in mine]
+            found += [
+                i for i, now, last in zip(mine[1:], instants[1:], instants, strict=False) if last - now > self.max_gap
+            ]
+        return sorted(found)
+
     def _values(self, topic: str) -> dict[int, list[float]]:
         """Values of each message with angles unwrapped from where the stream starts anew."""
         where = self.signals.on(topic)
@@ -146,57 +156,27 @@ class Reference:
         """The last message with which the topic stepped back before the sample closed; -1 without any."""
         return max([i for i in self.jumps[topic] if i < sample.closed_by], default=-1)
 
-    def _follow(self, topic: str, until: int) -> tuple[list[int], bool, bool, list[Sample]]:
-        """Messages with which a topic's own time steps back, the two of `lag`, and where the clock stepped back first.
+    def lag(self, topic: str, until: int) -> tuple[bool, bool]:
+        """Whether a topic's time has stepped back and the clock's not yet, and the other way round.
 
-        A step back is by more than max_gap; or by any time, once after the clock has stepped back to before the
-        topic's last message. The clock's steps back count until it is where it was.
+        A topic whose time reaches the instant again that it left has sent single messages of another time.
         """
-        closings = {s.closed_by: (s, n) for s, n in zip(self.samples, self.samples[1:], strict=False)}
-        by_header = self.signals.time[self.signals.clock] == "header"
-        steps: list[int] = []
-        first: list[Sample] = []
-        ahead = behind = awaits = False
+        resets = {s.index for s in self.samples if s.status is Status.RESET}
+        ahead = behind = False
         last: dict[bool, int] = {}
         left: tuple[bool, int] | None = None
-        clock_left = 0
         for i in range(until):
-            if i in closings:
-                closed, opened = closings[i]
-                if opened.status is not Status.RESET:
-                    if behind and opened.instant >= clock_left:
-                        behind = awaits = False
-                        first = []
-                elif ahead:
-                    ahead = False
-                else:
-                    first.append(opened)
-                    clock_left = max(clock_left, closed.instant) if behind else closed.instant
-                    arrival = self.sent[i].arrival
-                    late = [at > (opened.instant if stamped and by_header else arrival) for stamped, at in last.items()]
-                    behind, awaits = True, any(late)
+            if i in resets:
+                ahead, behind = False, not ahead
             if self.sent[i].topic != topic:
                 continue
             stamp = self.stamp(i)
             instant, stamped = self.sent[i].arrival if stamp is None else stamp, stamp is not None
-            back = last.get(stamped, instant) - instant
-            if back > self.max_gap or (awaits and back > 0):
-                steps.append(i)
-                left = stamped, last[stamped]
-                ahead, awaits = not (behind and self.follows(i)), False
-                behind = behind and back <= self.max_gap
+            if i in self.jumps[topic]:
+                ahead, behind, left = not (behind and self.follows(i)), False, (stamped, last[stamped])
             elif left is not None and left[0] is stamped and instant >= left[1]:
                 ahead = False
             last[stamped] = instant
-        return steps, ahead, behind, first
-
-    def lag(self, topic: str, until: int) -> tuple[bool, bool]:
-        """Whether a topic's time has stepped back and the clock's not yet, and the other way round.
-
-        A topic whose time reaches the instant again that it left has sent single messages of another time; a clock
-        whose time does is not followed any more.
-        """
-        _, ahead, behind, _ = self._follow(topic, until)
         return ahead, behind
 
     def follows(self, jump: int) -> bool:
@@ -206,23 +186,7 @@ class Reference:
         before = max(i for i in self.by_topic[topic] if i < jump and (self.stamp(i) is not None) == stamped)
         here = self.stamp(sample.index) if stamped else self.sent[sample.index].arrival
         gone = self.stamp(before) if stamped else self.sent[before].arrival
-        if (self.stamp(jump) if stamped else self.sent[jump].arrival) >= gone - self.max_gap:
-            return True  # it is awaited
         return here is None or abs(here - gone) >= abs(self.age(sample, jump))
-
-    def abandoned(self, topic: str, sample: Sample) -> set[int]:
-        """What had arrived of a later time than the clock stepped back to, and what that had replaced."""
-        if (topic, sample.index) not in self.left:
-            latest = -1
-            for first in self._follow(topic, sample.index + 1)[3]:
-                there = {i for i in self.by_topic[topic] if i < first.index} - self.passed_over(topic, first)
-                latest = max([latest, *(i for i in there if self.age(first, i) < 0)])
-            self.left[topic, sample.index] = {*range(latest + 1)}
-        return self.left[topic, sample.index]
-
-    def gone(self, topic: str, sample: Sample) -> set[int]:
-        """What a sample does not look at: of a time that the clock has left, or passed over."""
-        return self.abandoned(topic, sample) | (self.passed_over(topic, sample) if self.forgets else set())
 
     def passed_over(self, topic: str, before: Sample) -> set[int]:
         gone: set[int] = set()
@@ -233,8 +197,7 @@ class Reference:
             if closing.status is Status.RESET or ahead or self._left(sample, topic):
                 continue
             arrived = [i for i in self.by_topic[topic] if self.jump(sample, topic) <= i < sample.closed_by]
-            passed = {i for i in arrived if self.age(sample, i) >= 0} - self.abandoned(topic, sample)
-            gone |= passed - {sample.chosen[topic]}
+            gone |= {i for i in arrived if self.age(sample, i) >= 0} - {sample.chosen[topic]}
         return gone
 
     def _best(self, sample: Sample, candidates: Sequence[int]) -> tuple[int, int] | None:
@@ -248,7 +211,9 @@ class Reference:
         for event in self.jumps[topic]:
             _, behind = self.lag(topic, event)
             if sample.index < event < sample.closed_by and not (behind and self.follows(event)):
-                candidates = {i for i in self.by_topic[topic] if begin <= i < event} - self.gone(topic, sample)
+                candidates = {i for i in self.by_topic[topic] if begin <= i < event}
+                if self.forgets:
+                    candidates -= self.passed_over(topic, sample)
                 if best := self._best(sample, sorted(candidates)):
                     return best
             begin = event
@@ -262,8 +227,9 @@ class Reference:
                 chosen, age = sample.index, 0
             else:
                 candidates = [i for i in self.by_topic[topic] if self.jump(sample, topic) <= i < sample.closed_by]
-                gone = self.gone(topic, sample)
-                candidates = [i for i in candidates if i not in gone]
+                if self.forgets:
+                    gone = self.passed_over(topic, sample)
+                    candidates = [i for i in candidates if i not in gone]
                 sample.chosen[topic] = None
                 best = self._left(sample, topic) or self._best(sample, candidates)
                 if best is None:
@@ -609,53 +575,6 @@ def test_a_topic_that_is_heard_first_in_the_second_pass_joins_no_pass_to_another
             steps += sampler.push(*at("/c", begin + tick, 100 + tick, float(k)))
     judged = [step for step in steps if step.status is Status.OK]
     assert len(judged) > 1900 and all(step.before[0] == step.before[1] for step in judged)
-
-
-@pytest.mark.parametrize("in_flight", [False, True])
-def test_no_control_of_the_time_that_the_clock_has_left_is_joined_to_the_new_one(in_flight: bool) -> None:
-    """All stamps step back by 7 ticks, more than max_gap; from one control to the next that is 3, less than max_gap."""
-    stream = []
-    for k in range(104, 121):
-        back = 7 if k >= 110 else 0
-        if k % 4 == 0:
-            stream.append(at("/u", k, k - back, float(k)))
-        stream.append(at("/c", k, k - back))
-    if in_flight:
-        reset = next(i for i, m in enumerate(stream) if m.arrival == 110 * TICK)
-        stream.insert(reset + 1, stream.pop(next(i for i, m in enumerate(stream) if m.values == (108.0,))))
-    before = [104.0] * 4 + [104.0 if in_flight else 108.0] * 2
-    wanted = [*before[:-1], NAN, NAN, NAN, *[112.0] * 4, *[116.0] * 4]  # a step back is told without x and u
-    assert np.array_equal(controls_of(two_topics(), *stream), wanted, equal_nan=True)
-    sampler = run(two_topics(), stream)[1]
-    assert sampler.standing() is not None and not sampler.counters["late /u"]
-
-
-@pytest.mark.parametrize("stamp", [90, None])
-def test_a_control_that_is_held_stays_held_where_the_clock_steps_back(stamp: int | None) -> None:
-    clock = [at("/c", k, k - (10 if k >= 110 else 0)) for k in range(105, 125)]
-    used = controls_of(two_topics(), at("/u", 91, stamp, 5.0), *clock)
-    assert used == [5.0] * 4 + [pytest.approx(NAN, nan_ok=True)] + [5.0] * 14
-
-
-def test_what_an_abandoned_control_had_replaced_does_not_come_back() -> None:
-    """The last control before the clock steps back by 10 ticks is of the time that it leaves."""
-    clock = [at("/c", k, k - (10 if k >= 110 else 0)) for k in range(105, 125)]
-    late = at("/u", 109, 109, 6.0)
-    used = controls_of(two_topics(), at("/u", 91, 91, 5.0), *clock[:5], late, *clock[5:])
-    assert np.array_equal(used, [5.0] * 4 + [NAN] * 10 + [6.0] * 5, equal_nan=True)  # 109 on: the clock is there again
-
-
-def test_a_single_sample_of_another_time_does_not_cost_a_control_that_came_once() -> None:
-    clock = [at("/c", k, 50 if k == 110 else k) for k in range(105, 115)]
-    used = controls_of(two_topics(), at("/u", 91, 91, 5.0), *clock)
-    assert np.array_equal(used, [5.0] * 4 + [NAN, NAN] + [5.0] * 3, equal_nan=True)
-
-
-def test_messages_out_of_order_are_no_step_back_once_the_clock_is_where_it_was() -> None:
-    stream = [m for k in range(100, 110) for m in (at("/u", k, k + 1), at("/c", k, k))]
-    stream += [at("/c", k, k - 8) for k in range(110, 120)]  # up to 111, beyond the 109 that it left
-    ordered = [at("/u", 120, 113, 7.0), at("/u", 120, 112, 6.0)]
-    assert controls_of(two_topics(), *stream, *ordered, at("/c", 122, 114), at("/c", 123, 115))[-1] == 7.0
 
 
 def test_single_messages_of_another_time_leave_nothing_behind() -> None:
