@@ -1048,18 +1048,25 @@ Course_other(Course *self, PyObject *const *args, Py_ssize_t given)
 
 /* --- from and to Python --------------------------------------------------------------------------------------- */
 
+/* All of a ring of numbers, from its oldest on. */
 static PyObject *
-doubles(const double *from, Py_ssize_t count)
+ring(const double *from, Py_ssize_t count, Py_ssize_t oldest)
 {
     PyObject *list = PyList_New(count);
     for (Py_ssize_t i = 0; list && i < count; i++) {
-        PyObject *value = PyFloat_FromDouble(from[i]);
+        PyObject *value = PyFloat_FromDouble(from[(oldest + i) % count]);
         if (!value)
             Py_CLEAR(list);
         else
             PyList_SET_ITEM(list, i, value);
     }
     return list;
+}
+
+static PyObject *
+doubles(const double *from, Py_ssize_t count)
+{
+    return ring(from, count, 0);
 }
 
 static PyObject *
@@ -1341,14 +1348,7 @@ tell_delays(const Course *self)
     PyObject *lines = PyTuple_New(self->delays);
     for (Py_ssize_t i = 0; lines && i < self->delays; i++) {
         const Delayed *one = &self->delayed[i];
-        PyObject *line = PyList_New(one->delay);
-        for (Py_ssize_t j = 0; line && j < one->delay; j++) {
-            PyObject *value = PyFloat_FromDouble(one->line[(one->at + j) % one->delay]);
-            if (!value)
-                Py_CLEAR(line);
-            else
-                PyList_SET_ITEM(line, j, value);
-        }
+        PyObject *line = ring(one->line, one->delay, one->at);
         if (!line)
             Py_CLEAR(lines);
         else

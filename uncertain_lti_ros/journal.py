@@ -161,10 +161,7 @@ class Journal:
         if clock not in never and watch.silent_for(now) > timeout / 2:
             return "; ".join([f"no message on {clock}", *found])
         since = watch.sampler.counters - self._counters
-        signals = [
-            s.name for s in watch.model.signals.signals if since[f"missing {s.name}"] or since[f"stale {s.name}"]
-        ]
-        if signals:
+        if signals := watch.lacking(self._counters):
             found.append(f"{', '.join(signals)} missing, stale or not finite")
         for status, name in ((Status.GAP, "gaps"), (Status.RESET, "resets")):
             if since[name]:

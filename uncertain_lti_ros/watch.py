@@ -477,7 +477,11 @@ class Watch:
             complaints.append(f"outside the fitted domain in {period.outside} of {period.verdicts} verdicts")
         for status in (Status.GAP, Status.RESET, Status.MISSING):
             if period.statuses[status]:
-                which = f" ({self._lacking(period)})" if status is Status.MISSING else ""
+                which = ""
+                if status is Status.MISSING:
+                    names = self.lacking(period.counters)
+                    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+                    which = f" ({', '.join(names[:_SHOWN])}{more})"
                 complaints.append(f"{period.statuses[status]} samples without a verdict: {WHY[status]}{which}")
         dropped = sum(count for status, count in period.statuses.items() if status.dropped)
         if dropped:
@@ -516,12 +520,11 @@ class Watch:
         message = "; ".join([*(complaints or [f"{well}, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
 
-    def _lacking(self, period: _Period) -> str:
-        """The signals that samples had no value of since a report."""
-        since = self.sampler.counters - period.counters
-        names = [s.name for s in self.model.signals.signals if since[f"missing {s.name}"]]
-        more = len(names) - _SHOWN
-        return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    def lacking(self, before: Counter[str]) -> list[str]:
+        """Signals that samples had no value of since the sampler's counters were these."""
+        since = self.sampler.counters - before
+        names = [signal.name for signal in self.model.signals.signals]
+        return [name for name in names if since[f"missing {name}"] or since[f"stale {name}"]]
 
     def rule_text(self) -> str:
         """The alarm rule in words."""
