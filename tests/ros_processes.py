@@ -177,6 +177,7 @@ class World:
     def close(self) -> None:
         for process in self._processes:
             process.kill()
+            print(f"--- {process.name}\n{process.output}")  # seen where the test fails
         self._ends = True
         self._thread.join()
         self.node.destroy_node()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -95,7 +97,7 @@ class Node(envelope_monitor.EnvelopeMonitorNode):
     def _keep_reporting(self) -> None:
         """Never, likewise."""
 
-    def _keep_album(self) -> None:
+    def _take_due_snapshot(self) -> None:
         """Never: what is remembered is only looked at."""
 
     def _go_on(self) -> None:
@@ -150,11 +152,13 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             yield
         finally:
             rclpy.try_shutdown()
+            gc.collect()  # else the nodes would still be there for the next test in this domain
 
 
 def end(nodes: list[Node]) -> None:
     for node in nodes:
         node.finish()
+        assert node._state_machine.current_state[1] == "finalized"
         node.destroy_node()
 
 
@@ -353,6 +357,22 @@ def test_an_interrupt_while_something_is_sent_ends_the_process(ros: None, tmp_pa
         node.arrive(*last)
     assert not node._failures
     end([node])
+
+
+@needs_compiled
+def test_a_node_that_is_put_away_leaves_nothing(ros: None, tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    model = saved(tmp_path / "model.json", 3, rng)
+    node = Node(tmp_path / "model.json", True)
+    for message in stream(model, rng, 60, 0.0):
+        node._on_tick()
+        node.arrive(*message)
+    assert node.taken
+    end([node])
+    left = weakref.ref(node)
+    del node
+    gc.collect()
+    assert left() is None
 
 
 @needs_compiled

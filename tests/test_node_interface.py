@@ -163,6 +163,7 @@ sys.exit(envelope_monitor.main())
     events = world.listen(TransitionEvent, f"{NODE}/transition_event").connected()
     assert not world.change("activate")
     diagnostics.reaches(ERROR, saying="a transition failed unexpectedly; see the log")
+    process.says("OSError: the first time")
     assert world.state() == "unconfigured" and process.running
     until(lambda: "errorprocessing" in {m.goal_state.label for m in events.messages}, "the event")
     assert world.change("configure") and world.change("activate") and world.state() == "active"

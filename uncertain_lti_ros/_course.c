@@ -169,12 +169,41 @@ forget_layout(Topic *topic)
     topic->size = -1;
 }
 
+static int
+Course_traverse(Course *self, visitproc visit, void *arg)
+{
+    for (Py_ssize_t k = 0; self->topic && k < self->topics; k++)
+        Py_VISIT(self->topic[k].derived);
+    for (int i = 0; i < OUTPUTS; i++)
+        Py_VISIT(self->send[i]);
+    Py_VISIT(self->arrival);
+    Py_VISIT(self->failure);
+    Py_VISIT(self->log);
+    return 0;
+}
+
+/* What sends leads back to the node that has this: only a collector can tell that nobody else does. */
+static int
+Course_clear(Course *self)
+{
+    self->running = 0;
+    for (Py_ssize_t k = 0; self->topic && k < self->topics; k++)
+        forget_layout(&self->topic[k]);
+    for (int i = 0; i < OUTPUTS; i++)
+        Py_CLEAR(self->send[i]);
+    Py_CLEAR(self->arrival);
+    Py_CLEAR(self->failure);
+    Py_CLEAR(self->log);
+    return 0;
+}
+
 static void
 Course_dealloc(Course *self)
 {
+    PyObject_GC_UnTrack(self);
+    Course_clear(self);
     for (Py_ssize_t k = 0; self->topic && k < self->topics; k++) {
         Topic *topic = &self->topic[k];
-        forget_layout(topic);
         PyMem_Free(topic->where);
         PyMem_Free(topic->max_age);
         PyMem_Free(topic->angle);
@@ -188,11 +217,6 @@ Course_dealloc(Course *self)
     PyMem_Free(self->delayed);
     for (int i = 0; i < self->blocks; i++)
         PyMem_Free(self->memory[i]);
-    for (int i = 0; i < OUTPUTS; i++)
-        Py_XDECREF(self->send[i]);
-    Py_XDECREF(self->arrival);
-    Py_XDECREF(self->failure);
-    Py_XDECREF(self->log);
     Py_TYPE(self)->tp_free((PyObject *)self);
 }
 
@@ -1409,7 +1433,9 @@ static PyTypeObject CourseType = {
     PyVarObject_HEAD_INIT(NULL, 0).tp_name = "uncertain_lti_ros._course.Course",
     .tp_basicsize = sizeof(Course),
     .tp_dealloc = (destructor)Course_dealloc,
-    .tp_flags = Py_TPFLAGS_DEFAULT,
+    .tp_traverse = (traverseproc)Course_traverse,
+    .tp_clear = (inquiry)Course_clear,
+    .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC,
     .tp_doc = "Messages that come in order and complete.",
     .tp_methods = methods,
     .tp_init = (initproc)Course_init,

@@ -10,7 +10,7 @@ import struct
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
+from functools import cache, partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,20 @@ class _Output:
     def look(self) -> None:
         """Ask how many listen; events tell as well, and sooner."""
         self.listeners = self.publisher.get_subscription_count()
+
+
+def _told(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
+    """A transition whose unforeseen errors are counted and logged; rclpy on its own passes over them in silence."""
+
+    @wraps(transition)
+    def told(node: EnvelopeMonitorNode, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return transition(node, state)
+        except Exception as error:
+            node.note_failure(f"in {transition.__name__}", error)
+            return TransitionCallbackReturn.ERROR
+
+    return told
 
 
 class EnvelopeMonitorNode(LifecycleNode):
@@ -260,6 +274,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             response.success = False
             return response
 
+    @_told
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load and check the model, and offer the outputs."""
         path = str(self.get_parameter("model").value)
@@ -311,6 +326,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._marks = {mark: struct.pack(f"<{n}d", *[mark] * n) for mark in (0.0, 1.0)}
         self._no_mark = struct.pack(f"<{n}d", *[_NAN] * n)
 
+    @_told
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start with no sample and no verdict, and subscribe."""
         assert self.watch is not None
@@ -328,18 +344,21 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._beat()
         return result
 
+    @_told
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; no heartbeat comes from now on."""
         self._unsubscribe()
         self.get_logger().info("no longer active: no verdicts are given")
         return super().on_deactivate(state)
 
+    @_told
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget the model."""
         result = super().on_cleanup(state)
         self._put_away()
         return result
 
+    @_told
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Put everything away."""
         result = super().on_shutdown(state)
