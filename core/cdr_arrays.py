@@ -24,7 +24,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import normalize_fieldname
 
 from uncertain_lti.errors import BagError
-from uncertain_lti.message_types import Definition, header_stamp_ns
+from uncertain_lti.message_types import CODES, Definition, header_stamp_ns
 from uncertain_lti.signals import NORM, Derived, FieldPath
 
 Integers = NDArray[np.int64]
@@ -34,10 +34,6 @@ Values = NDArray[np.float64]
 _Key = TypeVar("_Key", str, int)
 
 NO_STAMP = -1
-_KINDS = {
-    "bool": "?", "byte": "i1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
-    "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
-}  # fmt: skip
 _TEXT = -1
 _STAMP = -1  # stands for a path where the header stamp is meant
 SLACK = 64
@@ -153,7 +149,7 @@ def _want_stamp(definition: Definition, top: _Wanted) -> None:
     here = top.fields.setdefault("header", _Wanted()).fields.setdefault("stamp", _Wanted())
     for part, name in enumerate(("sec", "nanosec")):
         node, what = parts.get(name, (None, None))
-        if node != Nodetype.BASE or _KINDS.get(what[0], "f8") not in ("i1", "u1", "i2", "u2", "i4", "u4"):
+        if node != Nodetype.BASE or CODES.get(what[0], "f8") not in ("i1", "u1", "i2", "u2", "i4", "u4"):
             raise _UnfitError
         here.fields.setdefault(name, _Wanted()).goals.append((_STAMP, part))
 
@@ -254,7 +250,7 @@ class _Walk:
             if not length:
                 raise _UnfitError
         elif plain and here is None:
-            self._unwanted(np.dtype(_KINDS[inner_what[0]]).itemsize, count)
+            self._unwanted(np.dtype(CODES[inner_what[0]]).itemsize, count)
             return
         else:
             self._align(4)
@@ -294,7 +290,7 @@ class _Walk:
         self.segment.fixed.append((at, mask))
 
     def _numbers(self, kind: str, count: int, elements: Mapping[int, _Wanted]) -> None:
-        code = _KINDS[kind]
+        code = CODES[kind]
         size = np.dtype(code).itemsize
         self._align(size)
         for i, wanted in elements.items():
@@ -695,7 +691,7 @@ class FieldReader:
             return None
         self.patience -= 1
         try:
-            value = self.definition.decode(data)
+            value = self.definition.decode_strictly(data)
             walk = self._walk(data, value, frozenset())
             shape = tuple(walk.shape)
             known = self.layouts.get(shape)

@@ -11,8 +11,9 @@ import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import zstandard
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
@@ -25,13 +26,14 @@ from uncertain_lti.signals import FieldType
 _LARGEST_SCHEMA = 1 << 20  # bytes
 _LARGEST_MESSAGE = 1 << 26  # bytes, decompressed
 _ZSTD = b"\x28\xb5\x2f\xfd"
+_CDR = b"\0\0", b"\0\1", b"\0\3"  # plain, and what the middleware reads as such; only the first is big-endian
 _LONGEST_UNROLLED = 4096  # rosbags writes a line of code per element of a fixed array of strings or messages
-_NUMBERS = {
-    "char", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64",
+CODES = {
+    "bool": "?", "byte": "i1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-_KINDS: Mapping[str, Any] = {"bool": "bool", "string": "string", "byte": "other"} | dict.fromkeys(
-    _NUMBERS, "number"
-)  # rclpy hands out a byte as bytes, so it is no number live either
+_KINDS: Mapping[str, Any] = dict.fromkeys(CODES, "number") | {"bool": "bool", "string": "string", "byte": "other"}
+# rclpy hands out a byte as bytes, so it is no number live either
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,25 +50,42 @@ class Definition:
     note: str = ""
 
     def decode(self, data: bytes) -> Any:
-        """Decode one CDR message; raises BagError where it does not fit the definition."""
+        """Decode one CDR message; raises BagError where it does not fit the definition.
+
+        Text that is no UTF-8, has no closing zero, or has not even the length of one, is read as the middleware does.
+        """
+        try:
+            return self.decode_strictly(data)
+        except BagError:
+            try:
+                odd = _OddText(self, data)
+                message = odd.message(self.type_name)
+                if self._may_end(message, odd.left):
+                    return message
+            except Exception:  # not that alone
+                pass
+            raise
+
+    def decode_strictly(self, data: bytes) -> Any:
+        """As `decode`; raises BagError also where text is not as it should be."""
         try:
             data = _plain(data)
             return self.store.deserialize_cdr(data, self.type_name)
         except Exception as error:  # the generated decoders raise whatever the bytes lead them to
-            if "size mismatch" in str(error) and (message := self._with_more_room(data)) is not None:
-                return message
+            if "size mismatch" in str(error):
+                layout = self.store.get_msgdef(self.type_name)
+                read = layout.deserialize_cdr_le if data[1] else layout.deserialize_cdr_be
+                message, end = read(data[4:], 0, layout.cls, self.store)
+                if self._may_end(message, len(data) - 4 - end):
+                    return message
             raise BagError(_one_line(error)) from None
 
-    def _with_more_room(self, data: bytes) -> Any:
-        """A message with as many bytes after it as `rclpy.serialization` leaves there, or None with more.
+    def _may_end(self, message: Any, left: int) -> bool:
+        """Whether so many bytes may be left behind a message: no more than `rclpy.serialization` leaves there.
 
         It reserves 4 for each empty sequence of 8-byte numbers, and so does every bag written through rosbag2_py.
         """
-        layout = self.store.get_msgdef(self.type_name)
-        read = layout.deserialize_cdr_le if data[1] else layout.deserialize_cdr_be
-        message, end = read(data[4:], 0, layout.cls, self.store)
-        more = len(data) - 4 - end
-        return message if more <= 3 + 4 * self._empty_sequences(self.type_name, message) else None
+        return left <= 3 + 4 * self._empty_sequences(self.type_name, message)
 
     def _empty_sequences(self, type_name: str, message: Any) -> int:
         count = 0
@@ -107,7 +126,7 @@ class Definition:
                 return None
         try:
             data = _plain(data)
-        except zstandard.ZstdError:
+        except (zstandard.ZstdError, TypesysError):
             return None
         if len(data) < 12:
             return None
@@ -125,11 +144,61 @@ class Definition:
         }
 
 
+class _OddText:
+    """Reads a message number by number, and lets text in it be odd."""
+
+    def __init__(self, definition: Definition, data: bytes) -> None:
+        data = _plain(data)
+        self._definition, self._data, self._at = definition, data[4:], 0
+        self._order: Literal["<", ">"] = "<" if data[1] else ">"
+
+    @property
+    def left(self) -> int:
+        return len(self._data) - self._at
+
+    def message(self, type_name: str) -> Any:
+        values = [self._value(node, what) for _, (node, what) in self._definition.types[type_name][1]]
+        return self._definition.store.get_msgdef(type_name).cls(*values)
+
+    def _value(self, node: Any, what: Any) -> Any:
+        if node == Nodetype.NAME:
+            return self.message(what)
+        if node == Nodetype.BASE:
+            return self._text() if what[0] == "string" else self._numbers(what[0], 1)[0].item()
+        (inner, inner_what), count = what
+        if node == Nodetype.SEQUENCE:
+            count = int(self._numbers("uint32", 1)[0])
+        if inner == Nodetype.BASE and inner_what[0] != "string":
+            return self._numbers(inner_what[0], count)
+        if count > self.left:
+            raise ValueError
+        return [self._value(inner, inner_what) for _ in range(count)]
+
+    def _numbers(self, kind: str, count: int) -> Any:
+        code = np.dtype(CODES[kind]).newbyteorder(self._order)
+        if not count:
+            return np.empty(0, code)
+        self._at += -self._at % code.itemsize
+        numbers = np.frombuffer(self._data, code, count, self._at)
+        self._at += count * code.itemsize
+        return numbers
+
+    def _text(self) -> str:
+        length = int(self._numbers("uint32", 1)[0])
+        if length > self.left:
+            raise ValueError
+        data = self._data[self._at : self._at + length]
+        self._at += length
+        return data.split(b"\0")[0].decode(errors="replace")
+
+
 def _plain(data: bytes) -> bytes:
     """Bytes of a message that the recorder may have compressed on its own (rosbag2's compression mode MESSAGE)."""
-    if data[:4] != _ZSTD:  # no CDR begins like this
-        return data
-    return zstandard.ZstdDecompressor().stream_reader(data).read(_LARGEST_MESSAGE)
+    if data[:4] == _ZSTD:  # no CDR begins like this
+        data = zstandard.ZstdDecompressor().stream_reader(data).read(_LARGEST_MESSAGE)
+    if data[:2] not in _CDR:  # the decoder takes whatever it is for plain
+        raise TypesysError(f"it is no plain CDR; it begins with {data[:2].hex() or 'nothing'}")
+    return data
 
 
 def header_stamp_ns(message: Any) -> int | None:

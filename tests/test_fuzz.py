@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import sys
 from pathlib import Path
 
@@ -18,6 +19,53 @@ def test_damage_gives_a_clear_error_or_a_correct_reading(kind: str) -> None:
     assert not outcome.failures, "\n".join(outcome.failures)
     assert sum(outcome.counts.values()) == 150
     assert outcome.counts["read"] > 30 and outcome.counts["refused"] > 5, "the damage is too small or too great"
+
+
+def framed(frame_id: bytes, start: bytes = b"\0\1\0\0", more: int = 0) -> bytes:
+    """A JointState with this frame_id, as it stands there."""
+    body = struct.pack("<iII", 5, 7, len(frame_id)) + frame_id
+    body += bytes(-len(body) % 4) + struct.pack("<III", 1, 2, ord("a")) + struct.pack("<I", 1)
+    return start + body + bytes(-len(body) % 8) + struct.pack("<dII", 1.5, 0, 0) + bytes(more)
+
+
+READ = {
+    "regular": framed(b"base\0"),
+    "Latin-1": framed(b"Tr\xe4ger\0"),
+    "no closing zero": framed(b"base"),
+    "not even the length of one": framed(b""),
+    "zeros": framed(b"base\0\0\0\0"),
+    "more room": framed(b"base\0", more=8),
+    "filled up": framed(b"base\0", more=11),
+}
+REFUSED = {
+    "bytes behind": framed(b"base\0", more=12),
+    "bytes behind odd text": framed(b"", more=12),
+    "a length that lies": framed(b"base\0").replace(b"\5\0\0\0base", b"\xff\0\0\0base"),
+    "another encapsulation": framed(b"base\0", start=b"\0\7\0\0"),
+    "too short": framed(b"base\0")[:40],
+    "nothing": b"",
+}
+
+
+def test_odd_messages_read_alike_live_and_from_recordings() -> None:
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    from uncertain_lti.signals import FieldPath
+    from uncertain_lti_ros.layout import UnreadableError
+
+    make_reader, fields, decoder = fuzz.middleware()
+    paths = [FieldPath("position[a]")]
+    live = make_reader(fuzz.JOINT_STATE, paths, fields, decoder(fuzz.JOINT_STATE))
+    for _ in range(2):  # the second time the live node knows the layouts
+        for what, data in READ.items():
+            stamp, values = live.read(data)
+            assert (stamp, list(values)) == (5_000_000_007, [1.5]), what
+        for what, data in REFUSED.items():
+            with pytest.raises(UnreadableError):
+                raise AssertionError(f"{what}: {live.read(data)}")
+    for what, data in (READ | REFUSED).items():
+        for before in ([], [READ["regular"]] * 3, list(READ.values()), list(REFUSED.values())):
+            recorded = fuzz.read_recorded(fuzz.JOINT_STATE, paths, [*before, data])
+            assert recorded == ((5_000_000_007, struct.pack("<d", 1.5)) if what in READ else None), what
 
 
 def test_whatever_goes_wrong_is_noticed(tmp_path: Path) -> None:

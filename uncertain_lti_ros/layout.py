@@ -26,6 +26,7 @@ _CDR = b"\x00\x01"  # plain, little-endian; whatever else comes is left to the m
 _ENCAPSULATION = 4
 _MOST_LAYOUTS = 8
 _MOST_PARTS = 20_000  # of a message that a layout is made from
+_PADDING = 3  # bytes: some senders fill up to a multiple of four
 _NEAR = 128  # bytes between two places that are compared in one go
 _LAYOUT = 100  # what making one costs; each message that fits one pays 1
 _BUDGET = 50 * _LAYOUT
@@ -109,6 +110,10 @@ class MessageReader:
             message = self._decode(data)
         except Exception as error:  # what the middleware raises is not stated anywhere
             raise UnreadableError(f"cannot be decoded: {error}") from None
+        if left := self._left(data):
+            raise UnreadableError(
+                f"is {left} bytes longer than a {self.type_name}; its publisher may have another version of that type"
+            )
         try:
             stamp, values = stamp_ns(message), [path.read(message) for path in self._paths]
         except _SHAPED_ODDLY as error:
@@ -121,6 +126,21 @@ class MessageReader:
     def fitted(self, count: int) -> None:
         """So many messages fitted `plan` elsewhere."""
         self._budget = min(_BUDGET, self._budget + count)
+
+    def _left(self, data: bytes) -> int:
+        """Bytes behind a message beyond those that senders leave there; 0 where that is not known.
+
+        The middleware passes over them; a reader of recordings does not.
+        """
+        if data[:2] != _CDR:
+            return 0
+        walk = _Walk(data, self._fields)
+        try:
+            walk.message(self.type_name, [])
+        except (_UnfitError, *_SHAPED_ODDLY, struct.error):
+            return 0
+        left = len(data) - walk.at
+        return left if left > _PADDING + walk.reserved else 0
 
     def _learn(self, data: bytes, stamp: int | None, values: list[float]) -> None:
         try:
@@ -180,6 +200,8 @@ class _Layout:
         every = [*(stamp if self._stamped else ()), *wants]
         walk = _Walk(data, fields)
         walk.message(type_name, [(want, want.path.steps) for want in every])
+        if walk.odd:
+            raise _UnfitError
         self._shape = _shape(data, [(0, 2), *walk.shape])
         places = [place for want in every for place in want.places]
         self._places = [want.places for want in every]
@@ -245,14 +267,16 @@ class _Walk:
 
     def __init__(self, data: bytes, fields: TypeFields) -> None:
         self._data, self._fields = data, fields
-        self._at = _ENCAPSULATION
+        self.at = _ENCAPSULATION
+        self.odd = False  # a text has not even a closing zero
+        self.reserved = 0  # bytes that `rclpy.serialization` leaves behind a message: 4 for each empty array of these
         self._parts = 0
         self.shape: list[tuple[int, int]] = []
 
     def message(self, type_name: str, wants: list[tuple[_Want, Sequence[tuple[str, str | int]]]]) -> None:
         fields = self._fields(type_name)
         if not fields:
-            self._at += 1  # an empty message is one byte long
+            self.at += 1  # an empty message is one byte long
         names: list[tuple[bytes, int]] | None = None
         looked_up: list[tuple[_Want, str, int, int, str]] = []  # want, name, count, start of the array, code
         for name, kind in fields.items():
@@ -276,9 +300,10 @@ class _Walk:
                 if code is None:
                     raise _UnfitError
                 size = struct.calcsize(f"<{code}")
-                start = self._align(size) if count else self._at
-                self._at = start + count * size
-                if self._at > len(self._data):
+                start = self._align(size) if count else self.at
+                self.reserved += 4 * (size == 8 and not count)
+                self.at = start + count * size
+                if self.at > len(self._data):
                     raise _UnfitError
                 for want, steps in here:
                     if not steps:  # norm of an array
@@ -327,7 +352,7 @@ class _Walk:
                 raise _UnfitError
             size = struct.calcsize(f"<{code}")
             start = self._align(size)
-            self._at = start + size
+            self.at = start + size
             for want, _ in here:
                 want.places = [(start, code)]
 
@@ -338,13 +363,13 @@ class _Walk:
         return count
 
     def _align(self, size: int) -> int:
-        self._at = -(-(self._at - _ENCAPSULATION) // size) * size + _ENCAPSULATION
-        return self._at
+        self.at = -(-(self.at - _ENCAPSULATION) // size) * size + _ENCAPSULATION
+        return self.at
 
     def _length(self) -> int:
         start = self._align(4)
         self.shape.append((start, 4))
-        self._at = start + 4
+        self.at = start + 4
         (length,) = struct.unpack_from("<I", self._data, start)
         if length > len(self._data):
             raise _UnfitError
@@ -353,11 +378,12 @@ class _Walk:
     def _text(self) -> tuple[bytes, int]:
         """Text without its end, and where it stands."""
         length = self._length()
-        start = self._at
-        self._at += length
-        if not length or self._at > len(self._data):
+        start = self.at
+        self.at += length
+        if self.at > len(self._data):
             raise _UnfitError
-        return self._data[start : self._at - 1], start
+        self.odd |= not length
+        return self._data[start : max(start, self.at - 1)], start
 
 
 class _Part(_Want):
