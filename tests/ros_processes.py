@@ -230,8 +230,8 @@ class World:
         client = self.node.create_client(kind, name)
         try:
             until(client.service_is_ready, f"service {name}", patience)
-            if again == math.inf:
-                time.sleep(0.2)  # this request goes out once
+            if again > 1.0:
+                time.sleep(0.2)  # this request may go out once only
             futures, asked, end = [client.call_async(request)], time.monotonic(), time.monotonic() + patience
             while not (answered := [future for future in futures if future.done()]):
                 now = time.monotonic()
@@ -254,12 +254,18 @@ class World:
         request = SetParametersAtomically.Request(
             parameters=[Parameter(key, value=value).to_parameter_msg() for key, value in values.items()]
         )
-        result = self.call(SetParametersAtomically, f"{name}/set_parameters_atomically", request).result
+        result = self.call(SetParametersAtomically, f"{name}/set_parameters_atomically", request, again=20.0).result
         return result.successful, result.reason
 
     def change(self, label: str, name: str = MONITOR) -> bool:
-        """Ask for a lifecycle transition."""
-        request = ChangeState.Request(transition=Transition(id=_TRANSITIONS[label]))
+        """Ask for a lifecycle transition, and once more where the answer was lost and it has not taken place."""
+        number, goal = _TRANSITIONS[label]
+        request = ChangeState.Request(transition=Transition(id=number))
+        try:
+            return bool(self.call(ChangeState, f"{name}/change_state", request, patience=PATIENCE / 3).success)
+        except AssertionError:
+            if self.state(name) == goal:
+                return True
         return bool(self.call(ChangeState, f"{name}/change_state", request).success)
 
     def state(self, name: str = MONITOR) -> str:
@@ -269,12 +275,12 @@ class World:
         return Diagnostics(self)
 
 
-_TRANSITIONS = {
-    "configure": Transition.TRANSITION_CONFIGURE,
-    "activate": Transition.TRANSITION_ACTIVATE,
-    "deactivate": Transition.TRANSITION_DEACTIVATE,
-    "cleanup": Transition.TRANSITION_CLEANUP,
-    "shutdown": Transition.TRANSITION_ACTIVE_SHUTDOWN,
+_TRANSITIONS = {  # and where they lead
+    "configure": (Transition.TRANSITION_CONFIGURE, "inactive"),
+    "activate": (Transition.TRANSITION_ACTIVATE, "active"),
+    "deactivate": (Transition.TRANSITION_DEACTIVATE, "inactive"),
+    "cleanup": (Transition.TRANSITION_CLEANUP, "unconfigured"),
+    "shutdown": (Transition.TRANSITION_ACTIVE_SHUTDOWN, "finalized"),
 }
 
 

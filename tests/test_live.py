@@ -608,6 +608,7 @@ def test_a_signal_ends_the_node_with_status_0(world: World, tmp_path: Path, end:
     diagnostics = world.diagnostics()
     process = world.monitor(saved(by_hand(), tmp_path))
     assert "runs on the events executor" in process.output
+    until(lambda: diagnostics.latest("envelope_monitor: monitor"), "its first words")
     process.signal(end)
     while process.running:  # a terminal and `ros2 launch` both send it, one after the other
         process.signal(end)
