@@ -377,6 +377,7 @@ class Run:
                 child.end()
 
 
+BARE = "bare, default executor", "bare, events executor"
 LIMITS = (
     ("monitor, all outputs heard", "bare, default executor", 0.6),
     ("monitor, all outputs heard", "bare, events executor", 1.5),
@@ -398,17 +399,13 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, 
                 bare = Run(n, rate, seconds, left).measure("take", "events", [], delays=True)
                 for name, found in zip(late, (bare, runs["monitor, all outputs heard"][-1]), strict=True):
                     late[name].append(float(np.percentile(found["delays"][100:], 99)) / 1e6)
-
             cpu = {name: np.array([found["cpu"] for found in some]) for name, some in runs.items()}
-
-            def beside(name: str, peer: str, cpu: dict[str, Any] = cpu) -> float:
-                return float(np.median(cpu[name] / cpu[peer]))
-
+            beside = {(name, peer): cpu[name] / cpu[peer] for name in cpu for peer in BARE}  # turn by turn
             for name, some in runs.items():
                 rows.append(
                     [
                         f"{n}", f"{rate:g}", name, f"{np.median(cpu[name]):.0f}",
-                        f"{beside(name, 'bare, default executor'):.2f}", f"{beside(name, 'bare, events executor'):.2f}",
+                        *(f"{np.median(beside[name, peer]):.2f}" for peer in BARE),
                         f"{np.median(late[name]):.2f}" if name in late else "",
                         str(max(found["missed"] for found in some)),
                         str(max(found["unheard"] for found in some)) if "unheard" in some[0] else "",
@@ -416,13 +413,14 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, 
                 )  # fmt: skip
                 print("  ".join(rows[-1]), file=sys.stderr, flush=True)
             for name, peer, limit in LIMITS:
-                ratio, each = beside(name, peer), cpu[name] / cpu[peer]
+                each = beside[name, peer]
+                ratio = np.median(each)
                 without = name.replace("monitor,", "publishing only,").removesuffix(" heard")
                 held.append(
                     [
                         f"{n}", f"{rate:g}", f"{name} / {peer}", f"{limit:g}", f"{ratio:.2f}",
                         f"{each.min():.2f} to {each.max():.2f}", "yes" if ratio <= limit else "no",
-                        f"{beside(without, peer):.2f}",
+                        f"{np.median(beside[without, peer]):.2f}",
                     ]
                 )  # fmt: skip
             bare_late, monitor_late = (np.array(some) for some in late.values())

@@ -11,6 +11,7 @@ from typing import Any
 
 from uncertain_lti.errors import BagError
 from uncertain_lti.files import MAGIC, kind_of
+from uncertain_lti.wording import shortlist
 
 _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.mcap")
 
@@ -194,5 +195,4 @@ def _no_recording(folder: Path, inside: list[Path]) -> BagError:
 
 
 def _names(paths: list[Path], limit: int = 12) -> str:
-    more = f" and {len(paths) - limit} more" if len(paths) > limit else ""
-    return ", ".join(path.name for path in paths[:limit]) + more
+    return shortlist([path.name for path in paths], limit)

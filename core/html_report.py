@@ -24,7 +24,7 @@ from uncertain_lti.findings import APART, CARE, NO, YES, shortened
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.report import beyond, number
-from uncertain_lti.wording import plural
+from uncertain_lti.wording import plural, shortlist
 
 MOST_DRAWN = 8
 """Recordings with figures of their own; those with most violations."""
@@ -266,15 +266,14 @@ def _episodes(facts: Mapping[str, Any]) -> str:
     rows = []
     for e in facts["episodes"][:_MOST_EPISODES]:
         where = sorted(e["states"].items(), key=lambda item: -item[1]["violations"])
-        listed = ", ".join(f"{shortened(name)} ({s['violations']}, worst {_utilisation(s)})" for name, s in where[:4])
-        more = f" and {len(where) - 4} more" if len(where) > 4 else ""
+        listed = [f"{shortened(name)} ({s['violations']}, worst {_utilisation(s)})" for name, s in where]
         rows.append(
             [
                 f"{e['first']['t']:.4f}",
                 f"{e['last']['t']:.4f}",
                 str(e["verdicts_violated"]),
                 "yes" if e["alarm"] else "",
-                _text(listed + more),
+                _text(shortlist(listed, 4)),
             ]
         )
     header = ("first [s]", "last [s]", "violated", "alarm", "states (violations, worst utilisation)")

@@ -20,7 +20,7 @@ from uncertain_lti.identification.noise import NOISE, predicted
 from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.signals import FieldPath, Signal
-from uncertain_lti.wording import plural
+from uncertain_lti.wording import plural, shortlist
 
 Array = NDArray[np.float64]
 Iterate = Callable[[Iterable[object], int], Iterable[object]]
@@ -1018,8 +1018,7 @@ def _left_out(sources: Sequence[Source], chosen: set[int]) -> list[str]:
             lines.append(f"#   {source.topic}: {_one_line(source.reason)}")
             continue
         for reason, paths in groups.items():
-            shown = ", ".join(paths[:6]) + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
-            lines.append(f"#   {source.topic} {shown}: {_one_line(reason)}")
+            lines.append(f"#   {source.topic} {shortlist(paths, 6)}: {_one_line(reason)}")
     return lines
 
 

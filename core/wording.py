@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 def plural(count: object, word: str) -> str:
@@ -14,6 +14,11 @@ def plural(count: object, word: str) -> str:
 def times(count: int) -> str:
     """Once, or how many times."""
     return "once" if count == 1 else f"{count} times"
+
+
+def shortlist(names: Sequence[str], limit: int) -> str:
+    """The first names, and how many more there are."""
+    return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
 def meant(word: object, known: Iterable[str]) -> str:

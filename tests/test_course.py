@@ -337,19 +337,26 @@ def test_an_output_that_fails_is_told_and_the_node_goes_on(ros: None, tmp_path: 
     end([node])
 
 
+def at_work(folder: Path) -> tuple[Node, tuple[int, str, bytes]]:
+    """A node that has taken a stream with compiled code, and the message that comes next."""
+    rng = np.random.default_rng(6)
+    model = saved(folder / "model.json", 3, rng)
+    node = Node(folder / "model.json", True)
+    *messages, last = stream(model, rng, 60, 0.0)
+    for message in messages:
+        node._on_tick()
+        node.arrive(*message)
+    assert node.taken
+    return node, last
+
+
 @needs_compiled
 def test_an_interrupt_while_something_is_sent_ends_the_process(ros: None, tmp_path: Path) -> None:
-    rng = np.random.default_rng(6)
-    model = saved(tmp_path / "model.json", 3, rng)
-    node = Node(tmp_path / "model.json", True)
-    *messages, last = stream(model, rng, 60, 0.0)
+    node, last = at_work(tmp_path)
 
     def interrupt(data: bytes) -> None:
         raise KeyboardInterrupt
 
-    for message in messages:
-        node._on_tick()
-        node.arrive(*message)
     node._settle()
     node._outputs["upper"].send = interrupt
     node._go_on()
@@ -361,13 +368,7 @@ def test_an_interrupt_while_something_is_sent_ends_the_process(ros: None, tmp_pa
 
 @needs_compiled
 def test_a_node_that_is_put_away_leaves_nothing(ros: None, tmp_path: Path) -> None:
-    rng = np.random.default_rng(6)
-    model = saved(tmp_path / "model.json", 3, rng)
-    node = Node(tmp_path / "model.json", True)
-    for message in stream(model, rng, 60, 0.0):
-        node._on_tick()
-        node.arrive(*message)
-    assert node.taken
+    node, _ = at_work(tmp_path)
     end([node])
     left = weakref.ref(node)
     del node

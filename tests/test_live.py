@@ -46,7 +46,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 # --- a model and recordings made by hand --------------------------------------------------------------------
 
 
-def by_hand(time: str = "header", **options: Any) -> UncertainLTI:
+def by_hand(time: str = "header", max_hold: float | None = 0.5, **options: Any) -> UncertainLTI:
     """Two states on a JointState, controls on a Vector3Stamped (header time) or a Float64 (log time)."""
     if time == "header":
         state = [(STATE, JOINT_STATE, "position[a]"), (STATE, JOINT_STATE, "position[b]")]
@@ -61,7 +61,7 @@ def by_hand(time: str = "header", **options: Any) -> UncertainLTI:
             for name, (topic, kind, path) in zip(names[0], state, strict=False)
         ),
         tuple(
-            Signal(name, topic, path, steady=0.1, scale=0.9, type=kind, max_hold=0.5)
+            Signal(name, topic, path, steady=0.1, scale=0.9, type=kind, max_hold=max_hold)
             for name, (topic, kind, path) in zip(names[1], control, strict=False)
         ),
     )

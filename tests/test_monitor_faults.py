@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -483,11 +482,7 @@ def test_reload_reads_the_file_again_or_says_why_not(world: World, tmp_path: Pat
 
 
 def test_a_control_that_is_sent_once_and_a_latched_alarm_outlive_a_reload(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    signals = replace(model.signals, controls=tuple(replace(c, max_hold=None) for c in model.signals.controls))
-    model = UncertainLTI(
-        model.A, model.B, model.dA, model.dB, v=model.v, signals=signals, sampling=model.sampling, alarm=Alarm(2, 3)
-    )
+    model = by_hand(max_hold=None, alarm=Alarm(2, 3))
     path = saved(model, tmp_path)
     mode_type = {"enable": "/machine/mode data == 3", "enable_type": "std_msgs/msg/UInt8"}
     process = world.monitor(path, latch=True, **mode_type)
@@ -606,9 +601,7 @@ def test_an_alarm_takes_a_snapshot_when_asked_to(world: World, tmp_path: Path) -
 
 def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(world: World, tmp_path: Path) -> None:
     folder = tmp_path / "snapshots"
-    model = by_hand()
-    signals = replace(model.signals, controls=tuple(replace(c, max_hold=None) for c in model.signals.controls))
-    model = UncertainLTI(model.A, model.B, model.dA, model.dB, v=model.v, signals=signals, sampling=model.sampling)
+    model = by_hand(max_hold=None)
     path = saved(model, tmp_path)
     options: dict[str, Any] = {"snapshot.on_alarm": True, "snapshot.after": 0.1, "snapshot.seconds": 1.0}
     world.monitor(path, **{"snapshot.folder": str(folder)}, **options)

@@ -95,18 +95,18 @@ class _Output:
         self.listeners = self.publisher.get_subscription_count()
 
 
-def _told(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
+def _failures_noted(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
     """A transition whose unforeseen errors are counted and logged; rclpy on its own passes over them in silence."""
 
     @wraps(transition)
-    def told(node: EnvelopeMonitorNode, state: LifecycleState) -> TransitionCallbackReturn:
+    def noting(node: EnvelopeMonitorNode, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             return transition(node, state)
         except Exception as error:
             node.note_failure(f"in {transition.__name__}", error)
             return TransitionCallbackReturn.ERROR
 
-    return told
+    return noting
 
 
 class EnvelopeMonitorNode(LifecycleNode):
@@ -274,7 +274,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             response.success = False
             return response
 
-    @_told
+    @_failures_noted
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load and check the model, and offer the outputs."""
         path = str(self.get_parameter("model").value)
@@ -326,7 +326,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._marks = {mark: struct.pack(f"<{n}d", *[mark] * n) for mark in (0.0, 1.0)}
         self._no_mark = struct.pack(f"<{n}d", *[_NAN] * n)
 
-    @_told
+    @_failures_noted
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start with no sample and no verdict, and subscribe."""
         assert self.watch is not None
@@ -344,21 +344,21 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._beat()
         return result
 
-    @_told
+    @_failures_noted
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; no heartbeat comes from now on."""
         self._unsubscribe()
         self.get_logger().info("no longer active: no verdicts are given")
         return super().on_deactivate(state)
 
-    @_told
+    @_failures_noted
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget the model."""
         result = super().on_cleanup(state)
         self._put_away()
         return result
 
-    @_told
+    @_failures_noted
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Put everything away."""
         result = super().on_shutdown(state)
@@ -452,7 +452,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _take(self, watch: Watch, topic: str, data: bytes) -> None:
         # The clock's own call makes three objects; without simulated time it says the same.
-        arrival = self._clock.now().nanoseconds if self._simulated else time.time_ns()
+        arrival = self._arrival()
         now = time.monotonic()
         alarms, alarm = watch.alarms, watch.alarm
         verdicts, opened = watch.take(topic, arrival, data, now)
@@ -504,12 +504,17 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     # --- messages that come in order and complete ---
 
+    def _arrival(self) -> int:
+        """The time at which a message comes, ns."""
+        nanoseconds: int = self._clock.now().nanoseconds if self._simulated else time.time_ns()
+        return nanoseconds
+
     def _pass_by(self, topic: str, data: bytes) -> bool:
         """Take a message of the enable condition's own topic that says what is known, beside compiled code at work."""
         assert self.watch is not None
         now = time.monotonic()
         try:
-            arrival = self._clock.now().nanoseconds if self._simulated else time.time_ns()
+            arrival = self._arrival()
             if not self.watch.tells_nothing_new(topic, data, now):
                 return False
         except Exception:  # the watch meets the same error

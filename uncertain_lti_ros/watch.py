@@ -12,6 +12,7 @@ from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.sampler import Sampler, Status, all_finite, to_ns
 from uncertain_lti.signals import FieldPath, TypeFields
+from uncertain_lti.wording import shortlist
 from uncertain_lti_ros.arming import Arming, Condition
 from uncertain_lti_ros.layout import MessageReader, Plan, UnreadableError
 
@@ -479,9 +480,7 @@ class Watch:
             if period.statuses[status]:
                 which = ""
                 if status is Status.MISSING:
-                    names = self.lacking(period.counters)
-                    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-                    which = f" ({', '.join(names[:_SHOWN])}{more})"
+                    which = f" ({shortlist(self.lacking(period.counters), _SHOWN)})"
                 complaints.append(f"{period.statuses[status]} samples without a verdict: {WHY[status]}{which}")
         dropped = sum(count for status, count in period.statuses.items() if status.dropped)
         if dropped:
