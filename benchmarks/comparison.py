@@ -29,7 +29,7 @@ if not any("uncertain_lti" in str(p) for p in sys.path):
 from tanks import Tanks  # noqa: E402
 
 from uncertain_lti import OperatingPoint, Transient, fit, read_transients  # noqa: E402
-from uncertain_lti.errors import FitError  # noqa: E402
+from uncertain_lti.base.errors import FitError  # noqa: E402
 from uncertain_lti.validation import cut  # noqa: E402
 
 Array = np.ndarray

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.bag import Bag, group_recordings
-from uncertain_lti.errors import BagError, FitError, SignalError
+from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.identification.cluster import DaskFleet
 from uncertain_lti.identification.diagnosis import too_few

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 from mcap.records import Schema
 
 from uncertain_lti.bag_files import listed_parts, natural, os_error, parts_of, stem_and_index
-from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.mcap_index import outline
 from uncertain_lti.mcap_records import Block, Contents, count, messages, read_block, scan
 from uncertain_lti.message_types import Definition, define, header_stamp_ns, normal_name, undefined

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from uncertain_lti.errors import BagError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.files import MAGIC, kind_of
 from uncertain_lti.wording import shortlist
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import FitError
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.intervals import cluster_size, rate_interval
 from uncertain_lti.model import Alarm
 from uncertain_lti.validation import Part, Validation, borrowed_margin, rising

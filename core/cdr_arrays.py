@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import normalize_fieldname
 
-from uncertain_lti.errors import BagError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.message_types import CODES, Definition, header_stamp_ns
 from uncertain_lti.signals import NORM, Derived, FieldPath
 

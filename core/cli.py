@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from uncertain_lti import __version__
-from uncertain_lti.errors import BagError, FitError, ModelError, SignalError, UncertainLTIError
+from uncertain_lti.base.errors import BagError, FitError, ModelError, SignalError, UncertainLTIError
 from uncertain_lti.progress import Progress
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from uncertain_lti.errors import BagError
+from uncertain_lti.base.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of an MCAP recording."""

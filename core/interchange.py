@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import ModelError, SignalError
+from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.files import whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.signals import Signal, SignalMap

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from uncertain_lti.errors import ModelError
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.files import may_replace, whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.signals import Signal

@@ -24,8 +24,8 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from uncertain_lti.bag_files import os_error
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.cdr_arrays import SLACK, numbers_at
-from uncertain_lti.errors import BagError
 from uncertain_lti.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, parse, walk
 
 Integers = NDArray[np.int64]

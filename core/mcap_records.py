@@ -34,7 +34,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics
 
 from uncertain_lti.bag_files import not_mcap, os_error
-from uncertain_lti.errors import BagError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.files import MAGIC
 
 try:

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
-from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.signals import FieldType
 
 _LARGEST_SCHEMA = 1 << 20  # bytes

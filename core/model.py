@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import ModelError, SignalError
+from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.files import kind_of, whole_file
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.signals import Signal, SignalMap

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import ModelError
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.sampler import Status, Step

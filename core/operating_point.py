@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import TransientError
+from uncertain_lti.base.errors import TransientError
 from uncertain_lti.signals import Signal
 
 Array = NDArray[np.float64]

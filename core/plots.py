@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import ModelError
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.files import whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts

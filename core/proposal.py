@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.bag import Bag, TopicFacts, describe, group_recordings
 from uncertain_lti.bag_arrays import read_columns
+from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cdr_arrays import RepeatedNamesError
-from uncertain_lti.errors import BagError, SignalError
 from uncertain_lti.identification.noise import NOISE, predicted
 from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
 from uncertain_lti.operating_point import resolve_auto

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.bag import Bag, group_recordings
 from uncertain_lti.bag_arrays import Progress, in_reach, read_columns
+from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cdr_arrays import RepeatedNamesError
-from uncertain_lti.errors import BagError, SignalError
 from uncertain_lti.message_types import header_stamp_ns
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.operating_point import resolve_auto

@@ -15,7 +15,7 @@ from typing import Any
 
 from uncertain_lti.bag import Bag
 from uncertain_lti.bag_arrays import Progress
-from uncertain_lti.errors import BagError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.mcap_records import Contents
 from uncertain_lti.reading import Stream, read_stream
 from uncertain_lti.signals import SignalMap

@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import SignalError
+from uncertain_lti.base.errors import SignalError
 from uncertain_lti.signals import FieldPath, SignalMap
 from uncertain_lti.wording import plural
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple
 
-from uncertain_lti.errors import SignalError
+from uncertain_lti.base.errors import SignalError
 from uncertain_lti.files import kind_of
 from uncertain_lti.wording import meant, plural
 

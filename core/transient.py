@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import TransientError
+from uncertain_lti.base.errors import TransientError
 from uncertain_lti.sampler import Status, median_step_ns, to_ns
 from uncertain_lti.signals import SignalMap
 from uncertain_lti.wording import plural

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import ModelError
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.mcap_writer import INDEX_ENTRY, MESSAGE_HEAD
 
 VECTOR_TYPE, FLAG_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"

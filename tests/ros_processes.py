@@ -33,7 +33,7 @@ PATIENCE = 60.0  # s; costs nothing where all is well
 MONITOR = "/envelope_monitor"
 _COMMANDS = """
 import argparse, sys
-from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti_ros import {0} as command
 parser = argparse.ArgumentParser()
 command.add_arguments(parser)

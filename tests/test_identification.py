@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
-from uncertain_lti.errors import FitError
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import formulation, passes, solvers, working_set
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import assemble

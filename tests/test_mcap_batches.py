@@ -18,7 +18,7 @@ from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 import uncertain_lti.mcap_batches
 from uncertain_lti.bag import Bag
 from uncertain_lti.bag_arrays import read_columns
-from uncertain_lti.errors import BagError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.reading import Stream, read_stream, read_stream_by_message
 from uncertain_lti.signals import FieldPath, Signal, SignalMap
 

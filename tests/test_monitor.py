@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
-from uncertain_lti.errors import ModelError
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model import Alarm, Domain
 from uncertain_lti.sampler import Sampler, Status, Step
 from uncertain_lti.signals import Signal

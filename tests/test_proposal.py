@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import SignalMap, fit, read_transients
+from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli import main
-from uncertain_lti.errors import BagError, FitError
 from uncertain_lti.proposal import LONGEST_ARRAY, _role, propose
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"

@@ -29,7 +29,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from test_sampler import Reference, Sent, cases
 
-from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.reading import read_for_model, read_transients, unused
 from uncertain_lti.sampler import Status

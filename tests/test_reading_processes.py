@@ -16,7 +16,7 @@ from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
 import uncertain_lti.reading_processes
 from uncertain_lti.bag import group_recordings
-from uncertain_lti.errors import BagError, SignalError
+from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.reading import read_transients
 from uncertain_lti.reading_processes import processes_for
 from uncertain_lti.signals import Signal, SignalMap
@@ -115,7 +115,7 @@ def test_interrupted_it_leaves_no_process_and_no_traceback_of_theirs(tmp_path: P
 SCRIPT = """
     import sys, threading, time
     import uncertain_lti.reading_processes as side
-    from uncertain_lti.errors import BagError
+    from uncertain_lti.base.errors import BagError
     from uncertain_lti.reading import read_transients
     from uncertain_lti.signals import Signal, SignalMap
 

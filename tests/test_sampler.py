@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti.errors import SignalError
+from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampler import BUFFERED_MESSAGES, Sampler, Status, Step, median_step_ns, resolve, to_ns
 from uncertain_lti.signals import Signal, SignalMap
 

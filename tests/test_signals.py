@@ -16,7 +16,7 @@ from bag_writer import JAZZY
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from uncertain_lti.errors import SignalError
+from uncertain_lti.base.errors import SignalError
 from uncertain_lti.message_types import define
 from uncertain_lti.signals import FieldPath, FieldType, Signal, SignalMap, TypeFields, numeric_paths
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti.errors import TransientError
+from uncertain_lti.base.errors import TransientError
 from uncertain_lti.sampler import Sampler, Status
 from uncertain_lti.signals import Signal, SignalMap
 from uncertain_lti.transient import Transient

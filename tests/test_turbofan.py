@@ -10,7 +10,7 @@ pytest.importorskip("scipy", reason="scipy, which integrates the turbofan, is no
 
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.bag import Bag
-from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
 from uncertain_lti.plants.turbofan import CONTROLS, STATES, Engine, GasPathSolver, Health, engine
 from uncertain_lti.plants.turbofan_components import P_STANDARD, T_STANDARD

@@ -11,9 +11,9 @@ from scipy import stats
 from tanks import DT, Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.calibration import calibrate, detection
 from uncertain_lti.cli import main
-from uncertain_lti.errors import FitError
 from uncertain_lti.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.model import Alarm
 from uncertain_lti.validation import Part, _rest, cut, judge, leave_out_cheaply, validate, validate_model

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from uncertain_lti.errors import ModelError, SignalError
+from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.signals import FieldPath
 
 _OPERATORS: Mapping[str, Callable[[float, float], bool]] = {

@@ -30,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from uncertain_lti.errors import ModelError, UncertainLTIError
+from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdict
 from uncertain_lti.signals import FieldPath

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any, Literal
 
-from uncertain_lti.errors import SignalError
+from uncertain_lti.base.errors import SignalError
 from uncertain_lti.signals import FieldType
 
 _ARRAY = re.compile(r"(?P<element>[^\[\]]+)\[(?P<count>\d+)\]")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from uncertain_lti.errors import ModelError
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.verdict_messages import NamedVector
 
 

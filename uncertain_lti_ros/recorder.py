@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from uncertain_lti.errors import BagError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti_ros.messages import definition, message_class
 from uncertain_lti_ros.process import Life, living
 from uncertain_lti_ros.subscriptions import MatchedSubscription

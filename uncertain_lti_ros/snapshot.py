@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Protocol
 
-from uncertain_lti.errors import ModelError, UncertainLTIError
+from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.mcap_writer import McapWriter
 from uncertain_lti.verdict_messages import FALSE, JUDGED, TOPICS, TRUE, NamedVector
 from uncertain_lti_ros.messages import definition

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from uncertain_lti.errors import ModelError
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.sampler import Sampler, Status, all_finite, to_ns

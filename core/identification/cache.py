@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import FitError
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.files import whole_file
 from uncertain_lti.identification.problem import BLOCK, Block, Columns, Problem
 

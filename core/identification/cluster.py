@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import FitError, UncertainLTIError
+from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
 

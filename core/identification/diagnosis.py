@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import FitError
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import excitation, sensors
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.excitation import quoted as _list

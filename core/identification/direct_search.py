@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import golden
 
-from uncertain_lti.errors import FitError
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.transient import Transient

@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import FitError
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.transient import Transient
 from uncertain_lti.wording import plural

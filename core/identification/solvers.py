@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import FitError
+from uncertain_lti.base.errors import FitError
 
 Array = NDArray[np.float64]
 Sense = NDArray[np.int32]

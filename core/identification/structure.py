@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import FitError
+from uncertain_lti.base.errors import FitError
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from math import pi, sqrt
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
 from uncertain_lti.plants.turbofan_components import (
     P_STANDARD,

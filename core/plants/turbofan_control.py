@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.plants.turbofan import Engine, GasPath, GasPathSolver, Health, engine
 from uncertain_lti.plants.turbofan_components import T_STANDARD

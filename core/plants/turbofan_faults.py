@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.errors import UncertainLTIError
+from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants.turbofan import CONTROLS, STATES, Health
 
 Array = NDArray[np.float64]
