@@ -22,7 +22,7 @@ from uncertain_lti import __version__
 from uncertain_lti.bag import Bag
 from uncertain_lti.bag_arrays import Progress
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.files import whole_file
+from uncertain_lti.base.files import whole_file
 from uncertain_lti.mcap_copy import Copier, profile_of
 from uncertain_lti.mcap_records import Contents, scan
 from uncertain_lti.mcap_writer import McapWriter

@@ -237,7 +237,7 @@ def _budget(text: str) -> float:
 
 def _model_target(wish: str) -> Path:
     """Where a model goes; raises as `files.target`."""
-    from uncertain_lti.files import target
+    from uncertain_lti.base.files import target
 
     return target(wish, holds=b'"uncertain-lti/', kind="model file", example="machine.model.json")
 
@@ -305,7 +305,7 @@ def _topics(options: argparse.Namespace) -> int:
 
 
 def _init(options: argparse.Namespace) -> int:
-    from uncertain_lti.files import whole_file
+    from uncertain_lti.base.files import whole_file
     from uncertain_lti.proposal import propose
 
     output = options.output
@@ -332,7 +332,7 @@ def _init(options: argparse.Namespace) -> int:
 
 def _fit(options: argparse.Namespace) -> int:
     from uncertain_lti import fit, read_transients
-    from uncertain_lti.files import sha256
+    from uncertain_lti.base.files import sha256
     from uncertain_lti.report import fit_text, left_out_text, next_text, recording_text
     from uncertain_lti.validation import leave_out_cheaply
 
@@ -380,7 +380,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
     from contextlib import ExitStack
 
     from uncertain_lti.archive import fit_archive
-    from uncertain_lti.files import sha256
+    from uncertain_lti.base.files import sha256
     from uncertain_lti.report import archive_text, next_text
 
     if options.discard:

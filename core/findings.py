@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.bag import Bag
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.files import sha256, target
+from uncertain_lti.base.files import sha256, target
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.report import check_data, number

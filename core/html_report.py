@@ -19,7 +19,7 @@ from PIL import Image  # which matplotlib brings
 from uncertain_lti import plots
 from uncertain_lti.bag_arrays import Progress
 from uncertain_lti.base.errors import BagError, ModelError
-from uncertain_lti.files import whole_file
+from uncertain_lti.base.files import whole_file
 from uncertain_lti.findings import APART, CARE, NO, YES, shortened
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts

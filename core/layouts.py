@@ -12,7 +12,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.files import may_replace, whole_file
+from uncertain_lti.base.files import may_replace, whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.signals import Signal
 from uncertain_lti.verdict_messages import NODE

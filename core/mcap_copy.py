@@ -16,7 +16,7 @@ from mcap.records import Channel, Header, Schema
 
 from uncertain_lti.bag_files import os_error
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.files import MAGIC
+from uncertain_lti.base.files import MAGIC
 from uncertain_lti.mcap_records import CHUNK, MESSAGE, RECORD, Block, Contents, inflate, parse, walk
 from uncertain_lti.mcap_writer import INDEX_ENTRY, McapWriter
 

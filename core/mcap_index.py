@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
 from uncertain_lti.bag_files import os_error
-from uncertain_lti.files import MAGIC
+from uncertain_lti.base.files import MAGIC
 from uncertain_lti.mcap_records import (
     CHUNK,
     FOOTER_SIZE,

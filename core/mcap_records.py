@@ -35,7 +35,7 @@ from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistic
 
 from uncertain_lti.bag_files import not_mcap, os_error
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.files import MAGIC
+from uncertain_lti.base.files import MAGIC
 
 try:
     from isal.isal_zlib import crc32 as crc32

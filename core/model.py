@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.errors import ModelError, SignalError
-from uncertain_lti.files import kind_of, whole_file
+from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.signals import Signal, SignalMap
 from uncertain_lti.transient import Transient

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.files import whole_file
+from uncertain_lti.base.files import whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.transient import Transient

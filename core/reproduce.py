@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from uncertain_lti.files import whole_file
+from uncertain_lti.base.files import whole_file
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.model import UncertainLTI

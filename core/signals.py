@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.files import kind_of
+from uncertain_lti.base.files import kind_of
 from uncertain_lti.wording import meant, plural
 
 LONGEST_DELAY = 1_000_000

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
 
+from uncertain_lti.base.files import whole_file
 from uncertain_lti.cli import main
-from uncertain_lti.files import whole_file
 from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.progress import Progress
 

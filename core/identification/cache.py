@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.files import whole_file
+from uncertain_lti.base.files import whole_file
 from uncertain_lti.identification.problem import BLOCK, Block, Columns, Problem
 
 Array = NDArray[np.float64]
