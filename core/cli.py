@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import BagError, FitError, ModelError, SignalError, UncertainLTIError
-from uncertain_lti.progress import Progress
+from uncertain_lti.base.progress import Progress
 
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI

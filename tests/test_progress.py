@@ -14,9 +14,9 @@ import pytest
 from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti.base.files import whole_file
+from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli import main
 from uncertain_lti.identification.cache import CacheWriter
-from uncertain_lti.progress import Progress
 
 CLI = [sys.executable, "-m", "uncertain_lti.cli"]
 
