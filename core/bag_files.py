@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC, kind_of
-from uncertain_lti.wording import shortlist
 
 _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.mcap")
 

@@ -246,7 +246,7 @@ class _Parser(argparse.ArgumentParser):
     """Names the nearest command, option or choice in place of a misspelt one."""
 
     def error(self, message: str) -> NoReturn:
-        from uncertain_lti.wording import meant
+        from uncertain_lti.base.english import meant
 
         if match := re.search(r"invalid choice: '?(.*?)'? \(choose from (.*)\)", message):
             message += meant(match[1], re.findall(r"[\w-]+", match[2]))
@@ -438,9 +438,9 @@ def _local_cluster(dask: Any, workers: int) -> Any:
 def _check(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.bag import group_recordings
+    from uncertain_lti.base.english import plural
     from uncertain_lti.reading import read_with_decisions
     from uncertain_lti.report import check_data, check_text
-    from uncertain_lti.wording import plural
 
     model = _named(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
@@ -570,8 +570,8 @@ def _reproduce(options: argparse.Namespace) -> int:
 def _named(model: str) -> UncertainLTI:
     """The model of a file, or the paper's by its name."""
     from uncertain_lti import UncertainLTI
+    from uncertain_lti.base.english import meant
     from uncertain_lti.plants.leibov import leibov2006
-    from uncertain_lti.wording import meant
 
     if not os.path.exists(model):
         if model == "leibov2006":

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from uncertain_lti import __version__
 from uncertain_lti.bag import Bag
+from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import sha256, target
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.report import check_data, number
-from uncertain_lti.wording import plural, times
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
 """Mean width of the one-step bounds as a share of the state's own range, in the recordings or in the fit."""

@@ -18,13 +18,13 @@ from PIL import Image  # which matplotlib brings
 
 from uncertain_lti import plots
 from uncertain_lti.bag_arrays import Progress
+from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.findings import APART, CARE, NO, YES, shortened
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.report import beyond, number
-from uncertain_lti.wording import plural, shortlist
 
 MOST_DRAWN = 8
 """Recordings with figures of their own; those with most violations."""

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.signals import Signal, SignalMap
-from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.sampler import Status, Step
 from uncertain_lti.transient import Transient
-from uncertain_lti.wording import plural, times
 
 Array = NDArray[np.float64]
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from uncertain_lti.bag import Bag, TopicFacts, describe, group_recordings
 from uncertain_lti.bag_arrays import read_columns
+from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cdr_arrays import RepeatedNamesError
 from uncertain_lti.identification.noise import NOISE, predicted
 from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.signals import FieldPath, Signal
-from uncertain_lti.wording import plural, shortlist
 
 Array = NDArray[np.float64]
 Iterate = Callable[[Iterable[object], int], Iterable[object]]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.bag import Bag, group_recordings
 from uncertain_lti.bag_arrays import Progress, in_reach, read_columns
+from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cdr_arrays import RepeatedNamesError
 from uncertain_lti.message_types import header_stamp_ns
@@ -23,7 +24,6 @@ from uncertain_lti.sampler import Sampler, Status, resolve
 from uncertain_lti.sampler_arrays import Decisions, Samples, decided, sample_arrays
 from uncertain_lti.signals import FieldPath, SignalMap, UncarriedTopicError
 from uncertain_lti.transient import Transient
-from uncertain_lti.wording import meant
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 

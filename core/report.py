@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.english import plural, times
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.reading import unused
 from uncertain_lti.transient import Transient
-from uncertain_lti.wording import plural, times
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.signals import FieldPath, SignalMap
-from uncertain_lti.wording import plural
 
 _TWO_PI = 2.0 * math.pi
 BUFFERED_MESSAGES = 10_000

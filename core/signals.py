@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, NamedTuple
 
+from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.files import kind_of
-from uncertain_lti.wording import meant, plural
 
 LONGEST_DELAY = 1_000_000
 """Samples by which a control may be delayed at most."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uncertain_lti.wording import plural
+from uncertain_lti.base.english import plural
 
 if TYPE_CHECKING:
     from uncertain_lti.model import UncertainLTI

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
@@ -24,7 +25,6 @@ from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import EnvelopeMonitor
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.transient import Transient
-from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from uncertain_lti.wording import plural, times
+from uncertain_lti.base.english import plural, times
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import excitation, sensors
 from uncertain_lti.identification.discard import Carriers
@@ -17,7 +18,6 @@ from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.transient import Transient
-from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 

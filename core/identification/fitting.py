@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.identification import formulation
 from uncertain_lti.identification.diagnosis import check_solvable, describe
@@ -25,7 +26,6 @@ from uncertain_lti.model import Alarm, Domain, Sampling, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.signals import FieldPath, Signal, SignalMap
 from uncertain_lti.transient import Transient
-from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 

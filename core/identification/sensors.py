@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.identification.excitation import quoted, successive, unexplained
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.signals import Signal
 from uncertain_lti.transient import Transient
-from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 

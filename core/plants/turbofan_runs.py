@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, JOINT_STATE, STATE_TOPIC
 from uncertain_lti.plants.turbofan import (
@@ -29,7 +30,6 @@ from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating
 from uncertain_lti.plants.turbofan_faults import KINDS, Fault
 from uncertain_lti.signals import Signal, SignalMap
 from uncertain_lti.transient import Transient
-from uncertain_lti.wording import plural
 
 Array = NDArray[np.float64]
 
