@@ -24,7 +24,7 @@ from recorded import JAZZY, Topic, message, write
 from uncertain_lti import fit, read_transients
 from uncertain_lti.archive import fit_archive
 from uncertain_lti.plants.leibov import leibov2006
-from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 BAGS = 64
 DT_NS = 25_000_000

@@ -48,7 +48,7 @@ from uncertain_lti.bag import Bag
 from uncertain_lti.bag_arrays import read_columns
 from uncertain_lti.mcap_records import crc32
 from uncertain_lti.reading import read_stream, read_transients, sample, sample_by_message
-from uncertain_lti.signals import FieldPath, Signal, SignalMap
+from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap
 
 PATHS = {
     "/joint_states": [f"{part}[{i}]" for part in ("position", "velocity") for i in range(12)],

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
     from uncertain_lti.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.reading import read_transients as read_transients
-    from uncertain_lti.signals import SignalMap as SignalMap
+    from uncertain_lti.signals.signal_map import SignalMap as SignalMap
     from uncertain_lti.transient import Transient as Transient
     from uncertain_lti.validation import validate as validate
 
@@ -22,7 +22,7 @@ __version__ = "0.1.0"
 _HOME = {
     "EnvelopeMonitor": "monitor",
     "OperatingPoint": "operating_point",
-    "SignalMap": "signals",
+    "SignalMap": "signals.signal_map",
     "Transient": "transient",
     "UncertainLTI": "model",
     "fit": "identification",

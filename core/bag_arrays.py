@@ -14,7 +14,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.cdr_arrays import FieldReader, Messages
 from uncertain_lti.mcap_batches import Batch, IndexMismatchError, batches
 from uncertain_lti.message_types import Definition
-from uncertain_lti.signals import FieldPath
+from uncertain_lti.signals.signal_map import FieldPath
 
 Integers = NDArray[np.int64]
 Progress = Callable[[Iterable[object], int], Iterable[object]]

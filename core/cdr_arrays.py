@@ -25,7 +25,7 @@ from rosbags.typesys.base import normalize_fieldname
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.message_types import CODES, Definition, header_stamp_ns
-from uncertain_lti.signals import NORM, Derived, FieldPath
+from uncertain_lti.signals.signal_map import NORM, Derived, FieldPath
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]

@@ -14,7 +14,7 @@ from xml.sax.saxutils import quoteattr
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import may_replace, whole_file
 from uncertain_lti.model import UncertainLTI
-from uncertain_lti.signals import Signal
+from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.verdict_messages import NODE
 
 BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"

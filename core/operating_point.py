@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.errors import TransientError
-from uncertain_lti.signals import Signal
+from uncertain_lti.signals.signal_map import Signal
 
 Array = NDArray[np.float64]
 

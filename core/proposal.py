@@ -20,7 +20,7 @@ from uncertain_lti.cdr_arrays import RepeatedNamesError
 from uncertain_lti.identification.noise import NOISE, predicted
 from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
 from uncertain_lti.operating_point import resolve_auto
-from uncertain_lti.signals import FieldPath, Signal
+from uncertain_lti.signals.signal_map import FieldPath, Signal
 
 Array = NDArray[np.float64]
 Iterate = Callable[[Iterable[object], int], Iterable[object]]

@@ -22,7 +22,7 @@ from uncertain_lti.model import UncertainLTI
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.sampler import Sampler, Status, resolve
 from uncertain_lti.sampler_arrays import Decisions, Samples, decided, sample_arrays
-from uncertain_lti.signals import FieldPath, SignalMap, UncarriedTopicError
+from uncertain_lti.signals.signal_map import FieldPath, SignalMap, UncarriedTopicError
 from uncertain_lti.transient import Transient
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]

@@ -18,7 +18,7 @@ from uncertain_lti.bag_arrays import Progress
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.mcap_records import Contents
 from uncertain_lti.reading import Stream, read_stream
-from uncertain_lti.signals import SignalMap
+from uncertain_lti.signals.signal_map import SignalMap
 
 WORTH_IT = 1 << 28
 """Bytes of recordings from which on processes that have to be started first save time."""

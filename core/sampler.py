@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.signals import FieldPath, SignalMap
+from uncertain_lti.signals.signal_map import FieldPath, SignalMap
 
 _TWO_PI = 2.0 * math.pi
 BUFFERED_MESSAGES = 10_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from uncertain_lti.signals import FieldType, TypeFields
+from uncertain_lti.signals.signal_map import FieldType, TypeFields
 
 _NO_SIGNALS = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _DEPTH = 8

@@ -235,7 +235,7 @@ def middleware() -> tuple[Any, Any, Any]:
 
 def read_messages(rng: random.Random, _: Path) -> str:
     """One damaged message after a few whole ones, by the layouts of the live node and by the middleware alone."""
-    from uncertain_lti.signals import FieldPath
+    from uncertain_lti.signals.signal_map import FieldPath
     from uncertain_lti_ros.layout import UnreadableError
 
     make_reader, fields, decoder = middleware()

@@ -29,7 +29,7 @@ from uncertain_lti.bag import Bag
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.message_types import Definition, define
 from uncertain_lti.reading import Stream, read_stream, read_stream_by_message
-from uncertain_lti.signals import FieldPath, Signal, SignalMap, numeric_paths
+from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap, numeric_paths
 
 SECOND = 10**9
 STEPS = "=" * 80

@@ -5,7 +5,7 @@ import pytest
 
 from uncertain_lti import OperatingPoint, SignalMap, Transient, fit
 from uncertain_lti.identification.diagnosis import remedies
-from uncertain_lti.signals import Signal
+from uncertain_lti.signals.signal_map import Signal
 
 A = np.array([[-1.0, 0.4], [0.3, -2.5]])
 B = np.array([[1.0, 0.2], [0.1, 2.0]])

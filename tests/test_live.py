@@ -19,7 +19,7 @@ from uncertain_lti.message_types import header_stamp_ns
 from uncertain_lti.model import Alarm, Domain, Sampling
 from uncertain_lti.monitor import Verdict
 from uncertain_lti.sampler import Sampler, Status
-from uncertain_lti.signals import FieldPath, Signal
+from uncertain_lti.signals.signal_map import FieldPath, Signal
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

@@ -20,7 +20,7 @@ from uncertain_lti.bag import Bag
 from uncertain_lti.bag_arrays import read_columns
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.reading import Stream, read_stream, read_stream_by_message
-from uncertain_lti.signals import FieldPath, Signal, SignalMap
+from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),))
 

@@ -13,7 +13,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model import Alarm, Domain
 from uncertain_lti.sampler import Sampler, Status, Step
-from uncertain_lti.signals import Signal
+from uncertain_lti.signals.signal_map import Signal
 
 
 def a_model(n: int, m: int, seed: int, **options: Any) -> UncertainLTI:

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.operating_point import STILL_BAND, STILL_SAMPLES, OperatingPoint, resolve_auto, still_stretches
-from uncertain_lti.signals import Signal
+from uncertain_lti.signals.signal_map import Signal
 
 NAN, INF = math.nan, math.inf
 number = st.floats(-1e6, 1e6)

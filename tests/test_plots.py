@@ -21,7 +21,7 @@ from uncertain_lti.plots import (
     utilisation_figure,
     width_budget,
 )
-from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 LONG = "x_$the$_total <pressure>\nbehind_the_high_pressure_compressor_état_"
 

@@ -19,7 +19,7 @@ from uncertain_lti.bag import group_recordings
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.reading import read_transients
 from uncertain_lti.reading_processes import processes_for
-from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))
 
@@ -117,7 +117,7 @@ SCRIPT = """
     import uncertain_lti.reading_processes as side
     from uncertain_lti.base.errors import BagError
     from uncertain_lti.reading import read_transients
-    from uncertain_lti.signals import Signal, SignalMap
+    from uncertain_lti.signals.signal_map import Signal, SignalMap
 
     def progress(items, total):
         print("reading", flush=True)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampler import BUFFERED_MESSAGES, Sampler, Status, Step, median_step_ns, resolve, to_ns
-from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 TICK = 10_000_000  # ns
 NAN, INF = math.nan, math.inf

@@ -14,7 +14,7 @@ from test_sampler import TICK, Sent, cases, loops
 
 from uncertain_lti.reading import Stream, sample_by_message
 from uncertain_lti.sampler_arrays import Samples, sample_arrays
-from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 
 def columns(signals: SignalMap, messages: Sequence[Sent]) -> dict[str, Any]:

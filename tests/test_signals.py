@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.message_types import define
-from uncertain_lti.signals import FieldPath, FieldType, Signal, SignalMap, TypeFields, numeric_paths
+from uncertain_lti.signals.signal_map import FieldPath, FieldType, Signal, SignalMap, TypeFields, numeric_paths
 
 NAN, INF = math.nan, math.inf
 

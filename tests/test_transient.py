@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.sampler import Sampler, Status
-from uncertain_lti.signals import Signal, SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.transient import Transient
 
 NAN, INF = math.nan, math.inf

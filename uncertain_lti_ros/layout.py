@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
-from uncertain_lti.signals import NORM, Derived, FieldPath, FieldType, TypeFields
+from uncertain_lti.signals.signal_map import NORM, Derived, FieldPath, FieldType, TypeFields
 
 _CODES = {
     "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
