@@ -12,10 +12,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from uncertain_lti.bag import Bag
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, STATE_TOPIC
 from uncertain_lti.plants.turbofan_faults import KINDS
 from uncertain_lti.plants.turbofan_runs import RECORDINGS, make_run
+from uncertain_lti.recordings.bag import Bag
 
 LEIBOV = {
     "leibov_fit": {"steps": 6000, "seed": 1, "fault_at": -1},

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.bag import Bag, group_recordings
 from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.identification.cluster import DaskFleet
@@ -23,6 +22,7 @@ from uncertain_lti.identification.working_set import InfeasibleError
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.reading import load_signals, read_stream, sample
+from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.sampler import resolve
 from uncertain_lti.signals.signal_map import SignalMap
 

@@ -260,7 +260,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _topics(options: argparse.Namespace) -> int:
-    from uncertain_lti.bag import Bag, describe
+    from uncertain_lti.recordings.bag import Bag, describe
     from uncertain_lti.report import number, table
 
     bag = Bag(options.bag)
@@ -437,9 +437,9 @@ def _local_cluster(dask: Any, workers: int) -> Any:
 
 def _check(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
-    from uncertain_lti.bag import group_recordings
     from uncertain_lti.base.english import plural
     from uncertain_lti.reading import read_with_decisions
+    from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import check_data, check_text
 
     model = _named(options.model)
@@ -474,9 +474,9 @@ def _check(options: argparse.Namespace) -> int:
 
 def _report(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
-    from uncertain_lti.bag import group_recordings
     from uncertain_lti.findings import findings, page_target
     from uncertain_lti.reading import read_for_model
+    from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import findings_text
 
     model = _named(options.model)
@@ -510,9 +510,9 @@ def _layout(options: argparse.Namespace) -> int:
 
 def _validate(options: argparse.Namespace) -> int:
     from uncertain_lti import UncertainLTI
-    from uncertain_lti.bag import group_recordings
     from uncertain_lti.calibration import calibrate
     from uncertain_lti.reading import read_for_model
+    from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import validation_text
     from uncertain_lti.validation import validate_model
 

@@ -180,10 +180,10 @@ def damaged_file(rng: random.Random) -> tuple[bytes, bool]:
 def read_file(rng: random.Random, folder: Path) -> str:
     """Every way in which a recording is read; returns what became of it."""
     from uncertain_lti import SignalMap
-    from uncertain_lti.bag import Bag, describe
     from uncertain_lti.base.errors import UncertainLTIError
     from uncertain_lti.cli import main
     from uncertain_lti.reading import read_stream, read_stream_by_message
+    from uncertain_lti.recordings.bag import Bag, describe
 
     path = folder / "damaged.mcap"
     data, checked = damaged_file(rng)

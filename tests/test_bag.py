@@ -52,8 +52,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from uncertain_lti.bag import Bag, RawMessage, describe, group_recordings, header_stamp_ns
 from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.recordings.bag import Bag, RawMessage, describe, group_recordings, header_stamp_ns
 from uncertain_lti.signals.signal_map import FieldPath, FieldType
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -15,10 +15,10 @@ from bag_writer import float64
 from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
 import uncertain_lti.reading_processes
-from uncertain_lti.bag import group_recordings
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.reading import read_transients
 from uncertain_lti.reading_processes import processes_for
+from uncertain_lti.recordings.bag import group_recordings
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))

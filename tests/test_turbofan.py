@@ -9,7 +9,6 @@ import pytest
 pytest.importorskip("scipy", reason="scipy, which integrates the turbofan, is not installed")
 
 from uncertain_lti import SignalMap, read_transients
-from uncertain_lti.bag import Bag
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
 from uncertain_lti.plants.turbofan import CONTROLS, STATES, Engine, GasPathSolver, Health, engine
@@ -28,6 +27,7 @@ from uncertain_lti.plants.turbofan_runs import (
     simulate,
     turbofan_signals,
 )
+from uncertain_lti.recordings.bag import Bag
 
 ROOT = Path(__file__).resolve().parents[1]
 LEVERS = (68.0, 64.0, 60.0, 50.0, 40.0, 25.0, 12.0)

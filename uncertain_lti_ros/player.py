@@ -21,8 +21,8 @@ from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from uncertain_lti.bag import Bag, RawMessage
 from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
+from uncertain_lti.recordings.bag import Bag, RawMessage
 from uncertain_lti.signals.signal_map import TypeFields
 from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.process import Life, living
