@@ -17,13 +17,13 @@ from typing import Any
 from PIL import Image  # which matplotlib brings
 
 from uncertain_lti import plots
-from uncertain_lti.bag_arrays import Progress
 from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.findings import APART, CARE, NO, YES, shortened
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
+from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.report import beyond, number
 
 MOST_DRAWN = 8
