@@ -294,7 +294,7 @@ def recorded_definition(kind: str) -> Any:
 
 def read_recorded(kind: str, paths: list[Any], messages: list[bytes]) -> tuple[int | None, bytes] | None:
     """Stamp and values of the last of these messages of a recording; None where it is left out, or names repeat."""
-    from uncertain_lti.cdr_arrays import NO_STAMP, SLACK, FieldReader, Messages, RepeatedNamesError
+    from uncertain_lti.recordings.cdr_arrays import NO_STAMP, SLACK, FieldReader, Messages, RepeatedNamesError
 
     ends = np.cumsum([len(data) for data in messages]) + SLACK
     begins = ends - [len(data) for data in messages]
