@@ -15,7 +15,7 @@ import pytest
 from bag_writer import Layout, float64
 from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
-import uncertain_lti.mcap_batches
+import uncertain_lti.recordings.mcap_batches
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.reading import Stream, read_stream, read_stream_by_message
 from uncertain_lti.recordings.bag import Bag
@@ -28,7 +28,7 @@ XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),)
 @pytest.fixture(autouse=True)
 def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that a short file has many."""
-    monkeypatch.setattr(uncertain_lti.mcap_batches, "_BATCH", 6000)
+    monkeypatch.setattr(uncertain_lti.recordings.mcap_batches, "_BATCH", 6000)
 
 
 def recording(folder: Path, compression: str, chunk_size: int) -> Path:
