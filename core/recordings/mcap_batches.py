@@ -24,9 +24,9 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, parse, walk
 from uncertain_lti.recordings.bag_files import os_error
 from uncertain_lti.recordings.cdr_arrays import SLACK, numbers_at
+from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, parse, walk
 
 Integers = NDArray[np.int64]
 

@@ -15,7 +15,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
 from uncertain_lti.base.files import MAGIC
-from uncertain_lti.mcap_records import (
+from uncertain_lti.recordings.bag_files import os_error
+from uncertain_lti.recordings.mcap_records import (
     CHUNK,
     FOOTER_SIZE,
     LARGEST_CHUNK,
@@ -28,7 +29,6 @@ from uncertain_lti.mcap_records import (
     parse,
     walk,
 )
-from uncertain_lti.recordings.bag_files import os_error
 
 _DATA_END_SIZE = RECORD.size + 4
 _FOOTER = struct.Struct("<QQI")  # begin of the summary, begin of its offsets, checksum
