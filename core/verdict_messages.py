@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.mcap_writer import INDEX_ENTRY, MESSAGE_HEAD
+from uncertain_lti.recordings.mcap_writer import INDEX_ENTRY, MESSAGE_HEAD
 
 VECTOR_TYPE, FLAG_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
 JUDGED = ("lower", "upper", "state", "utilisation")
