@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.message_types import define, jazzy_text
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.recordings.bag import Bag
@@ -29,6 +28,7 @@ from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of
 from uncertain_lti.recordings.mcap_records import Contents, scan
 from uncertain_lti.recordings.mcap_writer import McapWriter
+from uncertain_lti.recordings.message_types import define, jazzy_text
 from uncertain_lti.sampler_arrays import Decisions
 from uncertain_lti.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
 

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.message_types import header_stamp_ns
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.recordings.bag_arrays import Progress, in_reach, read_columns
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
+from uncertain_lti.recordings.message_types import header_stamp_ns
 from uncertain_lti.sampler import Sampler, Status, resolve
 from uncertain_lti.sampler_arrays import Decisions, Samples, decided, sample_arrays
 from uncertain_lti.signals.signal_map import FieldPath, SignalMap, UncarriedTopicError

@@ -287,7 +287,7 @@ def told_apart(kind: str, data: bytes) -> bool:
 
 @cache
 def recorded_definition(kind: str) -> Any:
-    from uncertain_lti.message_types import define, jazzy_text
+    from uncertain_lti.recordings.message_types import define, jazzy_text
 
     return define(kind, "ros2msg", jazzy_text(kind).encode())
 

@@ -14,10 +14,10 @@ import pytest
 from bag_writer import Layout, Message, Topic, cdr, float64, header, write
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
-from uncertain_lti.message_types import header_stamp_ns
 from uncertain_lti.model import Alarm, Domain, Sampling
 from uncertain_lti.monitor import Verdict
 from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.message_types import header_stamp_ns
 from uncertain_lti.sampler import Sampler, Status
 from uncertain_lti.signals.signal_map import FieldPath, Signal
 

@@ -17,9 +17,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti import Transient, cli
-from uncertain_lti.message_types import define
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, leibov2006, transient
 from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.message_types import define
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

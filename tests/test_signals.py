@@ -17,7 +17,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.message_types import define
+from uncertain_lti.recordings.message_types import define
 from uncertain_lti.signals.signal_map import FieldPath, FieldType, Signal, SignalMap, TypeFields, numeric_paths
 
 NAN, INF = math.nan, math.inf

@@ -15,10 +15,10 @@ from typing import Any, Literal, NamedTuple
 from mcap.records import Schema
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.message_types import Definition, define, header_stamp_ns, normal_name, undefined
 from uncertain_lti.recordings.bag_files import listed_parts, natural, os_error, parts_of, stem_and_index
 from uncertain_lti.recordings.mcap_index import outline
 from uncertain_lti.recordings.mcap_records import Block, Contents, count, messages, read_block, scan
+from uncertain_lti.recordings.message_types import Definition, define, header_stamp_ns, normal_name, undefined
 from uncertain_lti.signals.paths import signal_paths
 from uncertain_lti.signals.signal_map import FieldType, TypeFields
 

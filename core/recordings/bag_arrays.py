@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.message_types import Definition
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.cdr_arrays import FieldReader, Messages
 from uncertain_lti.recordings.mcap_batches import Batch, IndexMismatchError, batches
+from uncertain_lti.recordings.message_types import Definition
 from uncertain_lti.signals.signal_map import FieldPath
 
 Integers = NDArray[np.int64]

@@ -24,7 +24,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import normalize_fieldname
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.message_types import CODES, Definition, header_stamp_ns
+from uncertain_lti.recordings.message_types import CODES, Definition, header_stamp_ns
 from uncertain_lti.signals.signal_map import NORM, Derived, FieldPath
 
 Integers = NDArray[np.int64]
