@@ -23,7 +23,7 @@ from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.reading import load_signals, read_stream, sample
 from uncertain_lti.recordings.bag import Bag, group_recordings
-from uncertain_lti.sampler import resolve
+from uncertain_lti.sampling.sampler import resolve
 from uncertain_lti.signals.signal_map import SignalMap
 
 Recording = tuple[str, tuple[str, ...]]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES, Status, to_ns
+from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES, Status, to_ns
 from uncertain_lti.signals.signal_map import FieldPath, SignalMap
 
 Integers = NDArray[np.int64]

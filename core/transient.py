@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import TransientError
-from uncertain_lti.sampler import Status, median_step_ns, to_ns
+from uncertain_lti.sampling.sampler import Status, median_step_ns, to_ns
 from uncertain_lti.signals.signal_map import SignalMap
 
 Array = NDArray[np.float64]

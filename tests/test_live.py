@@ -18,7 +18,7 @@ from uncertain_lti.model import Alarm, Domain, Sampling
 from uncertain_lti.monitor import Verdict
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import header_stamp_ns
-from uncertain_lti.sampler import Sampler, Status
+from uncertain_lti.sampling.sampler import Sampler, Status
 from uncertain_lti.signals.signal_map import FieldPath, Signal
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")

@@ -20,7 +20,7 @@ from conftest import ROOT
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model import Alarm
 from uncertain_lti.monitor import Verdict
-from uncertain_lti.sampler import Status
+from uncertain_lti.sampling.sampler import Status
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

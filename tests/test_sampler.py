@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.sampler import BUFFERED_MESSAGES, Sampler, Status, Step, median_step_ns, resolve, to_ns
+from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, Sampler, Status, Step, median_step_ns, resolve, to_ns
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 TICK = 10_000_000  # ns
@@ -671,11 +671,11 @@ def test_what_has_been_forgotten_is_missing_and_not_replaced_by_something_older(
 def test_little_room_makes_values_missing_and_never_wrong(case: tuple[SignalMap, list[Sent]], room: int) -> None:
     signals, messages = case
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("uncertain_lti.sampler.BUFFERED_MESSAGES", room)
-        patch.setattr("uncertain_lti.sampler.KEPT_OVER_A_JUMP", 0)  # else the same messages are not kept either way
+        patch.setattr("uncertain_lti.sampling.sampler.BUFFERED_MESSAGES", room)
+        patch.setattr("uncertain_lti.sampling.sampler.KEPT_OVER_A_JUMP", 0)  # else the same messages are not kept either way
         cramped, sampler = run(signals, messages)
         assert all(len(topic.kept) <= room for topic in sampler._topics.values())
-        patch.setattr("uncertain_lti.sampler.BUFFERED_MESSAGES", 10_000)
+        patch.setattr("uncertain_lti.sampling.sampler.BUFFERED_MESSAGES", 10_000)
         roomy, _ = run(signals, messages)
     for mine, theirs in zip(only(cramped), only(roomy), strict=True):
         assert (mine.t_ns, mine.arrival_ns) == (theirs.t_ns, theirs.arrival_ns)

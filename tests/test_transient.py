@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import TransientError
-from uncertain_lti.sampler import Sampler, Status
+from uncertain_lti.sampling.sampler import Sampler, Status
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.transient import Transient
 

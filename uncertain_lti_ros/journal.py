@@ -9,7 +9,7 @@ from typing import Any
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.monitor import Verdict
-from uncertain_lti.sampler import Status
+from uncertain_lti.sampling.sampler import Status
 from uncertain_lti_ros.watch import OK, WARN, WHY, Watch
 
 _BURST, _REFILL = 6, 10.0  # lines on one matter at once, and s until there is one more

@@ -11,7 +11,7 @@ from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import EnvelopeMonitor, Verdict
-from uncertain_lti.sampler import Sampler, Status, all_finite, to_ns
+from uncertain_lti.sampling.sampler import Sampler, Status, all_finite, to_ns
 from uncertain_lti.signals.signal_map import FieldPath, TypeFields
 from uncertain_lti_ros.arming import Arming, Condition
 from uncertain_lti_ros.layout import MessageReader, Plan, UnreadableError
