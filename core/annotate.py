@@ -29,7 +29,7 @@ from uncertain_lti.recordings.mcap_copy import Copier, profile_of
 from uncertain_lti.recordings.mcap_records import Contents, scan
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
-from uncertain_lti.sampler_arrays import Decisions
+from uncertain_lti.sampling.sampler_arrays import Decisions
 from uncertain_lti.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
 
 METADATA = "uncertain_lti_check"
