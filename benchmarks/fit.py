@@ -31,8 +31,8 @@ from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Columns, Problem, assemble
 from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-from uncertain_lti.transient import Transient
 
 DT = 0.025
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
     from uncertain_lti.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.reading import read_transients as read_transients
+    from uncertain_lti.sampling.transient import Transient as Transient
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
-    from uncertain_lti.transient import Transient as Transient
     from uncertain_lti.validation import validate as validate
 
 __version__ = "0.1.0"
@@ -23,7 +23,7 @@ _HOME = {
     "EnvelopeMonitor": "monitor",
     "OperatingPoint": "operating_point",
     "SignalMap": "signals.signal_map",
-    "Transient": "transient",
+    "Transient": "sampling.transient",
     "UncertainLTI": "model",
     "fit": "identification",
     "read_transients": "reading",

@@ -18,8 +18,8 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-from uncertain_lti.transient import Transient
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.sampling.sampler import Status, Step
-from uncertain_lti.transient import Transient
+from uncertain_lti.sampling.transient import Transient
 
 Array = NDArray[np.float64]
 

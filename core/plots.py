@@ -21,7 +21,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
-from uncertain_lti.transient import Transient
+from uncertain_lti.sampling.transient import Transient
 
 ENVELOPE, RECORDED, VIOLATED, ALARM, NO_VERDICT = "#56B4E9", "#000000", "#D55E00", "#F0E442", "#999999"
 PIXELS = 1200

@@ -22,8 +22,8 @@ from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.message_types import header_stamp_ns
 from uncertain_lti.sampling.sampler import Sampler, Status, resolve
 from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, sample_arrays
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import FieldPath, SignalMap, UncarriedTopicError
-from uncertain_lti.transient import Transient
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 

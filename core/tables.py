@@ -14,7 +14,7 @@ from uncertain_lti.base.english import plural
 if TYPE_CHECKING:
     from uncertain_lti.model import UncertainLTI
     from uncertain_lti.monitor import Verdicts
-    from uncertain_lti.transient import Transient
+    from uncertain_lti.sampling.transient import Transient
 
 MOST = 12
 """Rows and columns of a matrix that are shown."""

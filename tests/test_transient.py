@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.sampling.sampler import Sampler, Status
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-from uncertain_lti.transient import Transient
 
 NAN, INF = math.nan, math.inf
 TICK = 10_000_000  # ns

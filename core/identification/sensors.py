@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from uncertain_lti.base.english import plural
 from uncertain_lti.identification.excitation import quoted, successive, unexplained
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal
-from uncertain_lti.transient import Transient
 
 Array = NDArray[np.float64]
 

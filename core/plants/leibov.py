@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.model import UncertainLTI
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-from uncertain_lti.transient import Transient
 
 Array = NDArray[np.float64]
 

@@ -28,8 +28,8 @@ from uncertain_lti.plants.turbofan import (
 )
 from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating_point, trim
 from uncertain_lti.plants.turbofan_faults import KINDS, Fault
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-from uncertain_lti.transient import Transient
 
 Array = NDArray[np.float64]
 
