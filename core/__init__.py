@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from uncertain_lti.identification import fit as fit
     from uncertain_lti.model import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
-    from uncertain_lti.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.reading import read_transients as read_transients
+    from uncertain_lti.sampling.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.sampling.transient import Transient as Transient
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
     from uncertain_lti.validation import validate as validate
@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "EnvelopeMonitor": "monitor",
-    "OperatingPoint": "operating_point",
+    "OperatingPoint": "sampling.operating_point",
     "SignalMap": "signals.signal_map",
     "Transient": "sampling.transient",
     "UncertainLTI": "model",

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import kind_of, whole_file
-from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 

@@ -16,10 +16,10 @@ from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.identification.noise import NOISE, predicted
 from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
-from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.recordings.bag import Bag, TopicFacts, describe, group_recordings
 from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
+from uncertain_lti.sampling.operating_point import resolve_auto
 from uncertain_lti.signals.signal_map import FieldPath, Signal
 
 Array = NDArray[np.float64]

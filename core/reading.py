@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.model import UncertainLTI
-from uncertain_lti.operating_point import resolve_auto
 from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.recordings.bag_arrays import Progress, in_reach, read_columns
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.message_types import header_stamp_ns
+from uncertain_lti.sampling.operating_point import resolve_auto
 from uncertain_lti.sampling.sampler import Sampler, Status, resolve
 from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, sample_arrays
 from uncertain_lti.sampling.transient import Transient

@@ -23,7 +23,7 @@ from uncertain_lti.intervals import (
 )
 from uncertain_lti.model import Alarm, UncertainLTI
 from uncertain_lti.monitor import EnvelopeMonitor
-from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 
 Array = NDArray[np.float64]

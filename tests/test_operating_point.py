@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from uncertain_lti.base.errors import TransientError
-from uncertain_lti.operating_point import STILL_BAND, STILL_SAMPLES, OperatingPoint, resolve_auto, still_stretches
+from uncertain_lti.sampling.operating_point import (
+    STILL_BAND,
+    STILL_SAMPLES,
+    OperatingPoint,
+    resolve_auto,
+    still_stretches,
+)
 from uncertain_lti.signals.signal_map import Signal
 
 NAN, INF = math.nan, math.inf

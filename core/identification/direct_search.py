@@ -26,7 +26,7 @@ from scipy.optimize import golden
 
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.model import UncertainLTI
-from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.operating_point import OperatingPoint
+from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 
 Array = NDArray[np.float64]

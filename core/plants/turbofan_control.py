@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.optimize import root
 
 from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti.operating_point import OperatingPoint
 from uncertain_lti.plants.turbofan import Engine, GasPath, GasPathSolver, Health, engine
 from uncertain_lti.plants.turbofan_components import T_STANDARD
+from uncertain_lti.sampling.operating_point import OperatingPoint
 
 Array = NDArray[np.float64]
 
