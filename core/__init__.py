@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from uncertain_lti.identification import fit as fit
     from uncertain_lti.model import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
-    from uncertain_lti.reading import read_transients as read_transients
     from uncertain_lti.sampling.operating_point import OperatingPoint as OperatingPoint
+    from uncertain_lti.sampling.reading import read_transients as read_transients
     from uncertain_lti.sampling.transient import Transient as Transient
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
     from uncertain_lti.validation import validate as validate
@@ -26,7 +26,7 @@ _HOME = {
     "Transient": "sampling.transient",
     "UncertainLTI": "model",
     "fit": "identification",
-    "read_transients": "reading",
+    "read_transients": "sampling.reading",
     "validate": "validation",
 }
 

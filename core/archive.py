@@ -20,9 +20,9 @@ from uncertain_lti.identification.problem import Additive, Columns, Problem, ass
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError
 from uncertain_lti.model import Alarm, UncertainLTI
-from uncertain_lti.reading import load_signals, read_stream, sample
 from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.sampling.operating_point import OperatingPoint
+from uncertain_lti.sampling.reading import load_signals, read_stream, sample
 from uncertain_lti.sampling.sampler import resolve
 from uncertain_lti.signals.signal_map import SignalMap
 

@@ -438,9 +438,9 @@ def _local_cluster(dask: Any, workers: int) -> Any:
 def _check(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.base.english import plural
-    from uncertain_lti.reading import read_with_decisions
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import check_data, check_text
+    from uncertain_lti.sampling.reading import read_with_decisions
 
     model = _named(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
@@ -475,9 +475,9 @@ def _check(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.findings import findings, page_target
-    from uncertain_lti.reading import read_for_model
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import findings_text
+    from uncertain_lti.sampling.reading import read_for_model
 
     model = _named(options.model)
     bags = group_recordings(options.bags)
@@ -511,9 +511,9 @@ def _layout(options: argparse.Namespace) -> int:
 def _validate(options: argparse.Namespace) -> int:
     from uncertain_lti import UncertainLTI
     from uncertain_lti.calibration import calibrate
-    from uncertain_lti.reading import read_for_model
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import validation_text
+    from uncertain_lti.sampling.reading import read_for_model
     from uncertain_lti.validation import validate_model
 
     model = UncertainLTI.load(options.model)

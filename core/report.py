@@ -13,7 +13,7 @@ from uncertain_lti.base.english import plural, times
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model import UncertainLTI
 from uncertain_lti.monitor import Verdicts
-from uncertain_lti.reading import unused
+from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
 
 Array = NDArray[np.float64]

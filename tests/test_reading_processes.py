@@ -16,9 +16,9 @@ from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
 import uncertain_lti.reading_processes
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.reading import read_transients
 from uncertain_lti.reading_processes import processes_for
 from uncertain_lti.recordings.bag import group_recordings
+from uncertain_lti.sampling.reading import read_transients
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))
@@ -116,7 +116,7 @@ SCRIPT = """
     import sys, threading, time
     import uncertain_lti.reading_processes as side
     from uncertain_lti.base.errors import BagError
-    from uncertain_lti.reading import read_transients
+    from uncertain_lti.sampling.reading import read_transients
     from uncertain_lti.signals.signal_map import Signal, SignalMap
 
     def progress(items, total):
