@@ -250,7 +250,7 @@ def read_transients(
 
 def _streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None, processes: int | None) -> list[Stream]:
     if processes != 1 and len(bags) > 1:
-        from uncertain_lti.reading_processes import processes_for, read_streams
+        from uncertain_lti.sampling.reading_processes import processes_for, read_streams
 
         processes = processes_for(bags) if processes is None else processes
         if processes != 1:
