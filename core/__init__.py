@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from uncertain_lti.identification import fit as fit
-    from uncertain_lti.model import UncertainLTI as UncertainLTI
+    from uncertain_lti.model.uncertain_lti import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
     from uncertain_lti.sampling.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.sampling.reading import read_transients as read_transients
@@ -24,7 +24,7 @@ _HOME = {
     "OperatingPoint": "sampling.operating_point",
     "SignalMap": "signals.signal_map",
     "Transient": "sampling.transient",
-    "UncertainLTI": "model",
+    "UncertainLTI": "model.uncertain_lti",
     "fit": "identification",
     "read_transients": "sampling.reading",
     "validate": "validation",

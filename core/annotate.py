@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.model import Alarm, UncertainLTI
+from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import Progress

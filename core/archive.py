@@ -19,7 +19,7 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, is_constant
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError
-from uncertain_lti.model import Alarm, UncertainLTI
+from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
 from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.reading import load_signals, read_stream, sample

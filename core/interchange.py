@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 Array = NDArray[np.float64]

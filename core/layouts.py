@@ -13,7 +13,7 @@ from xml.sax.saxutils import quoteattr
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import may_replace, whole_file
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.verdict_messages import NODE
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model import Alarm, UncertainLTI
+from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.sampler import Status, Step
 from uncertain_lti.sampling.transient import Transient

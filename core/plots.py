@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor import Verdicts
 from uncertain_lti.sampling.transient import Transient
 

@@ -12,7 +12,7 @@ import numpy as np
 from uncertain_lti.base.english import plural
 
 if TYPE_CHECKING:
-    from uncertain_lti.model import UncertainLTI
+    from uncertain_lti.model.uncertain_lti import UncertainLTI
     from uncertain_lti.monitor import Verdicts
     from uncertain_lti.sampling.transient import Transient
 

@@ -23,7 +23,7 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray, Int32
 
 from uncertain_lti import SignalMap, UncertainLTI
-from uncertain_lti.model import Alarm, Domain, Sampling
+from uncertain_lti.model.uncertain_lti import Alarm, Domain, Sampling
 from uncertain_lti.monitor import NUMBERS
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti_ros import course, envelope_monitor

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uncertain_lti.model import Alarm
+from uncertain_lti.model.uncertain_lti import Alarm
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

@@ -14,7 +14,7 @@ import pytest
 from bag_writer import Layout, Message, Topic, cdr, float64, header, write
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
-from uncertain_lti.model import Alarm, Domain, Sampling
+from uncertain_lti.model.uncertain_lti import Alarm, Domain, Sampling
 from uncertain_lti.monitor import Verdict
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import header_stamp_ns

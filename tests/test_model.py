@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.model import FORMAT, Alarm, Domain, Sampling, UncertainLTI
+from uncertain_lti.model.uncertain_lti import FORMAT, Alarm, Domain, Sampling, UncertainLTI
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model import Alarm, Domain
+from uncertain_lti.model.uncertain_lti import Alarm, Domain
 from uncertain_lti.sampling.sampler import Sampler, Status, Step
 from uncertain_lti.signals.signal_map import Signal
 

@@ -18,7 +18,7 @@ from bag_writer import Layout, Message, Topic, write
 from conftest import ROOT
 
 from uncertain_lti import UncertainLTI
-from uncertain_lti.model import Alarm
+from uncertain_lti.model.uncertain_lti import Alarm
 from uncertain_lti.monitor import Verdict
 from uncertain_lti.sampling.sampler import Status
 

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
-from uncertain_lti.model import Alarm
+from uncertain_lti.model.uncertain_lti import Alarm
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

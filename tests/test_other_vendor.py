@@ -16,7 +16,7 @@ pytest.importorskip("cyclonedds", reason="the cyclonedds wheel, which subscribes
 from ros_processes import World, open_world
 from test_live import by_hand, header_bag, offline, saved
 
-from uncertain_lti.model import Alarm
+from uncertain_lti.model.uncertain_lti import Alarm
 from uncertain_lti.sampling.sampler import Status
 
 # Cyclone DDS on loopback, where multicast may be missing: the peer is named.

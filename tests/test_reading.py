@@ -30,7 +30,7 @@ from mcap.reader import make_reader
 from test_sampler import Reference, Sent, cases
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.reading import read_for_model, read_transients, unused
 from uncertain_lti.sampling.sampler import Status
 from uncertain_lti.sampling.transient import Transient

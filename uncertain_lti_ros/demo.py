@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
-from uncertain_lti.model import Alarm
+from uncertain_lti.model.uncertain_lti import Alarm
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.plots import budget_figure, envelope_figure, matrices_figure, save, utilisation_figure
 from uncertain_lti.report import check_data, check_text, fit_text

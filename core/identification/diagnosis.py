@@ -16,7 +16,7 @@ from uncertain_lti.identification.excitation import quoted as _list
 from uncertain_lti.identification.noise import Memory, memory
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 
 Array = NDArray[np.float64]

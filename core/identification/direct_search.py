@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import golden
 
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 

@@ -22,7 +22,7 @@ from uncertain_lti.identification.problem import Additive, Columns, Problem, ass
 from uncertain_lti.identification.repair import repair
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError, Solution, WorkingSet
-from uncertain_lti.model import Alarm, Domain, Sampling, UncertainLTI
+from uncertain_lti.model.uncertain_lti import Alarm, Domain, Sampling, UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap

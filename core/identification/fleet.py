@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.passes import Candidate, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Columns, Partition, Problem
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 Array = NDArray[np.float64]
 T = TypeVar("T")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.identification.problem import Block, Partition
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.model import UncertainLTI
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.recordings.bag_arrays import Progress, in_reach, read_columns
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
