@@ -390,27 +390,27 @@ class UncertainLTI:
 
     def to_control(self, dt: float | None = None, recorded: bool = False) -> Any:
         """The nominal model as a `control.StateSpace`; see `interchange.to_control`."""
-        from uncertain_lti.interchange import to_control
+        from uncertain_lti.model.interchange import to_control
 
         return to_control(self, dt, recorded)
 
     @staticmethod
     def from_control(system: Any, **options: Any) -> UncertainLTI:
         """From a `control.StateSpace` and half-widths; see `interchange.from_control`."""
-        from uncertain_lti.interchange import from_control
+        from uncertain_lti.model.interchange import from_control
 
         return from_control(system, **options)
 
     def save_mat(self, path: str | os.PathLike[str]) -> None:
         """Write a MATLAB file; see `interchange.save_mat`."""
-        from uncertain_lti.interchange import save_mat
+        from uncertain_lti.model.interchange import save_mat
 
         save_mat(self, path)
 
     @staticmethod
     def load_mat(path: str | os.PathLike[str]) -> UncertainLTI:
         """Read a MATLAB file; see `interchange.load_mat`."""
-        from uncertain_lti.interchange import load_mat
+        from uncertain_lti.model.interchange import load_mat
 
         return load_mat(path)
 
