@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from uncertain_lti.identification import fit as fit
     from uncertain_lti.model.uncertain_lti import UncertainLTI as UncertainLTI
-    from uncertain_lti.monitor import EnvelopeMonitor as EnvelopeMonitor
+    from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor as EnvelopeMonitor
     from uncertain_lti.sampling.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.sampling.reading import read_transients as read_transients
     from uncertain_lti.sampling.transient import Transient as Transient
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "EnvelopeMonitor": "monitor",
+    "EnvelopeMonitor": "monitor.envelope_monitor",
     "OperatingPoint": "sampling.operating_point",
     "SignalMap": "signals.signal_map",
     "Transient": "sampling.transient",

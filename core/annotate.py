@@ -22,7 +22,7 @@ from uncertain_lti import __version__
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
-from uncertain_lti.monitor import Verdicts
+from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of

@@ -16,7 +16,7 @@ from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import sha256, target
 from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
-from uncertain_lti.monitor import Verdicts
+from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.report import check_data, number
 

@@ -22,7 +22,7 @@ from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.findings import APART, CARE, NO, YES, shortened
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor import Verdicts
+from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.report import beyond, number
 

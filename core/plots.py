@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor import Verdicts
+from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.sampling.transient import Transient
 
 ENVELOPE, RECORDED, VIOLATED, ALARM, NO_VERDICT = "#56B4E9", "#000000", "#D55E00", "#F0E442", "#999999"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor import Verdicts
+from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
 

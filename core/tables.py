@@ -13,7 +13,7 @@ from uncertain_lti.base.english import plural
 
 if TYPE_CHECKING:
     from uncertain_lti.model.uncertain_lti import UncertainLTI
-    from uncertain_lti.monitor import Verdicts
+    from uncertain_lti.monitor.envelope_monitor import Verdicts
     from uncertain_lti.sampling.transient import Transient
 
 MOST = 12

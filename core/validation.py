@@ -22,7 +22,7 @@ from uncertain_lti.intervals import (
     share_interval,
 )
 from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
-from uncertain_lti.monitor import EnvelopeMonitor
+from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 

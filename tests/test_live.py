@@ -15,7 +15,7 @@ from bag_writer import Layout, Message, Topic, cdr, float64, header, write
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
 from uncertain_lti.model.uncertain_lti import Alarm, Domain, Sampling
-from uncertain_lti.monitor import Verdict
+from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import header_stamp_ns
 from uncertain_lti.sampling.sampler import Sampler, Status

@@ -19,7 +19,7 @@ from conftest import ROOT
 
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model.uncertain_lti import Alarm
-from uncertain_lti.monitor import Verdict
+from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.sampling.sampler import Status
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
@@ -323,7 +323,7 @@ def test_errors_that_nobody_foresaw_are_counted_told_and_outlived(world: World, 
     code = """
 import os, sys
 os.environ["UNCERTAIN_LTI_PURE_PYTHON"] = "1"  # compiled code would judge most of the samples
-from uncertain_lti.monitor import EnvelopeMonitor
+from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti_ros import envelope_monitor
 judge, report, count = EnvelopeMonitor.judge, envelope_monitor.EnvelopeMonitorNode._report, [0, 0]
 def judging(*args, **named):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from uncertain_lti.base.english import plural
-from uncertain_lti.monitor import Verdict
+from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.sampling.sampler import Status
 from uncertain_lti_ros.watch import OK, WARN, WHY, Watch
 
