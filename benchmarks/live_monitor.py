@@ -75,7 +75,7 @@ def publish(n: int, rate: float, seconds: float, left: float, awaited: list[str]
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
 
-    from uncertain_lti.verdict_messages import NamedVector
+    from uncertain_lti.monitor.verdict_messages import NamedVector
 
     rclpy.init()
     node = rclpy.create_node("publisher")
@@ -139,7 +139,7 @@ def relay(n: int, names: list[str]) -> None:
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Bool
 
-    from uncertain_lti.verdict_messages import FALSE, NamedVector
+    from uncertain_lti.monitor.verdict_messages import FALSE, NamedVector
     from uncertain_lti_ros.process import spare_the_middleware
 
     spare_the_middleware()  # as the monitor does

@@ -23,6 +23,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.monitor.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of
@@ -30,7 +31,6 @@ from uncertain_lti.recordings.mcap_records import Contents, scan
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
 from uncertain_lti.sampling.sampler_arrays import Decisions
-from uncertain_lti.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
 
 METADATA = "uncertain_lti_check"
 """Name of the metadata record that says what was checked with what."""

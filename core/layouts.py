@@ -14,8 +14,8 @@ from xml.sax.saxutils import quoteattr
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import may_replace, whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.verdict_messages import NODE
 from uncertain_lti.signals.signal_map import Signal
-from uncertain_lti.verdict_messages import NODE
 
 BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"
 """Told apart by colour-blind people, on light and on dark ground (Okabe and Ito 2008)."""

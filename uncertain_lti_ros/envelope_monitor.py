@@ -33,8 +33,8 @@ from std_srvs.srv import Trigger
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdict
+from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti.signals.signal_map import FieldPath
-from uncertain_lti.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.arming import Condition
 from uncertain_lti_ros.course import Course, why_not

@@ -8,7 +8,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.verdict_messages import NamedVector
+from uncertain_lti.monitor.verdict_messages import NamedVector
 
 
 def sendable(names: Sequence[str], velocities: bool = False) -> NamedVector:

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Protocol
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
+from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TOPICS, TRUE, NamedVector
 from uncertain_lti.recordings.mcap_writer import McapWriter
-from uncertain_lti.verdict_messages import FALSE, JUDGED, TOPICS, TRUE, NamedVector
 from uncertain_lti_ros.messages import definition
 
 _OVERHEAD = 800  # bytes that one kept message takes beside its data, a verdict on it included
