@@ -379,8 +379,8 @@ def _fit(options: argparse.Namespace) -> int:
 def _fit_archive(options: argparse.Namespace, output: Path) -> int:
     from contextlib import ExitStack
 
-    from uncertain_lti.archive import fit_archive
     from uncertain_lti.base.files import sha256
+    from uncertain_lti.identification.archive import fit_archive
     from uncertain_lti.report import archive_text, next_text
 
     if options.discard:
