@@ -334,7 +334,7 @@ def _fit(options: argparse.Namespace) -> int:
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
     from uncertain_lti.report import fit_text, left_out_text, next_text, recording_text
-    from uncertain_lti.validation import leave_out_cheaply
+    from uncertain_lti.validation.left_out import leave_out_cheaply
 
     output = _model_target(options.output)
     if options.workers is not None and options.workers < 1:
@@ -514,7 +514,7 @@ def _validate(options: argparse.Namespace) -> int:
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import validation_text
     from uncertain_lti.sampling.reading import read_for_model
-    from uncertain_lti.validation import validate_model
+    from uncertain_lti.validation.left_out import validate_model
 
     model = UncertainLTI.load(options.model)
     sources = model.fit.get("sources", [])
