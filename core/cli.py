@@ -510,10 +510,10 @@ def _layout(options: argparse.Namespace) -> int:
 
 def _validate(options: argparse.Namespace) -> int:
     from uncertain_lti import UncertainLTI
-    from uncertain_lti.calibration import calibrate
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import validation_text
     from uncertain_lti.sampling.reading import read_for_model
+    from uncertain_lti.validation.calibration import calibrate
     from uncertain_lti.validation.left_out import validate_model
 
     model = UncertainLTI.load(options.model)

@@ -12,10 +12,10 @@ from tanks import DT, Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.calibration import calibrate, detection
 from uncertain_lti.cli import main
 from uncertain_lti.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.validation.calibration import calibrate, detection
 from uncertain_lti.validation.left_out import Part, _rest, cut, judge, leave_out_cheaply, validate, validate_model
 
 # --- intervals ---
@@ -472,7 +472,7 @@ def test_a_rule_that_sees_little_is_warned_of(folder, capsys, monkeypatch):
     model, target = str(folder / "m.json"), str(folder / "found.json")
     lines = {}
     for size in (1e-6, 1.0):  # a fault of next to nothing is not seen by a rule that keeps to the wish
-        monkeypatch.setattr("uncertain_lti.calibration.detection.__defaults__", (size,))
+        monkeypatch.setattr("uncertain_lti.validation.calibration.detection.__defaults__", (size,))
         capsys.readouterr()
         assert main(["validate", model, "--false-alarms", "2000", "--output", target]) == 0
         lines[size] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning:")]
