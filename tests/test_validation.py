@@ -13,9 +13,9 @@ from tanks import DT, Tanks
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli import main
-from uncertain_lti.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.model.uncertain_lti import Alarm
 from uncertain_lti.validation.calibration import calibrate, detection
+from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.validation.left_out import Part, _rest, cut, judge, leave_out_cheaply, validate, validate_model
 
 # --- intervals ---

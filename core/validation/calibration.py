@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.intervals import cluster_size, rate_interval
 from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.validation.intervals import cluster_size, rate_interval
 from uncertain_lti.validation.left_out import Part, Validation, borrowed_margin, rising
 
 Array = NDArray[np.float64]

@@ -14,17 +14,17 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.intervals import (
+from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
+from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
+from uncertain_lti.sampling.operating_point import OperatingPoint
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.validation.intervals import (
     cluster_size,
     discarding_bound,
     rate_interval,
     scenario_interval,
     share_interval,
 )
-from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
-from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.sampling.operating_point import OperatingPoint
-from uncertain_lti.sampling.transient import Transient
 
 Array = NDArray[np.float64]
 
