@@ -306,7 +306,7 @@ def _topics(options: argparse.Namespace) -> int:
 
 def _init(options: argparse.Namespace) -> int:
     from uncertain_lti.base.files import whole_file
-    from uncertain_lti.proposal import propose
+    from uncertain_lti.proposal.init import propose
 
     output = options.output
     if output is not None and os.path.exists(output):

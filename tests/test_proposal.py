@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli import main
-from uncertain_lti.proposal import LONGEST_ARRAY, _role, propose
+from uncertain_lti.proposal.init import LONGEST_ARRAY, _role, propose
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
 MS = 10**6
@@ -153,7 +153,7 @@ def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
 
 def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
     """The command and the first of two states fit the limit."""
-    import uncertain_lti.proposal as module
+    import uncertain_lti.proposal.init as module
 
     monkeypatch.setattr(module, "MOST_VALUES", 900)
 
