@@ -474,9 +474,9 @@ def _check(options: argparse.Namespace) -> int:
 
 def _report(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
-    from uncertain_lti.findings import findings, page_target
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.report import findings_text
+    from uncertain_lti.reports.findings import findings, page_target
     from uncertain_lti.sampling.reading import read_for_model
 
     model = _named(options.model)

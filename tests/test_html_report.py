@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.cli import main
-from uncertain_lti.findings import APART, CARE, MOST_EPISODES, NO, YES, findings
 from uncertain_lti.html_report import MOST_DRAWN, _first_screen, html_report
 from uncertain_lti.report import beyond
+from uncertain_lti.reports.findings import APART, CARE, MOST_EPISODES, NO, YES, findings
 from uncertain_lti.validation.left_out import validate
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;<img src=http://x/y.png onerror=alert(2)>\u202e\x07"
@@ -114,7 +114,7 @@ def test_what_was_fitted_proves_nothing(engine, capsys, tmp_path):
     model = fit(runs, additive="noise")
     model = model.with_(validation=validate(runs, additive="noise", full=model).to_dict())
     model.save(tmp_path / "v.model.json")
-    from uncertain_lti.findings import sha256
+    from uncertain_lti.reports.findings import sha256
 
     source = {"file": "elsewhere/run.mcap", "sha256": sha256(engine / "run.mcap")}
     model.with_(fit={**model.fit, "sources": [source]}).save(tmp_path / "v.model.json")
