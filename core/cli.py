@@ -261,7 +261,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _topics(options: argparse.Namespace) -> int:
     from uncertain_lti.recordings.bag import Bag, describe
-    from uncertain_lti.report import number, table
+    from uncertain_lti.reports.text import number, table
 
     bag = Bag(options.bag)
     facts = describe(bag, options.progress.iterate("reading"))
@@ -333,7 +333,7 @@ def _init(options: argparse.Namespace) -> int:
 def _fit(options: argparse.Namespace) -> int:
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
-    from uncertain_lti.report import fit_text, left_out_text, next_text, recording_text
+    from uncertain_lti.reports.text import fit_text, left_out_text, next_text, recording_text
     from uncertain_lti.validation.left_out import leave_out_cheaply
 
     output = _model_target(options.output)
@@ -381,7 +381,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
 
     from uncertain_lti.base.files import sha256
     from uncertain_lti.identification.archive import fit_archive
-    from uncertain_lti.report import archive_text, next_text
+    from uncertain_lti.reports.text import archive_text, next_text
 
     if options.discard:
         raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
@@ -439,7 +439,7 @@ def _check(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.base.english import plural
     from uncertain_lti.recordings.bag import group_recordings
-    from uncertain_lti.report import check_data, check_text
+    from uncertain_lti.reports.text import check_data, check_text
     from uncertain_lti.sampling.reading import read_with_decisions
 
     model = _named(options.model)
@@ -475,8 +475,8 @@ def _check(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.recordings.bag import group_recordings
-    from uncertain_lti.report import findings_text
     from uncertain_lti.reports.findings import findings, page_target
+    from uncertain_lti.reports.text import findings_text
     from uncertain_lti.sampling.reading import read_for_model
 
     model = _named(options.model)
@@ -511,7 +511,7 @@ def _layout(options: argparse.Namespace) -> int:
 def _validate(options: argparse.Namespace) -> int:
     from uncertain_lti import UncertainLTI
     from uncertain_lti.recordings.bag import group_recordings
-    from uncertain_lti.report import validation_text
+    from uncertain_lti.reports.text import validation_text
     from uncertain_lti.sampling.reading import read_for_model
     from uncertain_lti.validation.calibration import calibrate
     from uncertain_lti.validation.left_out import validate_model
@@ -582,7 +582,7 @@ def _named(model: str) -> UncertainLTI:
 
 
 def _info(options: argparse.Namespace) -> int:
-    from uncertain_lti.report import model_text
+    from uncertain_lti.reports.text import model_text
 
     model = _named(options.model)
     if options.json:

@@ -23,8 +23,8 @@ from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.bag_arrays import Progress
-from uncertain_lti.report import beyond, number
 from uncertain_lti.reports.findings import APART, CARE, NO, YES, shortened
+from uncertain_lti.reports.text import beyond, number
 
 MOST_DRAWN = 8
 """Recordings with figures of their own; those with most violations."""

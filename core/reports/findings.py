@@ -18,7 +18,7 @@ from uncertain_lti.base.files import sha256, target
 from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.report import check_data, number
+from uncertain_lti.reports.text import check_data, number
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
 """Mean width of the one-step bounds as a share of the state's own range, in the recordings or in the fit."""
