@@ -491,7 +491,7 @@ def _report(options: argparse.Namespace) -> int:
     facts = findings(model, options.model, checked, monitor.rule)
     _tell(options, findings_text(facts))
     if output is not None:
-        from uncertain_lti.html_report import html_report, write_page
+        from uncertain_lti.reports.html import html_report, write_page
 
         write_page(output, html_report(model, checked, facts, options.progress.iterate("drawing", "sections")))
         _tell(options, f"report written to {output}")
