@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, validate
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.reports.tables import MOST
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-from uncertain_lti.tables import MOST
 
 control = pytest.importorskip("control", reason="python-control is not installed")
 scipy_io = pytest.importorskip("scipy.io", reason="scipy is not installed")

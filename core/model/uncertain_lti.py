@@ -208,7 +208,7 @@ class UncertainLTI:
         return text + ")"
 
     def _repr_html_(self) -> str:
-        from uncertain_lti.tables import model_html
+        from uncertain_lti.reports.tables import model_html
 
         return model_html(self)
 

@@ -196,7 +196,7 @@ class Verdicts:
         return f"Verdicts({self.transient.name!r}: {plural(judged, 'verdict')}, {said}, {alarm})"
 
     def _repr_html_(self) -> str:
-        from uncertain_lti.tables import verdicts_html
+        from uncertain_lti.reports.tables import verdicts_html
 
         return verdicts_html(self)
 

@@ -180,7 +180,7 @@ class Transient:
         )
 
     def _repr_html_(self) -> str:
-        from uncertain_lti.tables import transient_html
+        from uncertain_lti.reports.tables import transient_html
 
         return transient_html(self)
 

@@ -121,7 +121,7 @@ class Validation:
         return f"Validation(left out one of {len(self.parts)} {self.kind}: {inside}, {whole} whole)"
 
     def _repr_html_(self) -> str:
-        from uncertain_lti.tables import validation_html
+        from uncertain_lti.reports.tables import validation_html
 
         return validation_html(self.to_dict(), repr(self))
 
