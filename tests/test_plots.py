@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.plots import (
+from uncertain_lti.reports.figures import (
     PIXELS,
     _Drawn,
     _Time,

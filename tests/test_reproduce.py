@@ -65,7 +65,7 @@ def test_the_direct_search_refuses_what_it_cannot_do():
 
 
 def test_the_published_model_can_be_checked_simulated_and_drawn(tmp_path):
-    from uncertain_lti.plots import envelope_figure, save
+    from uncertain_lti.reports.figures import envelope_figure, save
 
     model, run = leibov2006(), transient(300, 3)
     verdicts = EnvelopeMonitor(model).check(run)

@@ -21,7 +21,7 @@ from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
 from uncertain_lti.model.uncertain_lti import Alarm
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
-from uncertain_lti.plots import budget_figure, envelope_figure, matrices_figure, save, utilisation_figure
+from uncertain_lti.reports.figures import budget_figure, envelope_figure, matrices_figure, save, utilisation_figure
 from uncertain_lti.reports.text import check_data, check_text, fit_text
 from uncertain_lti.sampling.reading import read_for_model
 from uncertain_lti_ros.process import Life, living

@@ -16,13 +16,13 @@ from typing import Any
 
 from PIL import Image  # which matplotlib brings
 
-from uncertain_lti import plots
 from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.bag_arrays import Progress
+from uncertain_lti.reports import figures as plots
 from uncertain_lti.reports.findings import APART, CARE, NO, YES, shortened
 from uncertain_lti.reports.text import beyond, number
 
