@@ -501,7 +501,7 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _layout(options: argparse.Namespace) -> int:
-    from uncertain_lti.layouts import write_layouts
+    from uncertain_lti.reports.layouts import write_layouts
 
     for path in write_layouts(_named(options.model), options.foxglove, options.plotjuggler, options.topics):
         print(f"layout written to {path}")

@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 
 from uncertain_lti import fit, read_transients
 from uncertain_lti.cli import main
-from uncertain_lti.layouts import foxglove_layout, foxglove_text, plotjuggler_layout
+from uncertain_lti.reports.layouts import foxglove_layout, foxglove_text, plotjuggler_layout
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 ROOT = Path(__file__).resolve().parents[1]
