@@ -447,7 +447,7 @@ def _check(options: argparse.Namespace) -> int:
     bags = group_recordings(options.bags)
     copies: Sequence[Path | None] = [None] * len(bags)
     if options.write is not None:
-        from uncertain_lti.annotate import annotate, targets
+        from uncertain_lti.reports.annotate import annotate, targets
 
         copies = targets(options.write, bags)
     results = []

@@ -23,12 +23,12 @@ from test_sampler import cases, loops
 from test_sampler_arrays import columns
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
-from uncertain_lti.annotate import METADATA, annotate, targets
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli import main
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, NODE, TOPICS, TRUE, NamedVector, VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag, group_recordings
+from uncertain_lti.reports.annotate import METADATA, annotate, targets
 from uncertain_lti.sampling.reading import read_for_model, read_with_decisions
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.sampler_arrays import Decisions, decided
