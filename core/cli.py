@@ -557,7 +557,7 @@ def _validate(options: argparse.Namespace) -> int:
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    from uncertain_lti.reproduce import reproduce
+    from uncertain_lti.plants.reproduce import reproduce
 
     try:
         with options.progress.stage("reproducing") as step:
