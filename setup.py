@@ -82,7 +82,7 @@ setup(
     extras_require=extras,
     entry_points={
         "console_scripts": [
-            "uncertain-lti = uncertain_lti.cli:main",
+            "uncertain-lti = uncertain_lti.cli.main:main",
             "envelope_monitor = uncertain_lti_ros.programs:envelope_monitor",
             "plant = uncertain_lti_ros.programs:plant",
             "turbofan = uncertain_lti_ros.programs:turbofan",

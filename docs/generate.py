@@ -18,7 +18,7 @@ def write(folder: Path) -> None:
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
     """Name -> arguments of every command."""
-    from uncertain_lti.cli import _parser
+    from uncertain_lti.cli.main import _parser
 
     def subparsers(chosen: str) -> dict[str, argparse.ArgumentParser]:
         actions = _parser(chosen)._subparsers._group_actions  # argparse has no public way

@@ -181,7 +181,7 @@ def read_file(rng: random.Random, folder: Path) -> str:
     """Every way in which a recording is read; returns what became of it."""
     from uncertain_lti import SignalMap
     from uncertain_lti.base.errors import UncertainLTIError
-    from uncertain_lti.cli import main
+    from uncertain_lti.cli.main import main
     from uncertain_lti.recordings.bag import Bag, describe
     from uncertain_lti.sampling.reading import read_stream, read_stream_by_message
 

@@ -24,7 +24,7 @@ from test_sampler_arrays import columns
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, ModelError
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, NODE, TOPICS, TRUE, NamedVector, VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag, group_recordings
@@ -465,7 +465,7 @@ def test_a_full_disk_is_one_sentence(engine, tmp_path):
     limit = (
         "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); "
-        "from uncertain_lti.cli import main; sys.exit(main(sys.argv[1:]))"
+        "from uncertain_lti.cli.main import main; sys.exit(main(sys.argv[1:]))"
     )
     source = rewritten(folder / "bad.mcap", tmp_path / "in.mcap")
     arguments = ["check", str(folder / "m.model.json"), str(source), "--write", str(tmp_path / "out" / "")]
@@ -502,7 +502,7 @@ def test_memory_does_not_grow_with_the_recording(engine, tmp_path):
                 writer.add_message(camera, m.log_time, picture, m.publish_time)
         writer.finish()
     run = (
-        "import resource, sys; from uncertain_lti.cli import main; status = main(sys.argv[1:]); "
+        "import resource, sys; from uncertain_lti.cli.main import main; status = main(sys.argv[1:]); "
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024); sys.exit(status)"
     )
     peaks = []

@@ -197,7 +197,7 @@ def test_errors_of_workers_are_sentences(bags, cluster, tmp_path):
 
 
 def test_cache_of_the_command(bags, tmp_path, capsys):
-    from uncertain_lti.cli import main
+    from uncertain_lti.cli.main import main
 
     signals, paths = bags
     arguments = ["fit", *map(str, paths), "--signals", str(signals), "--output"]

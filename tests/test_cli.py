@@ -11,7 +11,7 @@ import pytest
 from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.plants.leibov import STATE_TOPIC
 
 
@@ -260,7 +260,7 @@ def test_recordings_that_break_readers(recordings, folder, capsys):
 
 def test_help_and_usage():
     """As a process: every command has --help; wrong usage is status 2."""
-    command = [sys.executable, "-m", "uncertain_lti.cli"]
+    command = [sys.executable, "-m", "uncertain_lti.cli.main"]
     environment = {**os.environ, "COLUMNS": "100"}
     whole = subprocess.run([*command, "--help"], capture_output=True, text=True, env=environment, timeout=60)
     assert whole.returncode == 0

@@ -39,7 +39,7 @@ PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if
 LANGUAGES = {"sh", "python", "yaml", "json", "text", "matlab", "{toctree}", "{include}", "{eval-rst}"}
 NOT_RUN = 14
 """Blocks that may stay unrun, all pages together."""
-PROGRAMS = {"uncertain-lti": "uncertain_lti.cli", "envelope_monitor": "uncertain_lti_ros.envelope_monitor"}
+PROGRAMS = {"uncertain-lti": "uncertain_lti.cli.main", "envelope_monitor": "uncertain_lti_ros.envelope_monitor"}
 
 
 @dataclass

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.reports.findings import APART, CARE, MOST_EPISODES, NO, YES, findings
 from uncertain_lti.reports.html import MOST_DRAWN, _first_screen, html_report
 from uncertain_lti.reports.text import beyond

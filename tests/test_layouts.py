@@ -9,7 +9,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from uncertain_lti import fit, read_transients
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.reports.layouts import foxglove_layout, foxglove_text, plotjuggler_layout
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 

@@ -16,7 +16,8 @@ from bag_writer import JAZZY, Message, Topic, cdr, float64, header, ramp, write
 from rosbags.highlevel import AnyReader
 from rosbags.typesys.store import Typestore
 
-from uncertain_lti import Transient, cli
+from uncertain_lti import Transient
+from uncertain_lti.cli.main import main as cli
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, leibov2006, transient
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import define

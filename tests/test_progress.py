@@ -15,10 +15,10 @@ from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.identification.cache import CacheWriter
 
-CLI = [sys.executable, "-m", "uncertain_lti.cli"]
+CLI = [sys.executable, "-m", "uncertain_lti.cli.main"]
 
 
 class Terminal(io.StringIO):

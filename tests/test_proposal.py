@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.proposal.init import LONGEST_ARRAY, _role, propose
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit, read_transients
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.sampling.reading import read_for_model
 
 RECORDINGS = [  # recordings, signals file, additive term that its noise asks for, are pure intervals infeasible

@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib", reason="matplotlib, which draws the figures, i
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.plants.leibov import leibov2006, transient
 

@@ -12,7 +12,7 @@ from tanks import DT, Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.cli import main
+from uncertain_lti.cli.main import main
 from uncertain_lti.model.uncertain_lti import Alarm
 from uncertain_lti.validation.calibration import calibrate, detection
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval

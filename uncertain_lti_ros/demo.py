@@ -140,7 +140,7 @@ def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> di
 
     subscription = life.node.create_subscription(JointState, _FLAGS, take, QoSProfile(depth=1000))
     monitor = [sys.executable, "-m", "uncertain_lti_ros.envelope_monitor", "--ros-args", "-p", f"model:={model}"]
-    player = [sys.executable, "-m", "uncertain_lti.cli", "play", str(bag), "--rate", str(rate)]
+    player = [sys.executable, "-m", "uncertain_lti.cli.main", "play", str(bag), "--rate", str(rate)]
     with _process([*monitor, "--log-level", "warn"]):
         _until(life, lambda: life.node.count_publishers(_FLAGS) > 0, "the envelope_monitor node did not start")
         with _process(player) as playing:
