@@ -32,11 +32,11 @@ from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti.signals.signal_map import FieldPath
 from uncertain_lti_ros.arguments import declare, run_node
-from uncertain_lti_ros.arming import Condition
 from uncertain_lti_ros.course import Course, why_not
 from uncertain_lti_ros.journal import Journal
 from uncertain_lti_ros.layout import MessageReader
