@@ -34,6 +34,7 @@ from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
+from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Watch, topic_types
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti.signals.signal_map import FieldPath
 from uncertain_lti_ros.arguments import declare, run_node
@@ -46,7 +47,6 @@ from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living, spare_the_middleware
 from uncertain_lti_ros.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, MatchedSubscription, Wish
-from uncertain_lti_ros.watch import ERROR, STALE, WARN, Report, Rule, Watch, topic_types
 
 NAME = "envelope_monitor"
 _SUMMARY = (
