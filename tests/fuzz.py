@@ -227,7 +227,7 @@ def read_file(rng: random.Random, folder: Path) -> str:
 def middleware() -> tuple[Any, Any, Any]:
     from rclpy.serialization import deserialize_message
 
-    from uncertain_lti_ros.layout import MessageReader
+    from uncertain_lti.recordings.message_reader import MessageReader
     from uncertain_lti_ros.messages import live_fields, message_class
 
     return MessageReader, cache(live_fields), lambda kind: lambda data: deserialize_message(data, message_class(kind))
@@ -235,8 +235,8 @@ def middleware() -> tuple[Any, Any, Any]:
 
 def read_messages(rng: random.Random, _: Path) -> str:
     """One damaged message after a few whole ones, by the layouts of the live node and by the middleware alone."""
+    from uncertain_lti.recordings.message_reader import UnreadableError
     from uncertain_lti.signals.signal_map import FieldPath
-    from uncertain_lti_ros.layout import UnreadableError
 
     make_reader, fields, decoder = middleware()
     kind, paths, make = rng.choice(
