@@ -34,13 +34,13 @@ from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
+from uncertain_lti.monitor.journal import Journal
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Watch, topic_types
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.signals.signal_map import FieldPath
 from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.course import Course, why_not
-from uncertain_lti_ros.journal import Journal
 from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
