@@ -25,9 +25,9 @@ from std_msgs.msg import Float64MultiArray, Int32
 from uncertain_lti import SignalMap, UncertainLTI
 from uncertain_lti.model.uncertain_lti import Alarm, Domain, Sampling
 from uncertain_lti.monitor.envelope_monitor import NUMBERS
+from uncertain_lti.monitor.snapshot import Recent, Told
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti_ros import course, envelope_monitor
-from uncertain_lti_ros.snapshot import Recent, Told
 
 STATE, CONTROL, SETPOINT = "/state", "/control", "/setpoint"
 VECTOR, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"

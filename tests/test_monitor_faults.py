@@ -640,7 +640,7 @@ def test_without_a_folder_there_are_no_snapshots(world: World, tmp_path: Path) -
 
 def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) -> None:
     from uncertain_lti.base.errors import ModelError
-    from uncertain_lti_ros.snapshot import Album, Entry, Scene
+    from uncertain_lti.monitor.snapshot import Album, Entry, Scene
 
     folder = tmp_path / "album"
     rng = np.random.default_rng(3)

@@ -23,10 +23,10 @@ import numpy as np
 
 from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.session import Watch
+from uncertain_lti.monitor.snapshot import Entry
 from uncertain_lti.monitor.verdict_messages import JUDGED, NamedVector
 from uncertain_lti.recordings.message_reader import Plan
 from uncertain_lti.sampling.sampler import LONGEST_NS, Status, Step, all_finite, to_ns
-from uncertain_lti_ros.snapshot import Entry
 
 _course: Any = None
 try:

@@ -36,6 +36,7 @@ from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.journal import Journal
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Watch, topic_types
+from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.signals.signal_map import FieldPath
@@ -45,7 +46,6 @@ from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living, spare_the_middleware
-from uncertain_lti_ros.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, MatchedSubscription, Wish
 
 NAME = "envelope_monitor"
