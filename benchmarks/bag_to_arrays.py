@@ -47,7 +47,8 @@ from uncertain_lti.recordings import mcap_batches
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.recordings.mcap_records import crc32
-from uncertain_lti.sampling.reading import read_stream, read_transients, sample, sample_by_message
+from uncertain_lti.sampling.reading import read_transients, sample, sample_by_message
+from uncertain_lti.sampling.streams import read_stream
 from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap
 
 PATHS = {

@@ -183,7 +183,7 @@ def read_file(rng: random.Random, folder: Path) -> str:
     from uncertain_lti.base.errors import UncertainLTIError
     from uncertain_lti.cli.main import main
     from uncertain_lti.recordings.bag import Bag, describe
-    from uncertain_lti.sampling.reading import read_stream, read_stream_by_message
+    from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
 
     path = folder / "damaged.mcap"
     data, checked = damaged_file(rng)

@@ -29,7 +29,7 @@ from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, NODE, TOPICS, 
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.reports.annotate import METADATA, annotate, targets
-from uncertain_lti.sampling.reading import read_for_model, read_with_decisions
+from uncertain_lti.sampling.reading import read_as_fitted, read_as_fitted_with_decisions
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.sampler_arrays import Decisions, decided
 
@@ -80,7 +80,7 @@ def held(path, without=()):
 def check(model, path, output, **options):
     """Annotate the one recording at a path; verdicts and what was written."""
     (bag,) = group_recordings(path if isinstance(path, list) else [path])
-    transient, decisions = read_with_decisions(bag, model)
+    transient, decisions = read_as_fitted_with_decisions(bag, model.signals)
     verdicts = EnvelopeMonitor(model).check(transient)
     return verdicts, annotate(bag.parts, verdicts, decisions, output, model, **options)
 
@@ -275,7 +275,7 @@ def test_everything_recorded_is_in_the_copy(engine, tmp_path, compression, chunk
     with open(tmp_path / "out.mcap", "rb") as stream:
         assert len(list(NonSeekingReader(stream, validate_crcs=True).iter_messages())) == len(times)
     assert not Bag(tmp_path / "out.mcap").warnings
-    (again,) = [read_for_model(tmp_path / "out.mcap", model)]
+    (again,) = [read_as_fitted(tmp_path / "out.mcap", model.signals)]
     assert np.array_equal(again.x, verdicts.transient.x) and np.array_equal(again.t_ns, verdicts.transient.t_ns)
 
 

@@ -28,7 +28,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import Definition, define
-from uncertain_lti.sampling.reading import Stream, read_stream, read_stream_by_message
+from uncertain_lti.sampling.streams import Stream, read_stream, read_stream_by_message
 from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap, numeric_paths
 
 SECOND = 10**9

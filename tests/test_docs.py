@@ -369,7 +369,9 @@ def test_public_docstrings_name_their_arguments():
     package = importlib.import_module("uncertain_lti")
     things = [getattr(package, n) for n in package.__all__]
     things += [importlib.import_module("uncertain_lti.identification.archive").fit_archive]
-    things += [getattr(importlib.import_module("uncertain_lti.model.interchange"), n) for n in ("to_control", "from_control")]
+    things += [
+        getattr(importlib.import_module("uncertain_lti.model.interchange"), n) for n in ("to_control", "from_control")
+    ]
     things += [package.UncertainLTI.bounds, package.Transient.from_dataframe, package.Transient.from_csv]
     for thing in things:
         text = inspect.getdoc(thing) or ""

@@ -19,7 +19,7 @@ import uncertain_lti.recordings.mcap_batches
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import read_columns
-from uncertain_lti.sampling.reading import Stream, read_stream, read_stream_by_message
+from uncertain_lti.sampling.streams import Stream, read_stream, read_stream_by_message
 from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),))

@@ -641,6 +641,7 @@ def test_without_a_folder_there_are_no_snapshots(world: World, tmp_path: Path) -
 def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) -> None:
     from uncertain_lti.base.errors import ModelError
     from uncertain_lti.monitor.snapshot import Album, Entry, Scene
+    from uncertain_lti_ros.messages import definition
 
     folder = tmp_path / "album"
     rng = np.random.default_rng(3)
@@ -648,8 +649,9 @@ def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) 
     def scene(size: int) -> Scene:
         entries = [Entry(0.0, k, "/t", rng.bytes(size // 10), (), False) for k in range(10)]
         return Scene(
-            entries, ["a"], {"/t": "std_msgs/msg/UInt8"}, {"flags": "/n/flags", "violation": "/n/violation"}, {}
-        )
+            entries, ["a"], {"/t": "std_msgs/msg/UInt8"}, {"flags": "/n/flags", "violation": "/n/violation"}, {},
+            definition,
+        )  # fmt: skip
 
     limit = 100_000
     album = Album(str(folder), "/rig/../../../etc/monitor", keep=100, limit=limit)

@@ -20,7 +20,12 @@ from packaging.utils import canonicalize_name
 import uncertain_lti
 
 ROOT = Path(__file__).resolve().parent.parent
-LIVE = ["errors", "files", "signals", "sampler", "transient", "operating_point", "model", "monitor"]
+LIVE = [
+    f"{room.name}.{path.stem}"
+    for room in (ROOT / "core" / name for name in ("base", "signals", "model", "monitor"))
+    for path in sorted(room.glob("*.py"))
+    if path.stem not in ("__init__", "interchange", "progress")
+] + ["sampling.sampler", "sampling.transient", "sampling.operating_point", "recordings.message_reader"]
 
 # Where the name to import is not the name to install.
 PIP_NAME = {"PIL": "pillow", "yaml": "pyyaml"}

@@ -31,7 +31,7 @@ from test_sampler import Reference, Sent, cases
 
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.reading import read_for_model, read_transients, unused
+from uncertain_lti.sampling.reading import read_as_fitted, read_transients, unused
 from uncertain_lti.sampling.sampler import Status
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -560,11 +560,11 @@ def test_a_model_reads_as_the_fit_did(tmp_path: Path) -> None:
     assert fitted.signals is not None
     model = model_of(fitted.signals)
     model.save(tmp_path / "m.model.json")
-    transient = read_for_model(one, UncertainLTI.load(tmp_path / "m.model.json"))
+    transient = read_as_fitted(one, UncertainLTI.load(tmp_path / "m.model.json").signals)
     for name in ("t_ns", "x", "u", "segment"):
         assert getattr(transient, name).tobytes() == getattr(fitted, name).tobytes()
     slower = float_bag(tmp_path, "b.mcap", range(0, 9000 * MS, 300 * MS), range(0, 9000 * MS, 30 * MS))
-    assert read_for_model(slower, model).segments == 30, "the limits are those of the fit, not of the recording"
+    assert read_as_fitted(slower, model.signals).segments == 30, "the limits are those of the fit, not of the recording"
 
 
 def test_a_recording_of_another_type_is_not_judged(tmp_path: Path) -> None:
@@ -578,10 +578,10 @@ def test_a_recording_of_another_type_is_not_judged(tmp_path: Path) -> None:
         "b.mcap",
     )
     with pytest.raises(BagError, match=f"{two}: /x is std_msgs/msg/Float32, and the model was fitted to {FLOAT64}"):
-        read_for_model(two, model_of(fitted.signals))
+        read_as_fitted(two, model_of(fitted.signals).signals)
     three = save(tmp_path, {"/y": FLOAT64}, [("/y", 1, float64(1.0))], "c.mcap")
     with pytest.raises(BagError, match="there is no topic /x; topics there: /y"):
-        read_for_model(three, model_of(fitted.signals))
+        read_as_fitted(three, model_of(fitted.signals).signals)
 
 
 @pytest.mark.parametrize("seam", [5000, -5000])
@@ -603,7 +603,7 @@ def test_a_model_of_arrays_names_no_topics(tmp_path: Path) -> None:
     model = UncertainLTI(np.eye(1), np.zeros((1, 0)), np.eye(1), np.zeros((1, 0)))
     path = float_bag(tmp_path, "a.mcap", range(0, 100 * MS, 10 * MS), [0])
     with pytest.raises(SignalError, match="the model was fitted to arrays and names no topics"):
-        read_for_model(path, model)
+        read_as_fitted(path, model.signals)
 
 
 def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path: Path) -> None:
@@ -614,10 +614,10 @@ def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path
     model = model_of(fitted.signals)
     zero = save(tmp_path, {"/x": JOINT_STATE}, [("/x", k * MS, joint_state(0, [k])) for k in range(9)], "zero.mcap")
     with pytest.raises(SignalError, match="zero.mcap: no message of /x has a stamp, and the model goes by them"):
-        read_for_model(zero, model)
+        read_as_fitted(zero, model.signals)
     silent = save(tmp_path, {"/x": JOINT_STATE, "/y": FLOAT64}, [("/y", 1, float64(1.0))], "silent.mcap")
     with pytest.raises(BagError, match="silent.mcap: /x has no message, so nothing can be judged; record it"):
-        read_for_model(silent, model)
+        read_as_fitted(silent, model.signals)
     driven = replace(fitted.signals, controls=(Signal("y", "/y", "data"),), time={**fitted.signals.time, "/y": "log"})
     quiet = save(
         tmp_path,
@@ -626,7 +626,7 @@ def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path
         "quiet.mcap",
     )
     with pytest.raises(BagError, match="quiet.mcap: /y has no message, so nothing can be judged; record it"):
-        read_for_model(quiet, model_of(driven))
+        read_as_fitted(quiet, model_of(driven).signals)
     vague = model_of(SignalMap((Signal("x", "/x", "position[0]"),)))
     with pytest.raises(SignalError, match="does not say clock, max_gap and time of every topic"):
-        read_for_model(good, vague)
+        read_as_fitted(good, vague.signals)

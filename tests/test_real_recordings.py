@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit, read_transients
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
-from uncertain_lti.sampling.reading import read_for_model
+from uncertain_lti.sampling.reading import read_as_fitted
 
 RECORDINGS = [  # recordings, signals file, additive term that its noise asks for, are pure intervals infeasible
     (("go2/test_3.mcap",), "go2_joint.yaml", "both", True),
@@ -113,10 +113,10 @@ def test_other_run_of_the_same_machine(recordings, signals_folder):
         for n in ("odd_t_0_5_run_01", "odd_t_0_5_run_02", "even_t_0_2_run_01")
     }
     model = fit(read_transients(runs["odd_t_0_5_run_01"], signals_folder / "hunter_se.yaml"), additive="disturbance")
-    same = EnvelopeMonitor(model).check(read_for_model(runs["odd_t_0_5_run_02"], model))
+    same = EnvelopeMonitor(model).check(read_as_fitted(runs["odd_t_0_5_run_02"], model.signals))
     assert same.violated.sum() < 0.005 * same.judged.sum()
     assert same.outside_domain.sum() < 0.01 * same.judged.sum()
-    cruising = EnvelopeMonitor(model).check(read_for_model(runs["even_t_0_2_run_01"], model))
+    cruising = EnvelopeMonitor(model).check(read_as_fitted(runs["even_t_0_2_run_01"], model.signals))
     assert cruising.judged.sum() > 2000
 
 
@@ -139,12 +139,12 @@ def test_gas_turbine_recordings_differ_and_the_check_says_so(recordings, signals
     folder = recordings / "micro_gas_turbine"
     signals = signals_folder / "micro_gas_turbine.yaml"
     alone = fit(read_transients(folder / "ex_1.mcap", signals), additive="noise")
-    strange = EnvelopeMonitor(alone).check(read_for_model(folder / "ex_20.mcap", alone))
+    strange = EnvelopeMonitor(alone).check(read_as_fitted(folder / "ex_20.mcap", alone.signals))
     assert strange.violated.sum() > 0.9 * strange.judged.sum()
     both = fit(read_transients([folder / "ex_1.mcap", folder / "ex_20.mcap"], signals), additive="noise")
     both.save(tmp_path / "m.model.json")
     ramps = EnvelopeMonitor(UncertainLTI.load(tmp_path / "m.model.json")).check(
-        read_for_model(folder / "ex_24.mcap", both)
+        read_as_fitted(folder / "ex_24.mcap", both.signals)
     )
     assert ramps.violated.sum() < 0.01 * ramps.judged.sum()
 

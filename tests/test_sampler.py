@@ -672,7 +672,7 @@ def test_little_room_makes_values_missing_and_never_wrong(case: tuple[SignalMap,
     signals, messages = case
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("uncertain_lti.sampling.sampler.BUFFERED_MESSAGES", room)
-        patch.setattr("uncertain_lti.sampling.sampler.KEPT_OVER_A_JUMP", 0)  # else the same messages are not kept either way
+        patch.setattr("uncertain_lti.sampling.sampler.KEPT_OVER_A_JUMP", 0)  # else others are kept
         cramped, sampler = run(signals, messages)
         assert all(len(topic.kept) <= room for topic in sampler._topics.values())
         patch.setattr("uncertain_lti.sampling.sampler.BUFFERED_MESSAGES", 10_000)

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_sampler import TICK, Sent, cases, loops
 
-from uncertain_lti.sampling.reading import Stream, sample_by_message
+from uncertain_lti.sampling.reading import sample_by_message
 from uncertain_lti.sampling.sampler_arrays import Samples, sample_arrays
+from uncertain_lti.sampling.streams import Stream
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 

@@ -23,7 +23,7 @@ from uncertain_lti.model.uncertain_lti import Alarm
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.reports.figures import budget_figure, envelope_figure, matrices_figure, save, utilisation_figure
 from uncertain_lti.reports.text import check_data, check_text, fit_text
-from uncertain_lti.sampling.reading import read_for_model
+from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti_ros.process import Life, living
 from uncertain_lti_ros.terminal import say, speed
 
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     print(f"   model: {model_file}")
 
     print(f"\n2. Playing {CHECK} at {args.rate:g} times real time to a live envelope_monitor node")
-    offline = EnvelopeMonitor(model).check(read_for_model(bags / CHECK, model))
+    offline = EnvelopeMonitor(model).check(read_as_fitted(bags / CHECK, model.signals))
     with living(lambda: Node("uncertain_lti_demo")) as life:
         live = _watch(life, model_file, bags / CHECK, args.rate, offline.transient.t_ns)
         if not life.alive:

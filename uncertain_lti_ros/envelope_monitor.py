@@ -42,7 +42,7 @@ from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.signals.signal_map import FieldPath
 from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.course import Course, why_not
-from uncertain_lti_ros.messages import live_fields, message_class
+from uncertain_lti_ros.messages import definition, live_fields, message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living, spare_the_middleware
@@ -669,6 +669,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "model": str(self.get_parameter("model").value),
                 "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
             },
+            definition,
         )
 
     def _lasting_problems(self) -> list[str]:

@@ -1,0 +1,4 @@
+"""Command line: one command a file.
+
+May import every room.
+"""

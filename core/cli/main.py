@@ -440,7 +440,7 @@ def _check(options: argparse.Namespace) -> int:
     from uncertain_lti.base.english import plural
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.reports.text import check_data, check_text
-    from uncertain_lti.sampling.reading import read_with_decisions
+    from uncertain_lti.sampling.reading import read_as_fitted_with_decisions
 
     model = _named(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
@@ -452,7 +452,7 @@ def _check(options: argparse.Namespace) -> int:
         copies = targets(options.write, bags)
     results = []
     for bag, copy in zip(bags, copies, strict=True):
-        transient, decisions = read_with_decisions(bag, model, options.progress.iterate("reading"))
+        transient, decisions = read_as_fitted_with_decisions(bag, model.signals, options.progress.iterate("reading"))
         _say(options, transient.notes)
         verdicts = monitor.check(transient)
         data = check_data(model, verdicts, samples=options.json)
@@ -477,7 +477,7 @@ def _report(options: argparse.Namespace) -> int:
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.reports.findings import findings, page_target
     from uncertain_lti.reports.text import findings_text
-    from uncertain_lti.sampling.reading import read_for_model
+    from uncertain_lti.sampling.reading import read_as_fitted
 
     model = _named(options.model)
     bags = group_recordings(options.bags)
@@ -485,7 +485,7 @@ def _report(options: argparse.Namespace) -> int:
     monitor = EnvelopeMonitor(model)
     checked = []
     for bag in bags:
-        transient = read_for_model(bag, model, options.progress.iterate("reading"))
+        transient = read_as_fitted(bag, model.signals, options.progress.iterate("reading"))
         _say(options, transient.notes)
         checked.append(monitor.check(transient))
     facts = findings(model, options.model, checked, monitor.rule)
@@ -512,7 +512,7 @@ def _validate(options: argparse.Namespace) -> int:
     from uncertain_lti import UncertainLTI
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.reports.text import validation_text
-    from uncertain_lti.sampling.reading import read_for_model
+    from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.calibration import calibrate
     from uncertain_lti.validation.left_out import validate_model
 
@@ -523,7 +523,8 @@ def _validate(options: argparse.Namespace) -> int:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
     if options.output is not None:
         _model_target(options.output)
-    transients = [read_for_model(bag, model, options.progress.iterate("reading")) for bag in group_recordings(bags)]
+    reading = options.progress.iterate("reading")
+    transients = [read_as_fitted(bag, model.signals, reading) for bag in group_recordings(bags)]
     for transient in transients:
         _say(options, transient.notes)
     with options.progress.stage("validating") as step:

@@ -22,8 +22,9 @@ from uncertain_lti.identification.working_set import InfeasibleError
 from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
 from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.sampling.operating_point import OperatingPoint
-from uncertain_lti.sampling.reading import load_signals, read_stream, sample
+from uncertain_lti.sampling.reading import load_signals, sample
 from uncertain_lti.sampling.sampler import resolve
+from uncertain_lti.sampling.streams import read_stream
 from uncertain_lti.signals.signal_map import SignalMap
 
 Recording = tuple[str, tuple[str, ...]]

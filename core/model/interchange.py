@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 Array = NDArray[np.float64]
@@ -23,7 +22,7 @@ DRIFT = "drift"
 _MATRICES = ("A", "B", "dA", "dB", "c", "dc", "v")
 
 
-def to_control(model: UncertainLTI, dt: float | None = None, recorded: bool = False) -> Any:
+def to_control(model: Any, dt: float | None = None, recorded: bool = False) -> Any:
     """The nominal model as a `control.StateSpace`; its outputs are the states.
 
     Half-widths have no place there: keep the model beside it. A drift c becomes a last input called `drift`, to be
@@ -67,6 +66,7 @@ def to_control(model: UncertainLTI, dt: float | None = None, recorded: bool = Fa
 
 
 def from_control(
+    model_class: Any,
     system: Any,
     dA: ArrayLike | None = None,
     dB: ArrayLike | None = None,
@@ -75,11 +75,13 @@ def from_control(
     *,
     signals: SignalMap | None = None,
     recorded: bool = False,
-) -> UncertainLTI:
+) -> Any:
     """A model from a `control.StateSpace`, the inverse of `to_control`.
 
     Parameters
     ----------
+    model_class : type
+        `UncertainLTI`.
     system : control.StateSpace
         Continuous, or discrete with a known step, by eq. (3). Its outputs must be its states.
     dA, dB, dc, v : array, optional
@@ -124,16 +126,16 @@ def from_control(
             )
         A, B, c = A * X / X[:, None], B * U / X[:, None], c / X
     zero = np.zeros
-    return UncertainLTI(
+    return model_class(
         A, B, zero(A.shape) if dA is None else dA, zero(B.shape) if dB is None else dB, c, dc, v, signals=signals
     )
 
 
-def save_mat(model: UncertainLTI, path: str | os.PathLike[str]) -> None:
+def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
     """Write a MATLAB file (version 5): A, B, dA, dB, c, dc, v, names, units, operating point and steps.
 
     dt, dt_min, dt_max (s) are NaN where the model does not say them. `model_json` holds the whole model file, so that
-    `load_mat` gives back everything.
+    `UncertainLTI.load_mat` gives back everything.
 
     Raises
     ------
@@ -162,7 +164,7 @@ def save_mat(model: UncertainLTI, path: str | os.PathLike[str]) -> None:
         raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
-def load_mat(path: str | os.PathLike[str]) -> UncertainLTI:
+def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
     """Read a MATLAB file (up to version 7) with at least A, B, dA and dB.
 
     What else it holds of `save_mat` is taken too; matrices that were changed in MATLAB count, not those of
@@ -203,12 +205,12 @@ def load_mat(path: str | os.PathLike[str]) -> UncertainLTI:
             whole = json.loads(_texts(data["model_json"])[0])
             if isinstance(whole, dict):
                 whole |= {name: value.tolist() for name, value in matrices.items()}
-            return UncertainLTI.from_dict(whole, source=os.fspath(path))
+            return model_class.from_dict(whole, source=os.fspath(path))
         signals = SignalMap(
             _signals(data, "state", "x", n, path), _signals(data, "control", "u", m, path), source=os.fspath(path)
         )
         given = [matrices.get(name) for name in ("c", "dc", "v")]
-        return UncertainLTI(*(matrices[name] for name in ("A", "B", "dA", "dB")), *given, signals=signals)
+        return model_class(*(matrices[name] for name in ("A", "B", "dA", "dB")), *given, signals=signals)
     except (ValueError, LookupError) as error:
         raise ModelError(f"{path}: 'model_json' or the names are damaged ({error}); write the file anew") from None
     except (ModelError, SignalError) as error:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import kind_of, whole_file
+from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -208,9 +209,31 @@ class UncertainLTI:
         return text + ")"
 
     def _repr_html_(self) -> str:
-        from uncertain_lti.reports.tables import model_html
-
-        return model_html(self)
+        """Nominal elements with their half-widths, and the widths that the fit reached."""
+        names = [*self.state_names, *self.control_names]
+        nominal, half = np.hstack([self.A, self.B]), np.hstack([self.dA, self.dB])
+        shown = range(min(len(names), MOST))
+        extra = [(n, a, b) for n, a, b in (("c", self.c, self.dc), ("v", np.zeros(self.n), self.v)) if (a + b).any()]
+        header = ["A, B [1/s]", *(names[j] for j in shown)]
+        header += ["…"] * (len(names) > MOST) + [name for name, _, _ in extra]
+        rows = []
+        for i in range(min(self.n, MOST)):
+            row = [self.state_names[i], *(f"{nominal[i, j]:.4g} ± {half[i, j]:.3g}" for j in shown)]
+            row += ["…"] * (len(names) > MOST) + [f"{a[i]:.4g} ± {b[i]:.3g}" for _, a, b in extra]
+            rows.append(row)
+        if self.n > MOST:
+            rows.append(["…"] * len(header))
+        facts, below = self.fit, []
+        if facts.get("mean_width_recorded") is not None:
+            widths = [
+                f"{name_with_unit(s.name, s.unit)} {number_text(float(w))}"
+                for s, w in zip(self.signals.states[:MOST], np.ravel(facts["mean_width_recorded"]), strict=False)
+            ]
+            below.append(f"mean one-step width: {', '.join(widths)}" + ", …" * (self.n > MOST))
+        rule = self.alarm
+        below.append(f"alarm: {rule.violations} of {plural(rule.window, 'verdict')}, margin {number_text(rule.margin)}")
+        below += [f"note: {message}" for message in facts.get("messages", [])]
+        return html_table(repr(self), header, rows, below)
 
     # --- one-step bounds ---
 
@@ -399,7 +422,8 @@ class UncertainLTI:
         """From a `control.StateSpace` and half-widths; see `interchange.from_control`."""
         from uncertain_lti.model.interchange import from_control
 
-        return from_control(system, **options)
+        model: UncertainLTI = from_control(UncertainLTI, system, **options)
+        return model
 
     def save_mat(self, path: str | os.PathLike[str]) -> None:
         """Write a MATLAB file; see `interchange.save_mat`."""
@@ -412,7 +436,8 @@ class UncertainLTI:
         """Read a MATLAB file; see `interchange.load_mat`."""
         from uncertain_lti.model.interchange import load_mat
 
-        return load_mat(path)
+        model: UncertainLTI = load_mat(UncertainLTI, path)
+        return model
 
     # --- the file ---
 

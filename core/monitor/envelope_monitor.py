@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.sampler import Status, Step
@@ -196,9 +197,24 @@ class Verdicts:
         return f"Verdicts({self.transient.name!r}: {plural(judged, 'verdict')}, {said}, {alarm})"
 
     def _repr_html_(self) -> str:
-        from uncertain_lti.reports.tables import verdicts_html
-
-        return verdicts_html(self)
+        """Violations and widths of each state."""
+        transient, judged = self.transient, self.judged
+        count, rows = int(judged.sum()), []
+        units = [s.unit for s in transient.signals.states] if transient.signals else [""] * self.flags.shape[1]
+        for i, (name, unit) in enumerate(zip(transient.state_names, units, strict=True)):
+            bad = np.flatnonzero(self.flags[:, i] == 1.0)
+            width = (self.upper - self.lower)[judged, i]
+            rows.append(
+                [
+                    name_with_unit(name, unit),
+                    str(len(bad)),
+                    f"{1 - len(bad) / count:.3%}" if count else "–",
+                    number_text(float(width.mean())) if count else "–",
+                    number_text(float(width.max())) if count else "–",
+                    f"{transient.t[bad[0]]:.4f} s" if len(bad) else "–",
+                ]
+            )
+        return html_table(repr(self), ("state", "violations", "inside", "mean width", "largest", "first"), rows)
 
     @property
     def violated(self) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ import re
 import struct
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,7 +17,6 @@ from typing import Protocol
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TOPICS, TRUE, NamedVector
 from uncertain_lti.recordings.mcap_writer import McapWriter
-from uncertain_lti_ros.messages import definition
 
 _OVERHEAD = 800  # bytes that one kept message takes beside its data, a verdict on it included
 _PER_STATE = 200  # and for each state of a verdict
@@ -94,13 +93,17 @@ class Recent:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a file holds: entries, the names of the states, and the topics with their types."""
+    """What a file holds: entries, the names of the states, and the topics with their types.
+
+    definition tells the text of a message type, as a file carries it.
+    """
 
     entries: Sequence[Entry]
     names: Sequence[str]
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]  # flags, violation, lower, ...: topic
     notes: Mapping[str, str]
+    definition: Callable[[str], str]
 
     def write(self, path: Path) -> int:
         """Write an MCAP file; returns the number of messages. Raises OSError."""
@@ -109,9 +112,9 @@ class Scene:
         with open(path, "xb") as stream:
             writer = McapWriter(stream, "uncertain-lti")
             writer.metadata("uncertain_lti", self.notes)
-            inputs = {t: writer.channel(t, kind, definition(kind)) for t, kind in self.inputs.items()}
+            inputs = {t: writer.channel(t, kind, self.definition(kind)) for t, kind in self.inputs.items()}
             outputs = {
-                name: writer.channel(topic, TOPICS[name], definition(TOPICS[name]))
+                name: writer.channel(topic, TOPICS[name], self.definition(TOPICS[name]))
                 for name, topic in self.outputs.items()
             }
             log_time = 0
@@ -206,7 +209,7 @@ class Album:
         self._thread = threading.Thread(target=self._write, args=(scene, path), name="snapshot", daemon=True)
         self._thread.start()
         self._thread.join(patience)
-        if self.busy:
+        if self._thread.is_alive():
             return f"writing {path}; ~/status says when it is there"
         if self.problem:
             raise ModelError(self.problem)

@@ -1,1 +1,4 @@
-"""Simulated plants for the demo, the examples and the tests."""
+"""Plants: simulated machines for examples and tests, and the paper's experiment.
+
+May import every room above: base to reports.
+"""

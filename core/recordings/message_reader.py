@@ -392,7 +392,7 @@ class _Part(_Want):
     def __init__(self, whole: _Want, index: int) -> None:
         self._whole, self._index = whole, index
 
-    @property  # type: ignore[override]
+    @property
     def places(self) -> list[tuple[int, str]]:
         return [self._whole.places[self._index]]
 

@@ -112,7 +112,7 @@ def annotate(
     verdicts : Verdicts
         Of `EnvelopeMonitor.check`.
     decisions : Decisions
-        Of the same reading (`reading.read_with_decisions`).
+        Of the same reading (`reading.read_as_fitted_with_decisions`).
     output : path
         MCAP file to write; it bears this name once it is whole.
     model, model_file, rule

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from array import array
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,100 +13,17 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.bag import Bag, group_recordings
-from uncertain_lti.recordings.bag_arrays import Progress, in_reach, read_columns
-from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
-from uncertain_lti.recordings.message_types import header_stamp_ns
+from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.sampling.operating_point import resolve_auto
+from uncertain_lti.sampling.reading_processes import processes_for, read_streams
 from uncertain_lti.sampling.sampler import Sampler, Status, resolve
 from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, sample_arrays
+from uncertain_lti.sampling.streams import Stream, check_paths, read_stream
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import FieldPath, SignalMap, UncarriedTopicError
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
-
-
-@dataclass
-class Stream:
-    """The wanted field values of one recording in order of arrival.
-
-    topic (messages,) positions in `signals.topics`; arrival, stamp (messages,) ns, with -1 for no stamp; values,
-    one array per topic, message after message in the order of `signals.on(topic)`.
-    """
-
-    bag: Bag
-    topic: NDArray[np.int64]
-    arrival: NDArray[np.int64]
-    stamp: NDArray[np.int64]
-    values: list[NDArray[np.float64]]
-
-
-def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
-    """Read the fields of a signals file from one recording.
-
-    Messages are read in blocks (`bag_arrays`), with what `read_stream_by_message` gives to the last bit.
-
-    Raises
-    ------
-    BagError
-        A topic is not there or cannot be read.
-    SignalError
-        A field is not in the message type, is not one number, or looks up a name or an element that no message has.
-    """
-    paths = _paths(bag, signals)
-    try:
-        columns = read_columns(bag, signals.topics, paths, progress)
-    except RepeatedNamesError:
-        return read_stream_by_message(bag, signals, progress)
-    _refuse_absent(bag, signals, paths, columns.values)
-    return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
-
-
-def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
-    """The same, message by message; raises as `read_stream` does."""
-    paths = _paths(bag, signals)
-    topics = signals.topics
-    messages: Iterable[tuple[str, int, object]] = bag.messages(topics)
-    if progress is not None:
-        total = sum(bag.topics[t].count for t in topics)
-        messages = progress(messages, total)  # type: ignore[assignment]
-    position = {name: i for i, name in enumerate(topics)}
-    order, arrival, stamp = array("q"), array("q"), array("q")
-    values = [array("d") for _ in topics]
-    for name, log_time, message in messages:
-        where = position[name]
-        order.append(where)
-        arrival.append(in_reach(bag, log_time))
-        stamp.append(header_stamp_ns(message) or -1)
-        values[where].extend([path.read(message) for path in paths[where]])
-    arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
-    _refuse_absent(bag, signals, paths, arrays)
-    return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
-
-
-def _paths(bag: Bag, signals: SignalMap) -> list[list[FieldPath]]:
-    """Field paths per topic; every problem of the map is found before the long read."""
-    for name in signals.topics:
-        if name in bag.topics and bag.topics[name].readable:
-            signals.check(name, bag.topics[name].type, bag.type_fields(name))
-    return [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics]
-
-
-def _refuse_absent(
-    bag: Bag, signals: SignalMap, paths: Sequence[Sequence[FieldPath]], values: Sequence[NDArray[np.float64]]
-) -> None:
-    """What the first message lacks, and what gave no number in any other, is a mistake in the map."""
-    for name, columns, read in zip(signals.topics, paths, values, strict=True):
-        for path, column in zip(columns, read.T, strict=True):
-            looked_up = any(kind != "attribute" for kind, _ in path.steps)
-            if not looked_up or not len(column) or not math.isnan(column[0]) or not np.isnan(column).all():
-                continue
-            said = bag.said
-            _, _, first = next(iter(bag.messages([name])))
-            bag.tell(*said)
-            if absent := path.absent(first):
-                raise SignalError(f"field '{path.text}' of {name} in {bag.path}: {absent}")
 
 
 def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, str]:
@@ -250,18 +166,16 @@ def read_transients(
 
 def _streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None, processes: int | None) -> list[Stream]:
     if processes != 1 and len(bags) > 1:
-        from uncertain_lti.sampling.reading_processes import processes_for, read_streams
-
         processes = processes_for(bags) if processes is None else processes
         if processes != 1:
             for bag in bags:
-                _paths(bag, signals)  # what is wrong with the map is found before anything is started
+                check_paths(bag, signals)  # what is wrong with the map is found before anything is started
             return read_streams(bags, signals, progress, processes)
     return [read_stream(bag, signals, progress) for bag in bags]
 
 
-def read_for_model(
-    recording: Bag | str | os.PathLike[str], model: UncertainLTI, progress: Progress | None = None
+def read_as_fitted(
+    recording: Bag | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> Transient:
     """Read one recording with the signals and sampling that a model was fitted with.
 
@@ -273,23 +187,22 @@ def read_for_model(
         The model names no topics (it was fitted to arrays) or does not say how they are sampled, or goes by stamps
         that the recording lacks.
     """
-    stream, signals = _stream_for_model(recording, model, progress)
+    stream = _stream_for_model(recording, signals, progress)
     return sample(stream, signals, progress)
 
 
-def read_with_decisions(
-    recording: Bag | str | os.PathLike[str], model: UncertainLTI, progress: Progress | None = None
+def read_as_fitted_with_decisions(
+    recording: Bag | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> tuple[Transient, Decisions]:
-    """`read_for_model`, and which message decided each clock message; raises as that does."""
-    stream, signals = _stream_for_model(recording, model, progress)
+    """`read_as_fitted`, and which message decided each clock message; raises as that does."""
+    stream = _stream_for_model(recording, signals, progress)
     decisions = decided(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
     return sample(stream, signals, progress), decisions
 
 
 def _stream_for_model(
-    recording: Bag | str | os.PathLike[str], model: UncertainLTI, progress: Progress | None = None
-) -> tuple[Stream, SignalMap]:
-    signals = model.signals
+    recording: Bag | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
+) -> Stream:
     if any(not s.topic for s in signals.signals):
         raise SignalError(
             "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
@@ -319,7 +232,7 @@ def _stream_for_model(
             f"{bag.path}: no message of {signals.clock} has a stamp, and the model goes by them; fit it to such "
             f"recordings, with time: log for that topic"
         )
-    return stream, signals
+    return stream
 
 
 def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.PathLike[str]]) -> SignalMap:

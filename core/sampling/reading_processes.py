@@ -17,7 +17,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.recordings.mcap_records import Contents
-from uncertain_lti.sampling.reading import Stream, read_stream
+from uncertain_lti.sampling.streams import Stream, read_stream
 from uncertain_lti.signals.signal_map import SignalMap
 
 WORTH_IT = 1 << 28

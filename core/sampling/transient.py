@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import TransientError
+from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.sampling.sampler import Status, median_step_ns, to_ns
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -180,9 +181,21 @@ class Transient:
         )
 
     def _repr_html_(self) -> str:
-        from uncertain_lti.reports.tables import transient_html
-
-        return transient_html(self)
+        """Range, largest step and missing samples of each signal."""
+        rows = []
+        units = [s.unit for s in self.signals.signals] if self.signals else [""] * 10**4
+        names = [*self.state_names, *self.control_names]
+        kinds = ["state"] * len(self.state_names) + ["control"] * len(self.control_names)
+        columns = [*self.x.T, *self.u[:-1].T]
+        for name, kind, unit, values in zip(names, kinds, units, columns, strict=False):
+            finite = values[np.isfinite(values)]
+            low, high = (float(finite.min()), float(finite.max())) if len(finite) else (math.nan, math.nan)
+            rms = float(np.sqrt(np.nanmean(np.diff(values) ** 2))) if len(finite) > 1 else math.nan
+            cells = [name_with_unit(name, unit), kind, number_text(low), number_text(high), number_text(rms)]
+            rows.append([*cells, str(len(values) - len(finite))])
+        counts = [f"{count} {reason}" for reason, count in sorted(self.counters.items()) if count]
+        header = ("signal", "", "least", "greatest", "rms step", "missing")
+        return html_table(repr(self), header, rows, [f"left out: {', '.join(counts)}"] if counts else [])
 
     @classmethod
     def from_dataframe(

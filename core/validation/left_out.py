@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
@@ -121,9 +122,30 @@ class Validation:
         return f"Validation(left out one of {len(self.parts)} {self.kind}: {inside}, {whole} whole)"
 
     def _repr_html_(self) -> str:
-        from uncertain_lti.reports.tables import validation_html
-
-        return validation_html(self.to_dict(), repr(self))
+        """Coverage beside widths, from `Validation.to_dict()`."""
+        data = self.to_dict()
+        rows = [
+            [
+                name_with_unit(name, s["unit"]),
+                "–" if s["inside"] is None else f"{s['inside']:.3%}",
+                f"{s['parts_inside']}/{data['parts']}",
+                number_text(s["mean_width_left_out"]),
+                number_text(s["mean_width_full"]),
+            ]
+            for name, s in data["states"].items()
+        ]
+        below = []
+        if data["inside"] is not None:
+            low, high = data["inside_interval"]
+            below.append(
+                f"inside all bounds: {data['inside']:.3%} of {plural(data['verdicts'], 'verdict')} "
+                f"({data['confidence']:.0%} interval {low:.3%} to {high:.3%})"
+            )
+        for rule in data["false_alarms"][:1]:
+            of = f"{rule['violations']} of {rule['window']}"
+            below.append(f"false alarms per hour at {of}: {number_text(rule['per_hour'])}")
+        below += [data["scenario"]["words"], *(f"note: {note}" for note in data["notes"])]
+        return html_table(repr(self), ("left out", "inside", "whole parts", "mean width", "fitted"), rows, below)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data: coverage beside widths, false alarms per hour with intervals, scenario bound in words."""

@@ -1,0 +1,100 @@
+"""Streams: the wanted field values of one recording, in order of arrival."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.bag_arrays import Progress, in_reach, read_columns
+from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
+from uncertain_lti.recordings.message_types import header_stamp_ns
+from uncertain_lti.signals.signal_map import FieldPath, SignalMap
+
+
+@dataclass
+class Stream:
+    """The wanted field values of one recording in order of arrival.
+
+    topic (messages,) positions in `signals.topics`; arrival, stamp (messages,) ns, with -1 for no stamp; values,
+    one array per topic, message after message in the order of `signals.on(topic)`.
+    """
+
+    bag: Bag
+    topic: NDArray[np.int64]
+    arrival: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    values: list[NDArray[np.float64]]
+
+
+def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
+    """Read the fields of a signals file from one recording.
+
+    Messages are read in blocks (`bag_arrays`), with what `read_stream_by_message` gives to the last bit.
+
+    Raises
+    ------
+    BagError
+        A topic is not there or cannot be read.
+    SignalError
+        A field is not in the message type, is not one number, or looks up a name or an element that no message has.
+    """
+    paths = check_paths(bag, signals)
+    try:
+        columns = read_columns(bag, signals.topics, paths, progress)
+    except RepeatedNamesError:
+        return read_stream_by_message(bag, signals, progress)
+    _refuse_absent(bag, signals, paths, columns.values)
+    return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
+
+
+def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
+    """The same, message by message; raises as `read_stream` does."""
+    paths = check_paths(bag, signals)
+    topics = signals.topics
+    messages: Iterable[tuple[str, int, object]] = bag.messages(topics)
+    if progress is not None:
+        total = sum(bag.topics[t].count for t in topics)
+        messages = progress(messages, total)  # type: ignore[assignment]
+    position = {name: i for i, name in enumerate(topics)}
+    order, arrival, stamp = array("q"), array("q"), array("q")
+    values = [array("d") for _ in topics]
+    for name, log_time, message in messages:
+        where = position[name]
+        order.append(where)
+        arrival.append(in_reach(bag, log_time))
+        stamp.append(header_stamp_ns(message) or -1)
+        values[where].extend([path.read(message) for path in paths[where]])
+    arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
+    _refuse_absent(bag, signals, paths, arrays)
+    return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
+
+
+def check_paths(bag: Bag, signals: SignalMap) -> list[list[FieldPath]]:
+    """Field paths per topic; every problem of the map is found before the long read."""
+    for name in signals.topics:
+        if name in bag.topics and bag.topics[name].readable:
+            signals.check(name, bag.topics[name].type, bag.type_fields(name))
+    return [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics]
+
+
+def _refuse_absent(
+    bag: Bag, signals: SignalMap, paths: Sequence[Sequence[FieldPath]], values: Sequence[NDArray[np.float64]]
+) -> None:
+    """What the first message lacks, and what gave no number in any other, is a mistake in the map."""
+    for name, columns, read in zip(signals.topics, paths, values, strict=True):
+        for path, column in zip(columns, read.T, strict=True):
+            looked_up = any(kind != "attribute" for kind, _ in path.steps)
+            if not looked_up or not len(column) or not math.isnan(column[0]) or not np.isnan(column).all():
+                continue
+            said = bag.said
+            _, _, first = next(iter(bag.messages([name])))
+            bag.tell(*said)
+            if absent := path.absent(first):
+                raise SignalError(f"field '{path.text}' of {name} in {bag.path}: {absent}")

@@ -1,0 +1,78 @@
+"""The house: rooms that import in one direction, modules without circles, a sentence at every door."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = (
+    "base", "signals", "recordings", "sampling", "model", "monitor", "identification", "validation", "proposal",
+    "reports", "plants", "cli",
+)  # fmt: skip
+"""In order: a room imports from itself and from those before it."""
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for path in sorted((ROOT / "core").rglob("*.py")):
+        parts = list(path.relative_to(ROOT / "core").with_suffix("").parts)
+        found[".".join(["uncertain_lti", *(parts[:-1] if parts[-1] == "__init__" else parts)])] = path
+    return found
+
+
+def imported(path: Path, known: dict[str, Path]) -> set[str]:
+    """Every module of the project that a file imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "uncertain_lti":
+            for name in node.names:
+                whole = f"{node.module}.{name.name}"
+                found.add(whole if whole in known else node.module)
+        elif isinstance(node, ast.Import):
+            found |= {name.name for name in node.names if name.name.split(".")[0] == "uncertain_lti"}
+    return found
+
+
+def room(module: str) -> str:
+    return module.split(".")[1] if "." in module else ""
+
+
+def test_imports_go_one_way():
+    known = modules()
+    backwards = [
+        f"{module} imports {other}"
+        for module, path in known.items()
+        if room(module)
+        for other in imported(path, known)
+        if room(other) and ROOMS.index(room(other)) > ROOMS.index(room(module))
+    ]
+    assert not backwards
+
+
+def test_no_module_leads_back_to_itself():
+    known = modules()
+    edges = {module: imported(path, known) - {module} for module, path in known.items() if path.name != "__init__.py"}
+    leaves = {module for module in edges if not edges[module] & edges.keys()}
+    while leaves:
+        for module in leaves:
+            del edges[module]
+        leaves = {module for module in edges if not edges[module] & edges.keys()}
+    assert not edges, "these import each other in a circle, or what does"
+
+
+def test_every_room_says_what_it_is_for_and_what_it_may_import():
+    rooms = {p.parent.name for p in (ROOT / "core").glob("*/__init__.py")}
+    assert rooms == set(ROOMS)
+    for name in rooms:
+        door = ROOT / "core" / name / "__init__.py"
+        first, *_, last = (ast.get_docstring(ast.parse(door.read_text())) or "").split("\n")
+        assert first.endswith(".") and "mport" in last, door
+    assert [p.name for p in (ROOT / "core").glob("*.py")] == ["__init__.py"]
+
+
+def test_the_core_knows_no_ros():
+    for path in modules().values():
+        tree = ast.parse(path.read_text())
+        names = [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+        names += [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
+        tops = {name.split(".")[0] for name in names}
+        assert not tops & {"rclpy", "std_msgs", "sensor_msgs", "uncertain_lti_ros"}, path
