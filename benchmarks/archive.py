@@ -109,7 +109,7 @@ def main():
         def row(name, criterion, took, model):
             known = models[criterion]
             elements = max(np.abs(getattr(model, a) - getattr(known, a)).max() for a in ("A", "B", "dA", "dB"))
-            objective = np.max(np.abs(np.divide(model.fit["objective"], known.fit["objective"]) - 1))
+            objective = np.max(np.abs(np.divide(model.fit_summary["objective"], known.fit_summary["objective"]) - 1))
             outside = 0
             for transient in transients:
                 s = transient.transitions()

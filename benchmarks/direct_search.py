@@ -31,10 +31,10 @@ def main() -> None:
         rows.append(
             [
                 name,
-                str(model.fit["transitions"]),
-                f"{model.fit['objective']:.5g}",
+                str(model.fit_summary["transitions"]),
+                f"{model.fit_summary['objective']:.5g}",
                 f"{found.objective:.5g}",
-                f"{found.objective / model.fit['objective'] - 1:+.2%}",
+                f"{found.objective / model.fit_summary['objective'] - 1:+.2%}",
                 f"{exact:.2f}",
                 f"{found.seconds:.1f}",
                 f"{found.seconds / exact:.0f}",

@@ -108,7 +108,11 @@ def million(scale):
                 ours, model = best(lambda p=problem, c=criterion: solve(p, c), 4)
                 rows.append(
                     [f"{noise:g}", additive, criterion, f"{peer:.3f} s", f"{ours:.3f} s", f"{ours / peer:.2f}"]
-                    + [str(model.fit["solver"]["passes"]), f"{model.fit['gap']:.0e}", str(outside(problem, model))]
+                    + [
+                        str(model.fit_summary["solver"]["passes"]),
+                        f"{model.fit_summary['gap']:.0e}",
+                        str(outside(problem, model)),
+                    ]
                 )
     header = ["noise", "additive", "criterion", "lstsq", "ours", "ratio", "passes", "gap", "outside"]
     table(f"{N} transitions of the published matrices, n = 5, m = 4, all rows", header, rows)
@@ -133,7 +137,7 @@ def joint(scale):
     for criterion in ("qp", "lp"):
         ours, model = best(lambda c=criterion: solve(problem, c))
         peer, (_, _, objective) = best(lambda c=criterion: formulation.solve(problem, c, cp.CLARABEL), 1)
-        difference = np.max(np.abs(np.asarray(model.fit["objective"]) / objective - 1))
+        difference = np.max(np.abs(np.asarray(model.fit_summary["objective"]) / objective - 1))
         rows.append(
             [
                 criterion,
@@ -185,7 +189,7 @@ def large(scale):
     rows = []
     for criterion in ("qp", "lp"):
         ours, model = best(lambda c=criterion: solve(problem, c), 1)
-        rows.append([criterion, f"{ours:.1f} s", f"{model.fit['gap']:.0e}", str(outside(problem, model))])
+        rows.append([criterion, f"{ours:.1f} s", f"{model.fit_summary['gap']:.0e}", str(outside(problem, model))])
     table(f"{N} transitions, n = 50, m = 10", ["criterion", "ours", "gap", "outside"], rows)
 
 
@@ -197,7 +201,7 @@ def coupled(scale):
     weights = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(5)
     problem = problem_of(*drawn(N), weights=weights)
     ours, model = best(lambda: solve(problem, "qp"), 1)
-    rows = [[f"{ours:.2f} s", f"{model.fit['gap']:.0e}", str(outside(problem, model))]]
+    rows = [[f"{ours:.2f} s", f"{model.fit_summary['gap']:.0e}", str(outside(problem, model))]]
     table(f"{N} transitions, n = 5, m = 4, full W(t_k)", ["ours", "gap", "outside"], rows)
 
 
@@ -268,11 +272,11 @@ def disk_fit(folder, N, parts):
             peak = peak_memory() / 2**20
             count = int(fleet.judge(model).outside.sum())
             known = models.setdefault(criterion, model)
-            objective = np.max(np.abs(np.divide(model.fit["objective"], known.fit["objective"]) - 1))
+            objective = np.max(np.abs(np.divide(model.fit_summary["objective"], known.fit_summary["objective"]) - 1))
             elements = max(np.abs(getattr(model, name) - getattr(known, name)).max() for name in ("A", "B", "dA", "dB"))
             rows.append(
-                [where, criterion, f"{took:.1f} s", str(model.fit["solver"]["passes"]), f"{peak:.0f} MiB"]
-                + [f"{model.fit['gap']:.0e}", str(count), f"{objective:.0e}", f"{elements:.0e}"]
+                [where, criterion, f"{took:.1f} s", str(model.fit_summary["solver"]["passes"]), f"{peak:.0f} MiB"]
+                + [f"{model.fit_summary['gap']:.0e}", str(count), f"{objective:.0e}", f"{elements:.0e}"]
             )
 
     fitted("on disk", Fleet([partition]))

@@ -45,7 +45,7 @@ QUEUE = 1000
 
 def save_model(path: Path, n: int, rate: float) -> None:
     from uncertain_lti import SignalMap, UncertainLTI
-    from uncertain_lti.model.uncertain_lti import Sampling
+    from uncertain_lti.model.domain import Sampling
     from uncertain_lti.signals.signal_map import Signal
 
     m, dt = CONTROLS[n], 1.0 / rate

@@ -48,7 +48,7 @@ def faults():
         onset = round(AT / DT)
         print(f"\nNoise {noise:g}\n\n| | " + " | ".join(f"{c}, {a}" for c, a in columns) + " |")
         print("|---|" + "---|" * len(columns))
-        width = [1e4 * np.mean(m.model.fit["mean_width"]) for m in monitors]
+        width = [1e4 * np.mean(m.model.fit_summary["mean_width"]) for m in monitors]
         print("| mean width, 1e-4 | " + " | ".join(f"{w:.3g}" for w in width) + " |")
         before = [int(m.check(healthy).violated[:onset].sum()) for m in monitors]
         print(f"| false before, of {onset - 1} | " + " | ".join(str(b) for b in before) + " |")

@@ -175,7 +175,7 @@ def test_real_recordings(name, recordings, signals_folder, tmp_path):
         source = sorted(source.parent.glob("*.mcap"))[0]
     transients = read_transients(source, signals_folder / f"{REAL[name][0]}.yaml")
     model = fit(transients, "qp", additive=REAL[name][1])
-    halved = model.with_(dA=model.dA / 2, dB=model.dB / 2, v=model.v / 2, dc=model.dc / 2)
+    halved = model.replace(dA=model.dA / 2, dB=model.dB / 2, v=model.v / 2, dc=model.dc / 2)
     verdicts, _ = check(halved, source, tmp_path / "out.mcap")
     assert verdicts.violated.any() and not verdicts.violated.all()
     same_recording(source, tmp_path / "out.mcap")

@@ -31,11 +31,13 @@ def bags(tmp_path_factory):
 def equal(one, two):
     for name in ARRAYS:
         assert getattr(one, name) == pytest.approx(getattr(two, name), rel=1e-9, abs=1e-9)
-    assert np.asarray(one.fit["objective"]) == pytest.approx(np.asarray(two.fit["objective"]), rel=1e-12)
+    assert np.asarray(one.fit_summary["objective"]) == pytest.approx(
+        np.asarray(two.fit_summary["objective"]), rel=1e-12
+    )
     assert one.sampling == two.sampling
     assert one.signals == two.signals
     assert np.array_equal(one.domain.x_min, two.domain.x_min)
-    assert one.fit["transitions"] == two.fit["transitions"] and one.fit["violations"] == 0
+    assert one.fit_summary["transitions"] == two.fit_summary["transitions"] and one.fit_summary["violations"] == 0
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
@@ -79,12 +81,12 @@ def test_many_blocks_and_passes_from_disk(tmp_path, criterion):
     stacked = np.hstack([block.z for block in partition.blocks()])
     assert np.array_equal(stacked, np.hstack([p.z_columns for _, p in parts]))
     model = fit_fleet(Fleet([partition]), whole.signals, criterion)
-    objective = np.asarray(model.fit["objective"])
-    assert objective == pytest.approx(np.asarray(whole.fit["objective"]), rel=1e-12)
+    objective = np.asarray(model.fit_summary["objective"])
+    assert objective == pytest.approx(np.asarray(whole.fit_summary["objective"]), rel=1e-12)
     assert model.dA == pytest.approx(whole.dA, rel=1e-9, abs=1e-9)
     # and in parts, as a cluster would hold them
     fleet = Fleet([p for _, p in parts])
-    assert np.asarray(fit_fleet(fleet, whole.signals, criterion).fit["objective"]) == pytest.approx(
+    assert np.asarray(fit_fleet(fleet, whole.signals, criterion).fit_summary["objective"]) == pytest.approx(
         objective, rel=1e-12
     )
     assert fleet.judge(model).outside.sum() == 0

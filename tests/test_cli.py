@@ -51,9 +51,9 @@ def test_fit_says_what_it_used(folder, capsys):
     printed = json.loads(capsys.readouterr().out)
     model = UncertainLTI.load(folder / "m.model.json")
     assert printed["fit"] == model.to_dict()["fit"]
-    (source,) = model.fit["sources"]
+    (source,) = model.fit_summary["sources"]
     assert source["file"].endswith("run.mcap") and len(source["sha256"]) == 64
-    assert model.fit["transitions"] == 299 and model.fit["violations"] == 0
+    assert model.fit_summary["transitions"] == 299 and model.fit_summary["violations"] == 0
     assert model.sampling.clock == STATE_TOPIC and model.signals.states[0].type == "sensor_msgs/msg/JointState"
 
 
@@ -108,7 +108,7 @@ def test_several_recordings_are_separate_transients(folder, capsys):
     engine_bag(folder / "second.mcap", steps=120, seed=2)
     assert fitted(folder, "--additive", "noise", bags=("run.mcap", "second.mcap")) == 0
     model = UncertainLTI.load(folder / "m.model.json")
-    assert model.fit["transients"] == 2 and model.fit["transitions"] == 299 + 119
+    assert model.fit_summary["transients"] == 2 and model.fit_summary["transitions"] == 299 + 119
     capsys.readouterr()
     assert main(["check", str(folder / "m.model.json"), str(folder / "run.mcap"), str(folder / "second.mcap")]) == 0
     assert capsys.readouterr().out.count("100.000% inside") == 2

@@ -58,9 +58,11 @@ def test_with_additive_terms_the_objective_is_never_above_that_of_simpler_models
     transient = drawn(seed, n, m, noise, jitter)
     width = 2.0 * best_box(transient)
     for additive in ("noise", "both"):
-        qp, lp = (fit(transient, c, additive=additive).fit["objective"] for c in ("qp", "lp"))
-        assert qp <= fit(transient, "qp", additive="none").fit["objective"] * (1 + 1e-7)
-        assert (np.asarray(lp) <= np.asarray(fit(transient, "lp", additive="none").fit["objective"]) * (1 + 1e-7)).all()
+        qp, lp = (fit(transient, c, additive=additive).fit_summary["objective"] for c in ("qp", "lp"))
+        assert qp <= fit(transient, "qp", additive="none").fit_summary["objective"] * (1 + 1e-7)
+        assert (
+            np.asarray(lp) <= np.asarray(fit(transient, "lp", additive="none").fit_summary["objective"]) * (1 + 1e-7)
+        ).all()
     assert qp <= 150 * np.sum(width**2) * (1 + 1e-6) + 1e-15
     assert (np.asarray(lp) <= width * (1 + 1e-6) + 1e-9).all()
 

@@ -23,7 +23,8 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray, Int32
 
 from uncertain_lti import SignalMap, UncertainLTI
-from uncertain_lti.model.uncertain_lti import Alarm, Domain, Sampling
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.monitor.envelope_monitor import NUMBERS
 from uncertain_lti.monitor.snapshot import Recent, Told
 from uncertain_lti.signals.signal_map import Signal
@@ -191,7 +192,7 @@ def saved(path: Path, n: int, rng: np.random.Generator, margin: float = 1.0, clo
         domain=Domain(np.full(n, -0.2), np.full(n, 0.2), np.full(3, -0.2), np.full(3, np.inf)),
         signals=signals,
         sampling=Sampling(STATE, VECTOR, dict(signals.time), dt_median=0.01, max_gap=0.055),
-        alarm=Alarm(3, 20, margin),
+        alarm_rule=AlarmRule(3, 20, margin),
     )
     model.save(path)
     return model
@@ -502,7 +503,7 @@ OPTIONS = (
 )
 
 
-def saved_with(path: Path, options: set[str], rng: np.random.Generator, alarm: Alarm) -> UncertainLTI:
+def saved_with(path: Path, options: set[str], rng: np.random.Generator, alarm: AlarmRule) -> UncertainLTI:
     """Joints, and of an inertial unit an angle and a norm; a control of whole numbers; left bounds are no rarity."""
     hold = 0.015 if "delays" in options else 0.1
     states = [
@@ -530,7 +531,7 @@ def saved_with(path: Path, options: set[str], rng: np.random.Generator, alarm: A
         domain=Domain(np.full(n, -3.0), np.full(n, 3.0), np.full(m, -3.0), np.full(m, 3.0)),
         signals=signals,
         sampling=Sampling(STATE, VECTOR, time, dt_median=0.01, max_gap=0.055),
-        alarm=alarm,
+        alarm_rule=alarm,
     )  # fmt: skip
     model.save(path)
     return model
@@ -581,7 +582,7 @@ def test_alarms_delays_angles_and_states_on_several_topics_are_as_in_python(
     ros: None, tmp_path: Path, options: set[str], rate: float
 ) -> None:
     alarms = taken = judged = 0
-    for seed, rule in enumerate((Alarm(1, 1), Alarm(3, 8), Alarm(6, 40, 0.9), Alarm(2, 2, 1.2))):
+    for seed, rule in enumerate((AlarmRule(1, 1), AlarmRule(3, 8), AlarmRule(6, 40, 0.9), AlarmRule(2, 2, 1.2))):
         rng = np.random.default_rng([seed, len(options)])
         saved_with(tmp_path / "model.json", options, rng, rule)
         nodes = [Node(tmp_path / "model.json", compiled) for compiled in (True, False)]

@@ -42,7 +42,7 @@ def run(seed=0, count=1500, noise=1e-3, dt=0.05, u=None, feedback=None, lag=0, c
 
 
 def messages(*transients, additive="noise", **options):
-    return fit(list(transients), additive=additive, seek_carriers=True, **options).fit["messages"]
+    return fit(list(transients), additive=additive, seek_carriers=True, **options).fit_summary["messages"]
 
 
 WORDS = {
@@ -221,7 +221,10 @@ def test_delay_is_found_and_setting_it_mends_the_fit(lag, noise):
     assert len(found) == 2 and all(f"`delay: {lag}`" in m for m in found)
     shifted = Transient(transient.t_ns[lag:], transient.x[lag:], transient.u[: len(transient) - lag])
     assert "delay" not in said(messages(shifted))
-    assert (fit(shifted, additive="noise").fit["mean_width"] < fit(transient, additive="noise").fit["mean_width"]).all()
+    assert (
+        fit(shifted, additive="noise").fit_summary["mean_width"]
+        < fit(transient, additive="noise").fit_summary["mean_width"]
+    ).all()
 
 
 def test_noise_near_rest_is_named_with_what_the_term_gains():
@@ -234,7 +237,7 @@ def test_noise_near_rest_is_named_with_what_the_term_gains():
     name = message.rpartition("mean width of ")[2].split()[0]
     i = int(name.strip("x")) - 1
     pure, better = fit(transient, additive="none"), fit(transient, additive="noise")
-    assert better.fit["mean_width"][i] / pure.fit["mean_width"][i] == pytest.approx(promised, abs=0.1)
+    assert better.fit_summary["mean_width"][i] / pure.fit_summary["mean_width"][i] == pytest.approx(promised, abs=0.1)
 
 
 def test_pure_intervals_that_do_well_are_left_alone():
@@ -251,7 +254,7 @@ def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
     from uncertain_lti import read_transients
 
     def of(bags, signals):
-        return fit(read_transients([recordings / b for b in bags], signals_folder / signals)).fit["messages"]
+        return fit(read_transients([recordings / b for b in bags], signals_folder / signals)).fit_summary["messages"]
 
     hunter = of(["hunter_se/straight_odd_t_0_5_run_01.mcap"], "hunter_se.yaml")
     assert {"collinear", "one-sided"} <= said(hunter)  # a straight run: the speed follows a throttle that only opens
@@ -273,8 +276,8 @@ def test_the_suggested_delay_narrows_the_neato(recordings, signals_folder):
         fit(read_transients(bag, replace(signals, controls=tuple(replace(c, delay=d) for c in signals.controls))))
         for d in (0, 1)
     )
-    assert sum("`delay: 1`" in m for m in plain.fit["messages"]) == 2
-    assert (shifted.fit["mean_width"] < 0.65 * plain.fit["mean_width"]).all()
+    assert sum("`delay: 1`" in m for m in plain.fit_summary["messages"]) == 2
+    assert (shifted.fit_summary["mean_width"] < 0.65 * plain.fit_summary["mean_width"]).all()
 
 
 def test_hunter_steering_is_named_as_not_identifiable(recordings, signals_folder, tmp_path):
@@ -286,7 +289,7 @@ def test_hunter_steering_is_named_as_not_identifiable(recordings, signals_folder
     )
     (tmp_path / "s.yaml").write_text(text + "  - {name: steering, topic: /hunter/cmd, field: vector.y}\n")
     bag = recordings / "hunter_se/straight_odd_t_0_5_run_01.mcap"
-    found = fit(read_transients(bag, tmp_path / "s.yaml")).fit["messages"]
+    found = fit(read_transients(bag, tmp_path / "s.yaml")).fit_summary["messages"]
     assert any("'steering' leaves its usual value in 1 of 2512 transitions only" in m for m in found)
 
 
@@ -311,8 +314,10 @@ def test_few_samples_that_carry_a_width_are_named_and_discarding_them_does_what_
     assert count == 2 * len(at) - (701 in at)
     wide, narrow = fit([spoiled], additive="noise"), fit([spoiled], additive="noise", discard=count)
     said_factor = float(message.split("'speed' ")[1].split(" times")[0])
-    assert wide.fit["mean_width"][0] / narrow.fit["mean_width"][0] == pytest.approx(said_factor, rel=0.01)
-    assert not any(WORDS["few"] in m for m in narrow.fit["messages"])
+    assert wide.fit_summary["mean_width"][0] / narrow.fit_summary["mean_width"][0] == pytest.approx(
+        said_factor, rel=0.01
+    )
+    assert not any(WORDS["few"] in m for m in narrow.fit_summary["messages"])
 
 
 def test_discards_that_are_too_few_are_added_to():

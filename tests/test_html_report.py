@@ -112,12 +112,12 @@ def test_what_was_fitted_proves_nothing(engine, capsys, tmp_path):
     """And a validated model says how it did on what was left out."""
     runs = read_transients([engine / "run.mcap", engine / "other.mcap"], engine / "signals.yaml")
     model = fit(runs, additive="noise")
-    model = model.with_(validation=validate(runs, additive="noise", full=model).to_dict())
+    model = model.replace(validation=validate(runs, additive="noise", full=model).to_dict())
     model.save(tmp_path / "v.model.json")
     from uncertain_lti.reports.findings import sha256
 
     source = {"file": "elsewhere/run.mcap", "sha256": sha256(engine / "run.mcap")}
-    model.with_(fit={**model.fit, "sources": [source]}).save(tmp_path / "v.model.json")
+    model.replace(fit_summary={**model.fit_summary, "sources": [source]}).save(tmp_path / "v.model.json")
     assert main(["report", str(tmp_path / "v.model.json"), str(engine / "run.mcap"), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     reasons = {r["about"]: r for r in facts["rely"]["reasons"] if r["about"] != "fit"}
@@ -139,7 +139,7 @@ def test_names_from_files_are_text(tmp_path, engine):
         states=tuple(replace(s, name=f"{HOSTILE}{i}", unit=HOSTILE) for i, s in enumerate(model.signals.states)),
     )
     nasty = {
-        **model.fit,
+        **model.fit_summary,
         "criterion": HOSTILE,
         "messages": [HOSTILE, 3],
         "sources": [{"file": HOSTILE, "sha256": HOSTILE}, HOSTILE],
@@ -157,7 +157,7 @@ def test_names_from_files_are_text(tmp_path, engine):
         {**good, "notes": [HOSTILE], "states": {s.name: next(iter(good["states"].values())) for s in signals.states}},
     ]
     for validation in validations:
-        changed = model.with_(signals=signals, fit=nasty, validation=validation)
+        changed = model.replace(signals=signals, fit_summary=nasty, validation=validation)
         verdicts = [EnvelopeMonitor(changed).check(transient)]
         facts = findings(changed, f"{HOSTILE}.json", verdicts)
         text = html_report(changed, verdicts, facts)
@@ -208,8 +208,8 @@ def judged(widths, validation=None, decay=1.0):
     n = len(widths)
     x = np.clip(np.cumsum(rng.uniform(-0.1, 0.1, (600, n)), axis=0), -1, 1)
     run = Transient(np.arange(600) * 0.01, x, np.zeros((600, 1)))
-    model = fit([run], additive="noise").with_(A=-decay * np.eye(n), B=np.zeros((n, 1)), v=np.array(widths))
-    model = model.with_(fit={"criterion": "qp"}, validation=validation or {})
+    model = fit([run], additive="noise").replace(A=-decay * np.eye(n), B=np.zeros((n, 1)), v=np.array(widths))
+    model = model.replace(fit_summary={"criterion": "qp"}, validation=validation or {})
     return findings(model, "m", [EnvelopeMonitor(model).check(run)])
 
 

@@ -69,7 +69,7 @@ def test_nothing_is_left_outside(criterion, additive, noise):
     ]
     model = fit(transients, criterion, additive=additive)
     assert count_outside(model, transients) == 0
-    assert model.fit["violations"] == 0
+    assert model.fit_summary["violations"] == 0
 
 
 @settings(max_examples=40, deadline=None)
@@ -112,8 +112,8 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
     model = fit(transient, criterion, weights, additive)
     problem = assemble([transient], OperatingPoint.identity(n, 2), weights, additive)
     _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL, **CLARABEL)
-    assert np.atleast_1d(model.fit["objective"]) == pytest.approx(expected, rel=1e-6)
-    assert model.fit["gap"] < 1e-7
+    assert np.atleast_1d(model.fit_summary["objective"]) == pytest.approx(expected, rel=1e-6)
+    assert model.fit_summary["gap"] < 1e-7
     # and the number stored is that of the bounds themselves
     width = widths(model, transient)
     W = np.ones(n) if weights is None else weights
@@ -122,7 +122,7 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
     else:
         diagonal = np.diagonal(W, axis1=1, axis2=2) if kind == "full" else W
         stored = np.max(np.sqrt(diagonal) * width, axis=0)
-    assert np.asarray(model.fit["objective"]) == pytest.approx(stored, rel=1e-9)
+    assert np.asarray(model.fit_summary["objective"]) == pytest.approx(stored, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_large_problem_reaches_the_same_optimum(criterion):
     model = fit(transient, criterion, additive="noise")
     problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
     _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL if criterion == "qp" else cp.HIGHS)
-    assert np.atleast_1d(model.fit["objective"]) == pytest.approx(expected, rel=1e-6)
+    assert np.atleast_1d(model.fit_summary["objective"]) == pytest.approx(expected, rel=1e-6)
     s = transient.transitions()
     lower, upper = model.bounds(s.x, s.u, s.dt)
     assert ((lower <= s.x_next) & (s.x_next <= upper)).all()
@@ -147,7 +147,9 @@ def test_both_methods_agree_and_contain(method, criterion):
     assert count_outside(model, [transient]) == 0
     other = fit(transient, criterion)
     # OSQP stops at its tolerance, and the repair pays for what it left outside
-    assert np.asarray(model.fit["objective"]) == pytest.approx(np.asarray(other.fit["objective"]), rel=1e-4)
+    assert np.asarray(model.fit_summary["objective"]) == pytest.approx(
+        np.asarray(other.fit_summary["objective"]), rel=1e-4
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -155,8 +157,8 @@ def test_objective_is_never_above_that_of_the_published_matrices(seed):
     plant = leibov2006()
     transient = drawn(plant, 1200, seed)
     width = widths(plant, transient)
-    assert fit(transient, "qp").fit["objective"] <= np.sum(width**2) * (1 + 1e-9)
-    assert (fit(transient, "lp").fit["objective"] <= width.max(axis=0) * (1 + 1e-9)).all()
+    assert fit(transient, "qp").fit_summary["objective"] <= np.sum(width**2) * (1 + 1e-9)
+    assert (fit(transient, "lp").fit_summary["objective"] <= width.max(axis=0) * (1 + 1e-9)).all()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -173,10 +175,12 @@ def test_additive_terms_never_cost(seed):
         box.append(2 * float(r.value))
     for additive in ("noise", "both"):
         qp, lp = fit(transient, "qp", additive=additive), fit(transient, "lp", additive=additive)
-        assert qp.fit["objective"] <= fit(transient, "qp").fit["objective"] * (1 + 1e-8)
-        assert (lp.fit["objective"] <= np.asarray(fit(transient, "lp").fit["objective"]) * (1 + 1e-8)).all()
-        assert qp.fit["objective"] <= len(s.k) * np.sum(np.square(box)) * (1 + 1e-8)
-        assert (lp.fit["objective"] <= np.array(box) * (1 + 1e-8)).all()
+        assert qp.fit_summary["objective"] <= fit(transient, "qp").fit_summary["objective"] * (1 + 1e-8)
+        assert (
+            lp.fit_summary["objective"] <= np.asarray(fit(transient, "lp").fit_summary["objective"]) * (1 + 1e-8)
+        ).all()
+        assert qp.fit_summary["objective"] <= len(s.k) * np.sum(np.square(box)) * (1 + 1e-8)
+        assert (lp.fit_summary["objective"] <= np.array(box) * (1 + 1e-8)).all()
 
 
 def test_ties_of_the_linear_programme_are_broken_as_stated():
@@ -242,7 +246,7 @@ def test_recordings_are_not_joined():
     parts = [drawn(plant, 150, seed) for seed in (1, 2, 3)]
     parts[1] = Transient(parts[1].t_ns + 10**12, parts[1].x, parts[1].u)
     model = fit(parts)
-    assert model.fit["transitions"] == sum(int(p.usable.sum()) for p in parts) == 450
+    assert model.fit_summary["transitions"] == sum(int(p.usable.sum()) for p in parts) == 450
     shifted = [Transient(p.t_ns + 7 * i, p.x, p.u) for i, p in enumerate(parts)]
     assert fit(shifted).A == pytest.approx(model.A)
 
@@ -257,8 +261,10 @@ def test_operating_point_only_changes_units():
         plain = fit(transient, criterion, additive="noise")
         same = fit(scaled, criterion, additive="noise", operating_point=point)
         assert same.A == pytest.approx(plain.A, rel=1e-4, abs=1e-4)
-        assert np.asarray(same.fit["objective"]) == pytest.approx(np.asarray(plain.fit["objective"]), rel=1e-6)
-        assert same.fit["mean_width_recorded"] == pytest.approx(plain.fit["mean_width"] * X, rel=1e-4)
+        assert np.asarray(same.fit_summary["objective"]) == pytest.approx(
+            np.asarray(plain.fit_summary["objective"]), rel=1e-6
+        )
+        assert same.fit_summary["mean_width_recorded"] == pytest.approx(plain.fit_summary["mean_width"] * X, rel=1e-4)
 
 
 def test_exact_linear_data_gives_the_matrices_and_next_to_no_width():
@@ -269,7 +275,7 @@ def test_exact_linear_data_gives_the_matrices_and_next_to_no_width():
         assert count_outside(model, [transient]) == 0
         assert model.A == pytest.approx(plant.A, abs=1e-8)
         assert model.B == pytest.approx(plant.B, abs=1e-8)
-        assert (model.fit["max_width"] < 1e-9).all()
+        assert (model.fit_summary["max_width"] < 1e-9).all()
 
 
 def test_domain_and_steps_are_those_of_the_data():
@@ -314,10 +320,10 @@ def test_input_that_never_moves_is_named():
             Transient(raw.t_ns, raw.x, u, control_names=["throttle", "steering"]),
             additive="disturbance" if value else "noise",
         )
-        assert any(words in message for message in model.fit["messages"])
+        assert any(words in message for message in model.fit_summary["messages"])
         assert count_outside(model, [Transient(raw.t_ns, raw.x, u)]) == 0
         if value == 0.0:
-            assert model.fit["rank"] == 3
+            assert model.fit_summary["rank"] == 3
             assert (model.B[:, 1] == 0).all() and (model.dB[:, 1] == 0).all()
 
 
@@ -325,32 +331,34 @@ def test_signals_that_move_together_are_named():
     raw = drawn(small_plant(1, 2, 2), 200, 1, rest=0)
     u = np.column_stack([raw.u[:, 0], -2.0 * raw.u[:, 0]])
     model = fit(Transient(raw.t_ns, raw.x, u, control_names=["left", "right"]), additive="noise")
-    assert any("'left' and 'right' move together" in message for message in model.fit["messages"])
-    assert model.fit["rank"] == 3
+    assert any("'left' and 'right' move together" in message for message in model.fit_summary["messages"])
+    assert model.fit_summary["rank"] == 3
 
 
 def test_unstable_nominal_model_is_said():
     plant = UncertainLTI([[2.0]], [[1.0]], [[0.3]], [[0.1]])
     model = fit(drawn(plant, 60, 0, rest=0))
-    assert any("unstable" in message for message in model.fit["messages"])
+    assert any("unstable" in message for message in model.fit_summary["messages"])
 
 
 def test_noise_near_rest_is_named_with_the_remedy():
     transient = drawn(small_plant(3), 400, 3, noise=2e-3, rest=150)
     model = fit(transient)
-    assert any("absurdly wide" in message and "--additive noise" in message for message in model.fit["messages"])
+    assert any(
+        "absurdly wide" in message and "--additive noise" in message for message in model.fit_summary["messages"]
+    )
     better = fit(transient, additive="noise")
-    assert not any("absurdly" in message for message in better.fit["messages"])
-    assert (better.fit["mean_width"] < model.fit["mean_width"]).all()
+    assert not any("absurdly" in message for message in better.fit_summary["messages"])
+    assert (better.fit_summary["mean_width"] < model.fit_summary["mean_width"]).all()
 
 
 def test_constant_step_gives_the_width_to_noise_and_says_so():
     transient = drawn(small_plant(3), 200, 3, noise=1e-3)
     model = fit(transient, additive="both")
     assert (model.dc == 0).all() and (model.v > 0).any() and (model.c != 0).any()
-    assert any("v takes the width" in message for message in model.fit["messages"])
+    assert any("v takes the width" in message for message in model.fit_summary["messages"])
     jittered = fit(drawn(small_plant(3), 200, 3, noise=1e-3, jitter=0.5), additive="both")
-    assert not any("v takes the width" in message for message in jittered.fit["messages"])
+    assert not any("v takes the width" in message for message in jittered.fit_summary["messages"])
 
 
 def test_wrong_options_are_refused():
@@ -480,11 +488,11 @@ def test_transients_weigh_as_the_user_says():
     one, two = drawn(plant, 100, 1, noise=1e-3), drawn(plant, 300, 2, noise=1e-3)
     twice = fit([one, two, Transient(two.t_ns, two.x, two.u)], additive="noise")
     weighed = fit([one, two], additive="noise", transient_weights=[1.0, 2.0])
-    assert weighed.fit["objective"] == pytest.approx(twice.fit["objective"], rel=1e-8)
+    assert weighed.fit_summary["objective"] == pytest.approx(twice.fit_summary["objective"], rel=1e-8)
     assert weighed.dA == pytest.approx(twice.dA, rel=1e-4, abs=1e-6)
     as_said = fit([one, two], additive="noise", weights=[np.full((100, 2), 2.0), np.full((300, 2), 2 / 3)])
     fair = fit([one, two], additive="noise", count="transient")
-    assert fair.fit["objective"] == pytest.approx(as_said.fit["objective"], rel=1e-8)
+    assert fair.fit_summary["objective"] == pytest.approx(as_said.fit_summary["objective"], rel=1e-8)
     assert count_outside(fair, [one, two]) == 0
     for options in (dict(count="run"), dict(transient_weights=[1.0]), dict(transient_weights=[1.0, -1.0])):
         with pytest.raises(FitError, match=r"count is|2 positive numbers"):
@@ -514,7 +522,7 @@ def test_structure_is_kept_and_costs(criterion):
     assert model.A[0, 1] == 0 and model.A[1, 0] == 0 and (model.B >= 0).all() and model.v[1] <= 0.5 * (1 + 1e-9)
     assert model.dA[0, 1] < 1e-12 and model.dA[1, 2] < 1e-12  # rounding apart
     assert model.dB[0, 0] >= 0.1
-    ratio = np.asarray(model.fit["objective"]) / np.asarray(free.fit["objective"])
+    ratio = np.asarray(model.fit_summary["objective"]) / np.asarray(free.fit_summary["objective"])
     assert (ratio >= 1 - 1e-8).all()
 
 
@@ -552,7 +560,7 @@ def test_known_kinematics_leave_only_the_noise():
     exact = Transient(np.arange(count + 1) * dt, x, u, state_names=["position", "velocity"])
     model = with_structure(exact, fixed=rows)
     assert count_outside(model, [exact]) == 0
-    assert model.A[0].tolist() == [0.0, 1.0] and model.fit["max_width"][0] < 1e-12
+    assert model.A[0].tolist() == [0.0, 1.0] and model.fit_summary["max_width"][0] < 1e-12
     noisy = Transient(exact.t_ns, x + 1e-4 * rng.standard_normal(x.shape), u, state_names=["position", "velocity"])
     for criterion in ("qp", "lp"):
         with pytest.raises(FitError, match="'position' cannot contain the step from sample .* additive"):
@@ -607,7 +615,7 @@ def test_structure_goes_to_the_model_file_and_back(tmp_path):
     transient = drawn(small_plant(72), 150, 72, noise=1e-3)
     given = Structure(2, 1, fixed={"A": [[np.nan, 0.3], [0.0, np.nan]]}, upper={"B": [[1.0], [np.nan]]})
     fit(transient, additive="noise", structure=given).save(tmp_path / "m.json")
-    stored = UncertainLTI.load(tmp_path / "m.json").fit["structure"]
+    stored = UncertainLTI.load(tmp_path / "m.json").fit_summary["structure"]
     again = Structure.from_dict(stored, 2, 1)
     for side in ("lower", "upper"):
         for name, values in getattr(given, side).items():
@@ -628,15 +636,17 @@ def test_discards_find_the_outliers(criterion, budget):
     x[200:, 1] += 0.7  # spoils one step
     spoiled = Transient(clean.t_ns, x, clean.u, name="run.mcap")
     model = fit(spoiled, criterion, additive="noise", discard=budget)
-    assert [(d["file"], d["k"]) for d in sorted(model.fit["discarded"], key=lambda d: d["k"])] == [
+    assert [(d["file"], d["k"]) for d in sorted(model.fit_summary["discarded"], key=lambda d: d["k"])] == [
         ("run.mcap", 89),
         ("run.mcap", 90),
         ("run.mcap", 199),
     ]
-    assert model.fit["transitions"] == 257 and all(d["effect"] > 0 for d in model.fit["discarded"])
+    assert model.fit_summary["transitions"] == 257 and all(d["effect"] > 0 for d in model.fit_summary["discarded"])
     everything = fit(spoiled, criterion, additive="noise")
-    assert (model.fit["mean_width"] < 0.5 * everything.fit["mean_width"]).all()
-    assert model.fit["with_discarded"]["mean_width"] == pytest.approx(everything.fit["mean_width"], rel=1e-6)
+    assert (model.fit_summary["mean_width"] < 0.5 * everything.fit_summary["mean_width"]).all()
+    assert model.fit_summary["with_discarded"]["mean_width"] == pytest.approx(
+        everything.fit_summary["mean_width"], rel=1e-6
+    )
     kept = Transient(clean.t_ns, x, clean.u)
     assert count_outside(model, [kept]) <= 6
 
@@ -653,7 +663,7 @@ def test_discards_are_the_best_single_ones(criterion, seed):
 
     everything = objective()
     effects = [float(np.sum((everything - objective(k)) / everything)) for k in range(60)]
-    (chosen,) = fit(transient, criterion, additive="noise", discard=1).fit["discarded"]
+    (chosen,) = fit(transient, criterion, additive="noise", discard=1).fit_summary["discarded"]
     # (10) sums the widths over one transition less here, which the choice leaves out of account
     assert effects[chosen["k"]] >= max(effects) - (0.01 if criterion == "qp" else 1e-6)
     if criterion == "lp":
@@ -677,10 +687,10 @@ def test_controls_that_move_together_cost_no_optimality(criterion, seed):
     transient = Transient(transient.t_ns, transient.x * scale, transient.u)
     model = fit(transient, criterion, additive="disturbance")
     assert count_outside(model, [transient]) == 0
-    assert model.fit["gap"] < 1e-6
+    assert model.fit_summary["gap"] < 1e-6
     problem = assemble([transient], OperatingPoint.identity(3, 3), None, "disturbance")
     _, _, objective = formulation.solve(problem, criterion, cp.CLARABEL)
-    np.testing.assert_allclose(model.fit["objective"], objective, rtol=1e-5)
+    np.testing.assert_allclose(model.fit_summary["objective"], objective, rtol=1e-5)
 
 
 @pytest.mark.parametrize("N", [300, 3 * SUBSAMPLE])
@@ -690,6 +700,6 @@ def test_a_weight_beside_the_largest_width_that_is_too_large_is_seen(monkeypatch
     expected = fit(transient, "lp", additive="noise")
     monkeypatch.setattr(working_set, "REGULARISATION", 100.0)
     model = fit(transient, "lp", additive="noise")
-    np.testing.assert_allclose(model.fit["objective"], expected.fit["objective"], rtol=1e-8)
-    np.testing.assert_allclose(model.fit["mean_width"], expected.fit["mean_width"], rtol=1e-3)
-    assert model.fit["gap"] < 1e-6 and count_outside(model, [transient]) == 0
+    np.testing.assert_allclose(model.fit_summary["objective"], expected.fit_summary["objective"], rtol=1e-8)
+    np.testing.assert_allclose(model.fit_summary["mean_width"], expected.fit_summary["mean_width"], rtol=1e-3)
+    assert model.fit_summary["gap"] < 1e-6 and count_outside(model, [transient]) == 0

@@ -55,7 +55,7 @@ def test_its_simulation_is_eq_3():
     """`control.forced_response` of the discrete system is the free run of the nominal model."""
     model = some_model(3, 2, 5)
     A = model.A - 3 * np.eye(3)
-    model = model.with_(A=A)
+    model = model.replace(A=A)
     rng, dt = np.random.default_rng(1), 0.02
     u = rng.normal(size=(50, 2))
     system = model.to_control(dt)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.model.alarm_rule import AlarmRule
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -33,7 +33,7 @@ class Rig:
     """A watch fed by hand, and what its journal says; time goes on by one step with every sample."""
 
     def __init__(self, **rule: Any) -> None:
-        model = self.model = by_hand(alarm=Alarm(2, 5))
+        model = self.model = by_hand(alarm_rule=AlarmRule(2, 5))
         self.said: list[tuple[int, str]] = []
         self.now, self.t_ns = 100.0, EPOCH_NS
         self.x, self.u = np.zeros(model.n), np.full(model.m, 0.2)
@@ -307,7 +307,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 
 def test_the_log_of_the_node_tells_the_story(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm=Alarm(2, 5))
+    model = by_hand(alarm_rule=AlarmRule(2, 5))
     process = world.monitor(saved(model, tmp_path))
     process.says(f"active: listening to {STATE}, {CONTROL}")
     process.says(f"no verdict yet: nothing received on {STATE}, {CONTROL}")

@@ -14,7 +14,8 @@ import pytest
 from bag_writer import Layout, Message, Topic, cdr, float64, header, write
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
-from uncertain_lti.model.uncertain_lti import Alarm, Domain, Sampling
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import header_stamp_ns
@@ -231,7 +232,7 @@ class Outputs:
 
 @pytest.mark.parametrize(("steps", "rate"), [(200, 1.0), (1500, 6.0)], ids=["real time", "six times as fast"])
 def test_header_time_gives_live_what_it_gives_offline(world: World, tmp_path: Path, steps: int, rate: float) -> None:
-    model = by_hand(alarm=Alarm(2, 5))
+    model = by_hand(alarm_rule=AlarmRule(2, 5))
     path = saved(model, tmp_path)
     bag = header_bag(model, tmp_path / "run.mcap", steps)
     verdicts = offline(path, bag)
@@ -349,7 +350,7 @@ class Plant:
 
 
 def test_every_verdict_and_every_heartbeat_is_published(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm=Alarm(2, 3))
+    model = by_hand(alarm_rule=AlarmRule(2, 3))
     path = saved(model, tmp_path)
     world.monitor(path, heartbeat=0.2)
     late: list[Any] = []
@@ -403,7 +404,7 @@ def test_a_sample_outside_the_fitted_domain_is_marked_and_still_judged(world: Wo
 
 def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp_path: Path) -> None:
     domain = Domain(np.full(2, -1.0), np.full(2, 1.0), np.full(2, -0.5), np.full(2, 0.5))
-    model = by_hand(domain=domain, alarm=Alarm(3, 5))
+    model = by_hand(domain=domain, alarm_rule=AlarmRule(3, 5))
     world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=0.6, hardware_id="rig 1")
     diagnostics = world.diagnostics()
     status = diagnostics.reaches(STALE, saying="nothing ever received on")

@@ -19,7 +19,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.model.uncertain_lti import FORMAT, Alarm, Domain, Sampling, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.uncertain_lti import FORMAT, UncertainLTI
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -274,13 +276,13 @@ def test_a_model_is_not_changed_behind_its_back() -> None:
     assert model.A[0, 0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
         model.A[0, 0] = 7.0
-    assert model.with_(v=[2.0]).v.tolist() == [2.0] and model.v.tolist() == [0.0]
+    assert model.replace(v=[2.0]).v.tolist() == [2.0] and model.v.tolist() == [0.0]
 
 
 @pytest.mark.parametrize("rule", [(0, 1, 1.0), (2, 1, 1.0), (1, 0, 1.0), (1, 10**400, 1.0), (1.5, 2, 1.0), (1, 1, 0.0)])
 def test_an_alarm_rule_out_of_range_is_refused(rule: tuple[Any, ...]) -> None:
     with pytest.raises(ModelError, match="^alarm: "):
-        Alarm(*rule)
+        AlarmRule(*rule)
 
 
 # --- the file ------------------------------------------------------------------------------------------------
@@ -325,13 +327,13 @@ def models(draw: st.DrawFn) -> UncertainLTI:
     box = [draw(hnp.arrays(float, k, elements=number)) for k in (n, n, m, m)]
     if draw(st.booleans()):
         box[0][0] = -INF
-    return model.with_(
+    return model.replace(
         A=draw(hnp.arrays(float, (n, n), elements=number)),
         signals=signals,
         sampling=sampling,
         domain=draw(st.sampled_from([Domain(*box), None])),
-        alarm=Alarm(2, draw(st.integers(2, 9)), draw(positive)),
-        fit={"criterion": "qp", "numbers": [1, 2.5, None], "inner": {"a": "ä"}},
+        alarm_rule=AlarmRule(2, draw(st.integers(2, 9)), draw(positive)),
+        fit_summary={"criterion": "qp", "numbers": [1, 2.5, None], "inner": {"a": "ä"}},
         validation={"inside": draw(number)},
     )
 
@@ -347,7 +349,7 @@ def test_a_saved_model_is_the_same_to_the_last_bit(
         assert bits(getattr(loaded, name)) == bits(getattr(model, name))
     for name in ("x_min", "x_max", "u_min", "u_max"):
         assert bits(getattr(loaded.domain, name)) == bits(getattr(model.domain, name))
-    for name in ("sampling", "alarm", "fit", "validation"):
+    for name in ("sampling", "alarm_rule", "fit_summary", "validation"):
         assert getattr(loaded, name) == getattr(model, name)
     assert loaded.signals.signals == model.signals.signals
     assert (loaded.signals.clock, loaded.signals.max_gap, loaded.signals.max_skew, dict(loaded.signals.time)) == (
@@ -370,13 +372,15 @@ def test_a_model_fitted_to_arrays_has_a_file_too(tmp_path: Path) -> None:
 
 def test_numbers_that_json_lacks_become_null_and_the_rest_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.json"
-    model = UncertainLTI(ONE, ONE, ONE, ONE, fit={"a": NAN, "b": np.arange(2), "c": np.float64(INF), "d": np.bool_(1)})
+    model = UncertainLTI(
+        ONE, ONE, ONE, ONE, fit_summary={"a": NAN, "b": np.arange(2), "c": np.float64(INF), "d": np.bool_(1)}
+    )
     model.save(path)
-    assert UncertainLTI.load(path).fit == {"a": None, "b": [0, 1], "c": None, "d": True}
+    assert UncertainLTI.load(path).fit_summary == {"a": None, "b": [0, 1], "c": None, "d": True}
     whole = path.read_bytes()
     for bad in ({"a": object()}, {"a": "\ud800"}, {"a": {1, 2}}):
         with pytest.raises(ModelError, match="what JSON cannot"):
-            model.with_(fit=bad).save(path)
+            model.replace(fit_summary=bad).save(path)
         assert path.read_bytes() == whole and os.listdir(tmp_path) == ["m.json"]
 
 
@@ -431,7 +435,7 @@ def write(folder: Path, data: Any) -> Path:
 
 def test_the_base_of_the_damaged_files_is_whole(tmp_path: Path) -> None:
     model = UncertainLTI.load(write(tmp_path, base()))
-    assert (model.n, model.m, model.alarm.window, model.sampling.max_skew) == (2, 1, 3, 0.1)
+    assert (model.n, model.m, model.alarm_rule.window, model.sampling.max_skew) == (2, 1, 3, 0.1)
     assert model.to_dict() == base()
 
 
@@ -693,7 +697,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, mon
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
         with pytest.raises(ModelError, match="cannot be written: No space left on device; choose another place"):
-            model.with_(v=[1.0, 1.0]).save(path)
+            model.replace(v=[1.0, 1.0]).save(path)
     assert path.read_bytes() == whole and os.listdir(tmp_path) == ["m.json"]
     (tmp_path / "folder").mkdir()
     with pytest.raises(ModelError, match="folder: cannot be written"):

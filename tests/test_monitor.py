@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.uncertain_lti import Alarm, Domain
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Domain
 from uncertain_lti.sampling.sampler import Sampler, Status, Step
 from uncertain_lti.signals.signal_map import Signal
 
@@ -75,7 +76,7 @@ def test_bounds_are_summed_in_the_order_of_the_columns(n: int, m: int) -> None:
 def test_sample_by_sample_gives_the_bits_of_the_whole_transient(n: int, m: int, margin: float) -> None:
     rng = np.random.default_rng(3)
     box = Domain(-rng.uniform(0, 9, n), rng.uniform(0, 9, n), -rng.uniform(0, 9, m), rng.uniform(0, 9, m))
-    model = a_model(n, m, 4, domain=box, alarm=Alarm(2, 5))
+    model = a_model(n, m, 4, domain=box, alarm_rule=AlarmRule(2, 5))
     transient = a_transient(n, m, 5)
     whole = EnvelopeMonitor(model, margin=margin).check(transient)
     verdicts = judge(EnvelopeMonitor(model, margin=margin), transient)
@@ -92,7 +93,7 @@ def test_the_alarm_counts_violations_in_its_window_and_only_those_that_count(dat
     violations = data.draw(st.integers(1, window))
     n = 3
     masked = data.draw(st.lists(st.sampled_from(["x0", "x1"]), unique=True))
-    model = a_model(n, 0, 6, alarm=Alarm(violations, window))
+    model = a_model(n, 0, 6, alarm_rule=AlarmRule(violations, window))
     transient = a_transient(n, 0, data.draw(st.integers(0, 10**6)))
     armed = data.draw(st.lists(st.booleans(), min_size=len(transient) - 1, max_size=len(transient) - 1))
     monitor = EnvelopeMonitor(model, margin=0.5, masked=masked)
@@ -143,7 +144,7 @@ def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
         rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.uniform(0, 30, (n, n)), rng.uniform(0, 30, (n, m)),
         rng.normal(size=n), rng.uniform(0, 20, n), rng.uniform(0, 1, n),
         signals=signals, domain=draw(st.sampled_from([box, None])),
-        alarm=Alarm(draw(st.integers(1, window)), window, draw(st.sampled_from([1.0, 0.5, 3.0]))),
+        alarm_rule=AlarmRule(draw(st.integers(1, window)), window, draw(st.sampled_from([1.0, 0.5, 3.0]))),
     )  # fmt: skip
     sampler = Sampler(signals)
     pushed = [s for k in range(len(t)) for s in sampler.push("/c", int(t[k]), int(t[k]), z[k].tolist())]
@@ -179,7 +180,7 @@ def test_a_stream_gives_the_bits_of_its_transient(case: tuple[UncertainLTI, Tran
 def test_verdicts_are_those_of_the_rules_worked_out_naively(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
     model, transient, _ = case
     verdicts = EnvelopeMonitor(model).check(transient)
-    point, rule = model.operating_point, model.alarm
+    point, rule = model.operating_point, model.alarm_rule
     recent: deque[bool] = deque(maxlen=rule.window)
     alarm = False
     for k, status in enumerate(transient.statuses()):
@@ -303,9 +304,9 @@ def test_an_alarm_rule_out_of_range_is_refused(options: dict[str, Any], words: s
 
 
 def test_what_is_given_replaces_the_rule_of_the_model() -> None:
-    model = scalar(alarm=Alarm(2, 5, 1.5))
-    assert EnvelopeMonitor(model).rule == Alarm(2, 5, 1.5)
-    assert EnvelopeMonitor(model, violations=3, margin=1.0).rule == Alarm(3, 5, 1.0)
+    model = scalar(alarm_rule=AlarmRule(2, 5, 1.5))
+    assert EnvelopeMonitor(model).rule == AlarmRule(2, 5, 1.5)
+    assert EnvelopeMonitor(model, violations=3, margin=1.0).rule == AlarmRule(3, 5, 1.0)
 
 
 def test_a_transient_of_other_size_is_refused() -> None:

@@ -18,7 +18,7 @@ from bag_writer import Layout, Message, Topic, write
 from conftest import ROOT
 
 from uncertain_lti import UncertainLTI
-from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.sampling.sampler import Status
 
@@ -132,7 +132,7 @@ def orderly_bag(model: UncertainLTI, path: Path, steps: int) -> Path:
 
 
 def test_under_every_disorder_the_verdicts_are_those_of_the_offline_check(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm=Alarm(2, 5))
+    model = by_hand(alarm_rule=AlarmRule(2, 5))
     path = saved(model, tmp_path)
     bag = faulty_bag(model, tmp_path / "faults.mcap", 400)
     verdicts = offline(path, bag)
@@ -482,7 +482,7 @@ def test_reload_reads_the_file_again_or_says_why_not(world: World, tmp_path: Pat
 
 
 def test_a_control_that_is_sent_once_and_a_latched_alarm_outlive_a_reload(world: World, tmp_path: Path) -> None:
-    model = by_hand(max_hold=None, alarm=Alarm(2, 3))
+    model = by_hand(max_hold=None, alarm_rule=AlarmRule(2, 3))
     path = saved(model, tmp_path)
     mode_type = {"enable": "/machine/mode data == 3", "enable_type": "std_msgs/msg/UInt8"}
     process = world.monitor(path, latch=True, **mode_type)
@@ -523,7 +523,7 @@ def test_snapshots_hold_what_came_and_what_was_said(world: World, tmp_path: Path
     folder.mkdir()
     keep = folder / "of someone else.mcap"
     keep.write_bytes(b"mine")
-    model = by_hand(alarm=Alarm(2, 3))
+    model = by_hand(alarm_rule=AlarmRule(2, 3))
     path = saved(model, tmp_path)
     options: dict[str, Any] = {"snapshot.folder": str(folder), "snapshot.keep": 2, "snapshot.seconds": 30.0}
     world.monitor(path, **options)

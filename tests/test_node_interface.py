@@ -16,7 +16,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
-from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.model.alarm_rule import AlarmRule
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -178,7 +178,7 @@ sys.exit(envelope_monitor.main())
 
 
 def test_without_the_events_executor_the_default_one_does_the_same(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm=Alarm(2, 5))
+    model = by_hand(alarm_rule=AlarmRule(2, 5))
     path = saved(model, tmp_path)
     bag = header_bag(model, tmp_path / "run.mcap", 150)
     code = """

@@ -16,7 +16,7 @@ pytest.importorskip("cyclonedds", reason="the cyclonedds wheel, which subscribes
 from ros_processes import World, open_world
 from test_live import by_hand, header_bag, offline, saved
 
-from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.sampling.sampler import Status
 
 # Cyclone DDS on loopback, where multicast may be missing: the peer is named.
@@ -86,7 +86,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 
 def test_another_vendor_hears_every_flag(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm=Alarm(2, 5))
+    model = by_hand(alarm_rule=AlarmRule(2, 5))
     path = saved(model, tmp_path)
     bag = header_bag(model, tmp_path / "run.mcap", 300)
     verdicts = offline(path, bag)

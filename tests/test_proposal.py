@@ -94,9 +94,11 @@ def test_real_recordings_fit_unedited(recordings, name):
     wanted_states, wanted_controls = REAL[name]
     assert wanted_states <= states and wanted_controls <= controls, proposal.text
     model = fitted([path], proposal)
-    assert model.fit["violations"] == 0
+    assert model.fit_summary["violations"] == 0
     assert "vector.y" not in controls and "twist.angular.z" not in states - wanted_states
-    assert not any("better when it is taken" in m or "like noise" in m for m in model.fit["messages"]), proposal.text
+    assert not any("better when it is taken" in m or "like noise" in m for m in model.fit_summary["messages"]), (
+        proposal.text
+    )
     if name in ("cougars_auv/SO_bag_0", "hunter_se/straight_odd_t_0_5_run_01"):  # depth is pressure; a rate is noise
         assert len(states) == 1
 
@@ -123,14 +125,14 @@ def test_the_shipped_engine(tmp_path):
     proposal = propose([path])
     assert len(proposal.states) == 5 and len(proposal.controls) == 4
     assert {c.name for c in proposal.controls} >= {"main_fuel_flow"}
-    assert fitted([path], proposal).fit["violations"] == 0
+    assert fitted([path], proposal).fit_summary["violations"] == 0
 
 
 def test_several_recordings_of_one_machine(tmp_path):
     paths = [save(tmp_path / f"{i}.mcap", driven(seed=i), {}) for i in range(3)]
     proposal = propose(paths)
     assert signals_of(proposal) == ([("/plant/state", "data")], [("/plant/cmd", "data")])
-    assert fitted(paths, proposal).fit["transients"] == 3
+    assert fitted(paths, proposal).fit_summary["transients"] == 3
 
 
 def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
@@ -148,7 +150,7 @@ def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
         proposal = propose(order)
         assert signals_of(proposal) == ([("/plant/state", "data")], [("/plant/cmd", "data")])
         assert "/plant/more_state: not in every recording" in proposal.text
-        assert fitted(order, proposal).fit["transients"] == 3
+        assert fitted(order, proposal).fit_summary["transients"] == 3
 
 
 def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
@@ -243,7 +245,7 @@ def test_angles_of_quaternions_are_unwrapped(tmp_path):
     assert [c.path for c in proposal.states] == ["unwrap(yaw(pose.orientation))"]
     assert "orientation.w" not in proposal.text
     model = fitted([path], proposal)
-    assert model.fit["mean_width_recorded"][0] < 0.1, "no jump by a turn inside the envelope"
+    assert model.fit_summary["mean_width_recorded"][0] < 0.1, "no jump by a turn inside the envelope"
 
 
 def test_a_quaternion_that_is_none_is_read_as_four_numbers(tmp_path):
@@ -301,7 +303,7 @@ def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
     assert said("data[4]: a number in 10 of 400 messages only") and said("data[5]: moves with data[0]")
     assert said(f"an array of {LONGEST_ARRAY + 1} numbers")
     assert said("/plant/talk: no number in it") and said("/plant/silent_state: 0 messages only")
-    assert fitted([path], proposal).fit["violations"] == 0
+    assert fitted([path], proposal).fit_summary["violations"] == 0
 
 
 def test_pictures_and_scans_are_not_opened(tmp_path):
@@ -335,7 +337,7 @@ def test_commands_that_come_now_and_then(tmp_path):
     proposal = propose([path])
     assert [c.topic for c in proposal.controls] == ["/plant/cmd"]
     assert "max_hold" not in yaml.safe_load(proposal.text)["controls"][0]
-    assert fitted([path], proposal).fit["transitions"] > 500
+    assert fitted([path], proposal).fit_summary["transitions"] > 500
 
 
 def test_clocks_that_disagree_are_not_mixed(tmp_path):
@@ -352,7 +354,7 @@ def test_clocks_that_disagree_are_not_mixed(tmp_path):
     proposal = propose([path])
     topics = yaml.safe_load(proposal.text)["topics"]
     assert topics == {"/plant/state": {"time": "log"}, "/plant/cmd": {"time": "log"}}
-    assert fitted([path], proposal).fit["transitions"] > 300
+    assert fitted([path], proposal).fit_summary["transitions"] > 300
 
 
 def test_stamps_that_stand_still_are_not_gone_by(tmp_path):
@@ -367,7 +369,7 @@ def test_stamps_that_stand_still_are_not_gone_by(tmp_path):
     path = save(tmp_path / "a.mcap", messages, {"/plant/state": "geometry_msgs/msg/PointStamped"})
     proposal = propose([path])
     assert yaml.safe_load(proposal.text)["topics"]["/plant/state"] == {"time": "log"}
-    assert fitted([path], proposal).fit["transitions"] > 300
+    assert fitted([path], proposal).fit_summary["transitions"] > 300
 
 
 def test_topics_and_names_that_yaml_would_misread(tmp_path):
@@ -526,4 +528,4 @@ def test_a_late_answer_becomes_the_delay_that_the_fit_would_name(tmp_path, late)
     path = save(tmp_path / "run.mcap", messages, {})
     proposal = propose([path])
     assert [c.delay for c in proposal.controls] == [late]
-    assert not any("better when it is taken" in m for m in fitted([path], proposal).fit["messages"])
+    assert not any("better when it is taken" in m for m in fitted([path], proposal).fit_summary["messages"])

@@ -43,10 +43,10 @@ def test_fit_contains_and_is_not_absurd(recordings, signals_folder, bags, signal
     assert outside(model, transients) == 0
     steps = [t.transitions() for t in transients]
     span = np.ptp(np.vstack([s.x for s in steps]), axis=0)
-    wide = model.fit["mean_width_recorded"] > 0.5 * span  # an envelope as wide as the range tells nothing
-    said = " ".join(m for m in model.fit["messages"] if "as wide as the state's own range" in m)
+    wide = model.fit_summary["mean_width_recorded"] > 0.5 * span  # an envelope as wide as the range tells nothing
+    said = " ".join(m for m in model.fit_summary["messages"] if "as wide as the state's own range" in m)
     assert [f"'{name}' (" in said for name in model.state_names] == wide.tolist()
-    assert not any("absurdly" in message for message in model.fit["messages"])
+    assert not any("absurdly" in message for message in model.fit_summary["messages"])
     if infeasible is not None:
         try:
             pure = fit(transients, criterion, additive="none")
@@ -70,7 +70,7 @@ def test_go2_fit_on_every_other_second_holds_on_the_others(recordings, signals_f
     unseen = sum((v.violated & ~v.outside_domain).sum() for v in verdicts)
     assert judged > 2500
     assert unseen < 0.01 * judged  # inside the fitted domain; measured: 0.03 to 0.4 %
-    assert (model.fit["mean_width_recorded"] < 0.6 * np.ptp(transient.transitions().x, axis=0)).all()
+    assert (model.fit_summary["mean_width_recorded"] < 0.6 * np.ptp(transient.transitions().x, axis=0)).all()
 
 
 def cut(transient, start, stop):
@@ -131,7 +131,7 @@ def test_steering_that_never_moves_is_named(recordings, signals_folder, tmp_path
     model = fit(transients, additive="disturbance")
     assert outside(model, transients) == 0
     if np.ptp(steering) == 0:
-        assert any("'steering'" in message for message in model.fit["messages"])
+        assert any("'steering'" in message for message in model.fit_summary["messages"])
 
 
 def test_gas_turbine_recordings_differ_and_the_check_says_so(recordings, signals_folder, tmp_path):
@@ -162,4 +162,4 @@ def test_rlc_circuit_with_known_truth(recordings):
     forward = (expm(continuous * dt) - np.eye(2)) / dt  # what a one-step model of this step sees
     assert outside(model, [t]) == 0
     assert (np.abs(model.A - forward) <= model.dA + 0.03 * np.abs(forward)).all()
-    assert (model.fit["max_width"] < 0.05).all()
+    assert (model.fit_summary["max_width"] < 0.05).all()

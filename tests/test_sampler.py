@@ -134,7 +134,7 @@ class Reference:
         taken = [s.index for s in self.samples] if clock else self.by_topic[topic]
         values = {i: list(self.sent[i].values) for i in taken}
         for column, position in enumerate(where):
-            signal = self.signals.signals[position]
+            signal = self.signals[position]
             if not signal.field.startswith("unwrap"):
                 continue
             last = signal.steady
@@ -237,7 +237,7 @@ class Reference:
                 age, chosen = best
                 sample.chosen[topic] = chosen
             for position, value in zip(where, self.values[topic][chosen], strict=True):
-                signal = self.signals.signals[position]
+                signal = self.signals[position]
                 limit = self.signals.max_skew or self.signals.max_gap
                 if position >= self.n:
                     limit = signal.max_hold

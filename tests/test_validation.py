@@ -13,7 +13,7 @@ from tanks import DT, Tanks
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
-from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.validation.calibration import calibrate, detection
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.validation.left_out import Part, _rest, cut, judge, leave_out_cheaply, validate, validate_model
@@ -115,7 +115,7 @@ def runs():
 
 @pytest.fixture(scope="module")
 def validation(runs):
-    return validate(runs, criterion="qp", additive="noise", alarm=Alarm(2, 3))
+    return validate(runs, criterion="qp", additive="noise", alarm_rule=AlarmRule(2, 3))
 
 
 def test_it_is_leaving_out_by_hand(runs, validation):
@@ -126,7 +126,7 @@ def test_it_is_leaving_out_by_hand(runs, validation):
         assert part.name == runs[g].name and part.judged == verdicts.judged.sum()
         assert part.violated == verdicts.violated.sum()
         assert np.array_equal(part.violations, (verdicts.flags == 1).sum(axis=0))
-        assert part.alarms(Alarm(2, 3)) == np.count_nonzero(np.diff(verdicts.alarm.astype(int)) == 1)
+        assert part.alarms(AlarmRule(2, 3)) == np.count_nonzero(np.diff(verdicts.alarm.astype(int)) == 1)
         width = (verdicts.upper - verdicts.lower)[verdicts.judged]
         assert part.mean_width == pytest.approx(width.mean(axis=0))
         assert part.max_width == pytest.approx(width.max(axis=0))
@@ -141,7 +141,7 @@ def test_the_summary_adds_up(validation, runs):
     assert data["inside_interval"][0] <= data["inside"] <= data["inside_interval"][1]
     for name, state in data["states"].items():
         i = int(name[1]) - 1
-        assert state["mean_width_full"] == pytest.approx(validation.model.fit["mean_width_recorded"][i])
+        assert state["mean_width_full"] == pytest.approx(validation.model.fit_summary["mean_width_recorded"][i])
         assert state["inside"] >= data["inside"] and 0.8 < state["left_out_to_full"] <= 1.01
     rules = [(a["violations"], a["window"]) for a in data["false_alarms"]]
     assert rules == [(2, 3), (1, 1), (3, 5)]  # the model's own first, none twice
@@ -161,7 +161,7 @@ def test_alarms_are_those_of_the_monitor_at_any_margin(validation, runs, m, n):
         verdicts = EnvelopeMonitor(validation.model, m, n, margin).check(looped)
         alarm, reset = verdicts.alarm, np.concatenate([[False], np.diff(looped.t_ns) < 0])
         edges = alarm & ~np.concatenate([[False], alarm[:-1]]) | alarm & reset
-        assert part.alarms(Alarm(m, n, margin)) == np.count_nonzero(edges)
+        assert part.alarms(AlarmRule(m, n, margin)) == np.count_nonzero(edges)
 
 
 def test_a_recording_that_leaves_the_others_envelope_changes_it():
@@ -261,12 +261,12 @@ def test_discards_are_counted_as_recordings():
 def test_calibration_keeps_to_the_wish_and_says_what_it_costs(validation, runs):
     hours = 120 / 3600
     strict, loose = calibrate(validation, 5 / hours), calibrate(validation, 40 / hours)
-    assert strict.alarm is not None and loose.alarm is not None
+    assert strict.alarm_rule is not None and loose.alarm_rule is not None
     for found in (strict, loose):
         for c in found.candidates:
             if c.margin is not None:
                 assert c.upper <= found.wish
-                assert sum(p.alarms(Alarm(c.violations, c.window, c.margin)) for p in validation.parts) == c.alarms
+                assert sum(p.alarms(AlarmRule(c.violations, c.window, c.margin)) for p in validation.parts) == c.alarms
         assert "confidence" in found.words and "is seen" in found.words
         json.dumps(found.to_dict(), allow_nan=False)
     for a, b in zip(strict.candidates, loose.candidates, strict=True):
@@ -276,7 +276,7 @@ def test_calibration_keeps_to_the_wish_and_says_what_it_costs(validation, runs):
 
 def test_calibration_refuses_what_so_little_cannot_show(validation):
     found = calibrate(validation, 0.1)
-    assert found.alarm is None and found.hours < found.needed_hours
+    assert found.alarm_rule is None and found.hours < found.needed_hours
     assert "without a single alarm" in found.words
     with pytest.raises(FitError, match="positive"):
         calibrate(validation, 0.0)
@@ -297,11 +297,11 @@ def test_detection_of_a_stated_fault_is_that_of_a_monitor(validation, runs):
     util = part.utilisation.copy()
     util[start:, state] += 2 * part.narrowness[start:, state]
     assert np.array_equal(np.abs(util).max(axis=1) > 1, left)
-    share, delay = detection([part], Alarm(1, 1, 1.0))
+    share, delay = detection([part], AlarmRule(1, 1, 1.0))
     assert (share > 0.9).all() and delay == pytest.approx(DT)  # two half-widths more leave the bounds at once
-    share, delay = detection([part], Alarm(5, 10, 1.0))
+    share, delay = detection([part], AlarmRule(5, 10, 1.0))
     assert (share > 0.8).all() and (delay >= 5 * DT - 1e-9).all()
-    share, delay = detection([part], Alarm(1, 1, 1.0), size=1e-6)  # alarms that were there anyway do not count
+    share, delay = detection([part], AlarmRule(1, 1, 1.0), size=1e-6)  # alarms that were there anyway do not count
     assert (share == 0).all() and np.isinf(delay).all()
 
 
@@ -336,7 +336,7 @@ def test_intervals_contain_the_truth_as_often_as_they_say():
         hours = x.shape[0] * 100 * DT / 3600
         data = validation.to_dict()
         for entry in data["false_alarms"]:
-            rule = Alarm(entry["violations"], entry["window"])
+            rule = AlarmRule(entry["violations"], entry["window"])
             alarms, left = true_alarms(validation.model, x, u, rule)
             low, high = entry["interval"]
             held.setdefault(f"alarms {rule.violations}/{rule.window}", []).append(low <= alarms.sum() / hours <= high)
@@ -350,8 +350,8 @@ def test_intervals_contain_the_truth_as_often_as_they_say():
             held.setdefault("scenario", []).append(low <= risk <= high)
         wish = rng.uniform(0.2, 1.0) / (100 * DT / 3600)
         found = calibrate(validation, wish)
-        if found.alarm is not None:
-            alarms, _ = true_alarms(validation.model, x, u, found.alarm)
+        if found.alarm_rule is not None:
+            alarms, _ = true_alarms(validation.model, x, u, found.alarm_rule)
             held.setdefault("calibrated", []).append(alarms.sum() / hours <= wish)
     shares = {what: (float(np.mean(hits)), len(hits)) for what, hits in held.items()}
     print(shares)
@@ -371,7 +371,7 @@ def test_blocks_of_one_recording_keep_their_promise_for_more_of_the_same():
         x, u = x[:, 50:], u[:, 50:]  # settled, as most of a long recording is
         hours = 20 * 750 * DT / 3600
         for entry in validation.to_dict()["false_alarms"]:
-            rule = Alarm(entry["violations"], entry["window"])
+            rule = AlarmRule(entry["violations"], entry["window"])
             alarms, _ = true_alarms(validation.model, x, u, rule)
             low, high = entry["interval"]
             held.setdefault(f"{rule.violations}/{rule.window}", []).append(low <= alarms.sum() / hours <= high)
@@ -441,8 +441,8 @@ def test_validate_then_watch_with_the_rule_found(folder, capsys):
     assert "at most 2000 false alarms per hour" in capsys.readouterr().out
     found, before = UncertainLTI.load(better), UncertainLTI.load(model)
     chosen = [(c["violations"], c["window"], c["margin"]) for c in found.validation["calibration"]["candidates"]]
-    assert (found.alarm.violations, found.alarm.window, found.alarm.margin) in chosen
-    assert np.array_equal(found.A, before.A) and before.alarm == Alarm()
+    assert (found.alarm_rule.violations, found.alarm_rule.window, found.alarm_rule.margin) in chosen
+    assert np.array_equal(found.A, before.A) and before.alarm_rule == AlarmRule()
     assert main(["validate", model, "--blocks", "3", "--gap", "0.1", "--json"]) == 0
     data = json.loads(capsys.readouterr().out)["validation"]
     assert data["kind"] == "blocks" and data["parts"] == 18 and data["gap"] == 0.1
@@ -477,7 +477,7 @@ def test_a_rule_that_sees_little_is_warned_of(folder, capsys, monkeypatch):
         assert main(["validate", model, "--false-alarms", "2000", "--output", target]) == 0
         lines[size] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning:")]
         written = UncertainLTI.load(target)
-        found, rule = written.validation["calibration"], written.alarm
+        found, rule = written.validation["calibration"], written.alarm_rule
         (chosen,) = [
             c
             for c in found["candidates"]
@@ -500,7 +500,7 @@ def test_validate_refuses_what_it_cannot_vouch_for(folder, capsys):
     assert main(["validate", model, "--output", str(folder / "nowhere" / "m.json")]) == 2
     assert "make it first" in capsys.readouterr().err
     weighted = UncertainLTI.load(model)
-    weighted = weighted.with_(fit={**weighted.fit, "weights": "per state"})
+    weighted = weighted.replace(fit_summary={**weighted.fit_summary, "weights": "per state"})
     with pytest.raises(FitError, match="fitted with weights"):
         validate_model(weighted, [])
     assert leave_out_cheaply([], weighted, 0.0) is None

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
-from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.reports.figures import budget_figure, envelope_figure, matrices_figure, save, utilisation_figure
 from uncertain_lti.reports.text import check_data, check_text, fit_text
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     print("1. Fitting a healthy turbofan (a nonlinear model with noisy sensors): pulses of every control both ways,")
     print(f"   and a run under control: {', '.join(FIT)}")
     transients = read_transients([bags / name for name in FIT], turbofan_signals())
-    model = fit(transients, "lp", additive="noise", alarm=Alarm(violations=2, window=5))
+    model = fit(transients, "lp", additive="noise", alarm_rule=AlarmRule(violations=2, window=5))
     model.save(model_file)
     print(fit_text(model, transients))
     print(f"   model: {model_file}")
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     )
     raised = offline.transient.t[offline.alarm]
     print(
-        f"the alarm ({model.alarm.violations} of {model.alarm.window} verdicts violated) is raised "
+        f"the alarm ({model.alarm_rule.violations} of {model.alarm_rule.window} verdicts violated) is raised "
         + (f"{raised[0] - t:.3f} s after that" if len(raised) and raised[0] >= t else "too early or not at all")
     )
     event = (t, what)

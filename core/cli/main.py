@@ -358,11 +358,11 @@ def _fit(options: argparse.Namespace) -> int:
             progress=step,
         )
     sources = [{"file": name, "sha256": sha256(name)} for t in transients for name in t.sources]
-    model = model.with_(fit={**model.fit, "sources": sources})
+    model = model.replace(fit_summary={**model.fit_summary, "sources": sources})
     with options.progress.stage("validating") as step:
         left_out = leave_out_cheaply(transients, model, time.perf_counter() - began, step)
     if left_out is not None:
-        model = model.with_(validation=left_out)
+        model = model.replace(validation=left_out)
     model.save(output)
     if options.json:
         data = model.to_dict()
@@ -409,8 +409,8 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
                 client=client,
                 progress=step,
             )
-    sources = [{**s, "sha256": sha256(s["file"])} for s in model.fit["sources"]]
-    model = model.with_(fit={**model.fit, "sources": sources})
+    sources = [{**s, "sha256": sha256(s["file"])} for s in model.fit_summary["sources"]]
+    model = model.replace(fit_summary={**model.fit_summary, "sources": sources})
     model.save(output)
     if options.json:
         _print_json({"model": str(output), "fit": model.to_dict()["fit"]})
@@ -517,7 +517,7 @@ def _validate(options: argparse.Namespace) -> int:
     from uncertain_lti.validation.left_out import validate_model
 
     model = UncertainLTI.load(options.model)
-    sources = model.fit.get("sources", [])
+    sources = model.fit_summary.get("sources", [])
     bags = options.bags or [s["file"] for s in sources]
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
@@ -536,11 +536,11 @@ def _validate(options: argparse.Namespace) -> int:
     if options.false_alarms is not None:
         calibration = calibrate(validation, options.false_alarms)
         data["calibration"] = calibration.to_dict()
-        if calibration.alarm is not None:
-            model = model.with_(alarm=calibration.alarm)
+        if calibration.alarm_rule is not None:
+            model = model.replace(alarm_rule=calibration.alarm_rule)
         elif options.output is not None:
             refusal = f"{options.output}: not written: {calibration.words}"
-    model = model.with_(validation=data)
+    model = model.replace(validation=data)
     output = None if refusal else options.output
     if output is not None:
         model.save(output)
@@ -549,7 +549,7 @@ def _validate(options: argparse.Namespace) -> int:
     else:
         _tell(options, validation_text(data))
         if output is not None:
-            rule = f"{model.alarm.violations} of {model.alarm.window}, margin {model.alarm.margin:.3g}"
+            rule = f"{model.alarm_rule.violations} of {model.alarm_rule.window}, margin {model.alarm_rule.margin:.3g}"
             kept = ", unchanged" if options.false_alarms is None else ""
             _tell(options, f"model written to {output}; its alarm rule{kept}: {rule}")
     if refusal:  # whoever asked for a rule and deploys the file would deploy one without it

@@ -19,7 +19,8 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, is_constant
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError
-from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.bag import Bag, group_recordings
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.reading import load_signals, sample
@@ -50,7 +51,7 @@ def fit_archive(
     *,
     cache: str | os.PathLike[str] | None = None,
     client: Any = None,
-    alarm: Alarm | None = None,
+    alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> UncertainLTI:
     """`fit` over recordings that together need not fit in memory; each of them must.
@@ -61,7 +62,7 @@ def fit_archive(
         As for `read_transients`; a cluster's workers must be able to read them under the same names.
     signals : SignalMap or path
         steady and scale must be numbers: `auto` would need all recordings at once.
-    criterion, additive, alarm
+    criterion, additive, alarm_rule
         As for `fit`.
     cache : path, optional
         Folder for the arrays, written while the bags are read; passes then read it block by block.
@@ -146,7 +147,7 @@ def fit_archive(
             signals,
             criterion,
             structure=structure,
-            alarm=alarm,
+            alarm_rule=alarm_rule,
             progress=progress,
             dt_median=fleet.median_dt() if dt is None else float(np.median(dt)),
         )
@@ -156,13 +157,13 @@ def fit_archive(
         name = f"transition {error.index - starts[which]} of {recordings[which][0]}"
         raise contradiction_in(error, name, signals) from None
     facts = {
-        **model.fit,
+        **model.fit_summary,
         "additive": additive,
         "weights": "ones",
         "transients": len(recordings),
         "sources": [{"file": file} for _, files in recordings for file in files],
     }
-    return model.with_(fit=facts)
+    return model.replace(fit_summary=facts)
 
 
 def survey(recording: Recording, signals: SignalMap) -> Survey:

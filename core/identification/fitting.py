@@ -22,7 +22,9 @@ from uncertain_lti.identification.problem import Additive, Columns, Problem, ass
 from uncertain_lti.identification.repair import repair
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError, Solution, WorkingSet
-from uncertain_lti.model.uncertain_lti import Alarm, Domain, Sampling, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap
@@ -44,7 +46,7 @@ def fit(
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
     seek_carriers: bool = False,
-    alarm: Alarm | None = None,
+    alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> UncertainLTI:
     """Fit dx/dt = (A ± ΔA) x + (B ± ΔB) u so that the one-step bounds contain every recorded sample.
@@ -83,7 +85,7 @@ def fit(
     seek_carriers : bool
         Say there as well which few transitions make a state's envelope much wider than the others need. Takes several
         times as long as the fit; beyond 200 000 transitions it is not sought.
-    alarm : Alarm, optional
+    alarm_rule : AlarmRule, optional
         Goes to the model file.
     progress : callable, optional
         Called with one line of text per pass over the data, and per discard.
@@ -162,7 +164,7 @@ def fit(
             criterion,
             structure=structure,
             method=method,
-            alarm=alarm,
+            alarm_rule=alarm_rule,
             progress=progress,
             dt_median=float(np.median(problem.dt)),
             describe_on=problem if describe_data else None,
@@ -173,7 +175,7 @@ def fit(
     except InfeasibleError as error:
         raise name(error) from None
     facts = {
-        **model.fit,
+        **model.fit_summary,
         "additive": additive,
         "weights": "ones"
         if weights is None and transient_weights is None
@@ -189,9 +191,9 @@ def fit(
         facts["discard"] = discard
         facts["discarded"] = discarded
         facts["with_discarded"] = {
-            key: before.fit[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
+            key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
         }
-    return model.with_(fit=facts)
+    return model.replace(fit_summary=facts)
 
 
 def fit_fleet(
@@ -201,7 +203,7 @@ def fit_fleet(
     *,
     structure: Structure | None = None,
     method: str = "working-set",
-    alarm: Alarm | None = None,
+    alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
     dt_median: float | None = None,
     describe_on: Problem | None = None,
@@ -216,7 +218,7 @@ def fit_fleet(
     fleet : Fleet
     signals : SignalMap
         With the operating point of the normalisation.
-    criterion, structure, method, alarm, progress
+    criterion, structure, method, alarm_rule, progress
         As in `fit`; method cvxpy takes a fleet of one `Problem`.
     dt_median : float, optional
         s.
@@ -242,7 +244,7 @@ def fit_fleet(
         solution = _as_written(engine, criterion)
 
     def build(theta: Array, d: Array) -> UncertainLTI:
-        return _model(fleet.columns, signals, sums, theta, d, dt_median, alarm)
+        return _model(fleet.columns, signals, sums, theta, d, dt_median, alarm_rule)
 
     model, d, judged = repair(build, fleet, sums, solution.theta, solution.d, solution.violation)
     max_width = judged.largest
@@ -284,7 +286,7 @@ def fit_fleet(
         facts["rank"], facts["messages"] = describe(
             model, describe_on, sums, mean_width, max_width, transients, few, discarded if criterion == "qp" else None
         )
-    return model.with_(fit=facts)
+    return model.replace(fit_summary=facts)
 
 
 def _as_written(engine: WorkingSet, criterion: str) -> Solution:
@@ -376,7 +378,7 @@ def _model(
     theta: Array,
     d: Array,
     dt_median: float | None,
-    alarm: Alarm | None,
+    alarm_rule: AlarmRule | None,
 ) -> UncertainLTI:
     n, p = len(signals.states), len(sums.low)
     zeros = np.zeros(n)
@@ -402,7 +404,7 @@ def _model(
             max_skew=signals.max_skew,
         ),
         domain=Domain(sums.low[:n], sums.high[:n], sums.low[n:], sums.high[n:]),
-        alarm=alarm,
+        alarm_rule=alarm_rule,
     )
 
 

@@ -7,7 +7,7 @@ import math
 import os
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from functools import cache
 from typing import Any
 
@@ -18,6 +18,8 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -26,63 +28,7 @@ Array = NDArray[np.float64]
 
 FORMAT = "uncertain-lti/1"
 MAX_FILE_BYTES = 64 * 2**20
-LONGEST_WINDOW = 1_000_000
-"""Verdicts that the alarm looks at, at most."""
 _BLOCK = 4096  # samples per block of the vectorised path: stays in the cache
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """How samples were cut when the model was fitted, and what the steps were; times in s."""
-
-    clock: str = ""
-    clock_type: str = ""
-    time: Mapping[str, str] = field(default_factory=dict)
-    dt_median: float | None = None
-    dt_min: float | None = None
-    dt_max: float | None = None
-    max_gap: float | None = None
-    min_step: float = 0.0
-    max_skew: float | None = None
-
-
-@dataclass(frozen=True)
-class Domain:
-    """Normalised ranges of x (n,) and u (m,) seen in the fit; None where nothing was fitted."""
-
-    x_min: Array
-    x_max: Array
-    u_min: Array
-    u_max: Array
-
-    def outside(self, x: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
-        """(...,): z = [x; u] leaves the box in some element."""
-        x, u = np.asarray(x), np.asarray(u)
-        left_x = ((x < self.x_min) | (x > self.x_max)).any(axis=-1)
-        left_u = ((u < self.u_min) | (u > self.u_max)).any(axis=-1)
-        return np.asarray(left_x | left_u)
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """The alarm is raised while `violations` of the last `window` verdicts are violations.
-
-    margin multiplies the half-widths of the bounds that are judged.
-    """
-
-    violations: int = 1
-    window: int = 1
-    margin: float = 1.0
-
-    def __post_init__(self) -> None:
-        whole = isinstance(self.violations, int) and isinstance(self.window, int)
-        if not (whole and 1 <= self.violations <= self.window <= LONGEST_WINDOW):
-            raise ModelError(
-                f"alarm: violations is {reprlib.repr(self.violations)} of window {reprlib.repr(self.window)}; it takes "
-                f"whole numbers, 1 <= violations <= window <= {LONGEST_WINDOW}"
-            )
-        if not (math.isfinite(self.margin) and self.margin > 0):
-            raise ModelError(f"alarm: margin is {self.margin}; it must be a positive number")
 
 
 class UncertainLTI:
@@ -108,8 +54,8 @@ class UncertainLTI:
         Names, topics, operating point; default names x1.., u1.. and values used as they are.
     sampling : Sampling, optional
     domain : Domain, optional
-    alarm : Alarm, optional
-    fit, validation : mapping, optional
+    alarm_rule : AlarmRule, optional
+    fit_summary, validation : mapping, optional
         How the model was obtained; plain data that goes to the file as it is.
 
     Raises
@@ -131,8 +77,8 @@ class UncertainLTI:
         signals: SignalMap | None = None,
         sampling: Sampling | None = None,
         domain: Domain | None = None,
-        alarm: Alarm | None = None,
-        fit: Mapping[str, Any] | None = None,
+        alarm_rule: AlarmRule | None = None,
+        fit_summary: Mapping[str, Any] | None = None,
         validation: Mapping[str, Any] | None = None,
     ) -> None:
         self.A = _array(A, "A", None)
@@ -169,8 +115,8 @@ class UncertainLTI:
         self.sampling = sampling or _sampling(signals)
         unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
         self.domain = domain or unbounded
-        self.alarm = alarm or Alarm()
-        self.fit = dict(fit or {})
+        self.alarm_rule = alarm_rule or AlarmRule()
+        self.fit_summary = dict(fit_summary or {})
         self.validation = dict(validation or {})
         # columns, contiguous: the verdict arithmetic walks over them in this order and no other
         self._nominal = [np.ascontiguousarray(col) for col in np.hstack([self.A, self.B]).T]
@@ -204,8 +150,9 @@ class UncertainLTI:
         text += f"{plural(self.m, 'control')}"
         if self.m:
             text += f": {', '.join(self.control_names)}"
-        if "criterion" in self.fit:
-            text += f"; fitted by {self.fit['criterion']} to {plural(self.fit.get('transitions'), 'transition')}"
+        if "criterion" in self.fit_summary:
+            count = plural(self.fit_summary.get("transitions"), "transition")
+            text += f"; fitted by {self.fit_summary['criterion']} to {count}"
         return text + ")"
 
     def _repr_html_(self) -> str:
@@ -223,14 +170,14 @@ class UncertainLTI:
             rows.append(row)
         if self.n > MOST:
             rows.append(["…"] * len(header))
-        facts, below = self.fit, []
+        facts, below = self.fit_summary, []
         if facts.get("mean_width_recorded") is not None:
             widths = [
                 f"{name_with_unit(s.name, s.unit)} {number_text(float(w))}"
                 for s, w in zip(self.signals.states[:MOST], np.ravel(facts["mean_width_recorded"]), strict=False)
             ]
             below.append(f"mean one-step width: {', '.join(widths)}" + ", …" * (self.n > MOST))
-        rule = self.alarm
+        rule = self.alarm_rule
         below.append(f"alarm: {rule.violations} of {plural(rule.window, 'verdict')}, margin {number_text(rule.margin)}")
         below += [f"note: {message}" for message in facts.get("messages", [])]
         return html_table(repr(self), header, rows, below)
@@ -399,12 +346,13 @@ class UncertainLTI:
             raise ModelError("spectral radius: the model has no dt_median; give dt")
         return float(np.abs(np.linalg.eigvals(np.eye(self.n) + dt * self.A)).max())
 
-    def with_(self, **changes: Any) -> UncertainLTI:
+    def replace(self, **changes: Any) -> UncertainLTI:
         """The same model with some constructor arguments replaced."""
         arguments = {
             name: getattr(self, name)
             for name in (
-                "A", "B", "dA", "dB", "c", "dc", "v", "signals", "sampling", "domain", "alarm", "fit", "validation"
+                "A", "B", "dA", "dB", "c", "dc", "v", "signals", "sampling", "domain", "alarm_rule", "fit_summary",
+                "validation",
             )
         }  # fmt: skip
         return UncertainLTI(**{**arguments, **changes})
@@ -476,11 +424,11 @@ class UncertainLTI:
                 for name in ("x_min", "x_max", "u_min", "u_max")
             },
             "alarm": {
-                "violations": self.alarm.violations,
-                "window": self.alarm.window,
-                "margin": self.alarm.margin,
+                "violations": self.alarm_rule.violations,
+                "window": self.alarm_rule.window,
+                "margin": self.alarm_rule.margin,
             },
-            "fit": _plain(self.fit),
+            "fit": _plain(self.fit_summary),
             "validation": _plain(self.validation),
         }
 
@@ -606,7 +554,7 @@ class UncertainLTI:
                 if name not in box:
                     raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
             domain = Domain(**{name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()})
-        alarm = _object(data.get("alarm", {}), "alarm", {f.name for f in fields(Alarm)})
+        alarm = _object(data.get("alarm", {}), "alarm", {f.name for f in fields(AlarmRule)})
         for key in ("violations", "window"):
             if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
                 raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
@@ -618,8 +566,8 @@ class UncertainLTI:
             signals=signals,
             sampling=sampling,
             domain=domain,
-            alarm=Alarm(**alarm),
-            fit=_object(data.get("fit", {}), "fit"),
+            alarm_rule=AlarmRule(**alarm),
+            fit_summary=_object(data.get("fit", {}), "fit"),
             validation=_object(data.get("validation", {}), "validation"),
         )
 

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
-from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.sampler import Status, Step
 from uncertain_lti.sampling.transient import Transient
@@ -252,9 +253,9 @@ class EnvelopeMonitor:
         margin: float | None = None,
         masked: Sequence[str] = (),
     ) -> None:
-        said = model.alarm
+        said = model.alarm_rule
         self.model = model
-        self.rule = Alarm(
+        self.rule = AlarmRule(
             said.violations if violations is None else violations,
             said.window if window is None else window,
             said.margin if margin is None else margin,

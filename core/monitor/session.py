@@ -108,7 +108,7 @@ def _held(model: UncertainLTI, signals: Sequence[int]) -> float:
     """How long the last values of these signals may be used, s."""
     if any(i < model.n for i in signals):
         return 0.0
-    holds = [model.signals.signals[i].max_hold for i in signals]
+    holds = [model.signals[i].max_hold for i in signals]
     return max(math.inf if hold is None else hold for hold in holds)
 
 

@@ -56,6 +56,11 @@ class Case:
     outside_domain: int
     seconds: float
 
+    @property
+    def fitted_by(self) -> tuple[str, str]:
+        """Criterion and additive term."""
+        return self.model.fit_summary["criterion"], self.model.fit_summary["additive"]
+
     @classmethod
     def of(
         cls, name: str, transients: Sequence[Transient], check: Transient, criterion: Any, additive: Any = "none"
@@ -88,9 +93,9 @@ class Case:
         """The numbers, as plain data."""
         return {
             "identified_from": self.name,
-            "criterion": self.model.fit["criterion"],
-            "additive": self.model.fit["additive"],
-            "objective": np.asarray(self.model.fit["objective"]).tolist(),
+            "criterion": self.model.fit_summary["criterion"],
+            "additive": self.model.fit_summary["additive"],
+            "objective": np.asarray(self.model.fit_summary["objective"]).tolist(),
             "outside_identification": self.outside,
             "inside": self.inside.tolist(),
             "inside_all": self.inside_all,
@@ -175,7 +180,7 @@ def reproduce(
         searches.append(
             {
                 "identified_from": name,
-                "exact": float(exact.model.fit["objective"]),
+                "exact": float(exact.model.fit_summary["objective"]),
                 "direct_search": found.objective,
                 "exact_seconds": exact.seconds,
                 "direct_search_seconds": found.seconds,
@@ -186,7 +191,7 @@ def reproduce(
     for case in cases:
         label = case.name.replace(" (the paper's)", "").replace(", noise 0.0001", "_noise")
         name = label.replace("±", "both").replace("+", "up").replace("%", "")
-        name = f"{name}_{case.model.fit['criterion']}_{case.model.fit['additive']}"
+        name = f"{name}_{case.model.fit_summary['criterion']}_{case.model.fit_summary['additive']}"
         case.model.save(folder / f"{name}.model.json")
     check_figure(chosen, folder / "check.png")
     check_figure(first, folder / "check_paper_pulses.png")
@@ -224,7 +229,7 @@ def cases_text(cases: Sequence[Case]) -> str:
     """Shares of the check inside."""
     rows = [
         [
-            c.name, c.model.fit["criterion"], c.model.fit["additive"], str(c.outside), f"{c.inside_all:.0%}",
+            c.name, *c.fitted_by, str(c.outside), f"{c.inside_all:.0%}",
             *(f"{share:.0%}" for share in c.inside), str(c.outside_domain),
         ]
         for c in cases
@@ -239,7 +244,7 @@ def width_text(cases: Sequence[Case]) -> str:
     """Widths and discrepancies over the check."""
     rows = [
         [
-            c.name, c.model.fit["criterion"], c.model.fit["additive"], *(f"{1e4 * w:.2f}" for w in c.mean_width),
+            c.name, *c.fitted_by, *(f"{1e4 * w:.2f}" for w in c.mean_width),
             number(c.squared), *(number(1e4 * e) for e in c.largest),
         ]
         for c in cases

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.monitor.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
 from uncertain_lti.recordings.bag import Bag
@@ -100,7 +101,7 @@ def annotate(
     output: str | os.PathLike[str],
     model: UncertainLTI,
     model_file: str | os.PathLike[str] = "",
-    rule: Alarm | None = None,
+    rule: AlarmRule | None = None,
     progress: Progress | None = None,
 ) -> Annotated:
     """Write a copy of a recording with the verdicts beside it; block by block, whatever its size.
@@ -270,9 +271,13 @@ def _fields(types: object) -> str:
 
 
 def _about(
-    contents: Sequence[Contents], base: str, model: UncertainLTI, model_file: str | os.PathLike[str], rule: Alarm | None
+    contents: Sequence[Contents],
+    base: str,
+    model: UncertainLTI,
+    model_file: str | os.PathLike[str],
+    rule: AlarmRule | None,
 ) -> dict[str, str]:
-    rule = rule or model.alarm
+    rule = rule or model.alarm_rule
     about = {
         "recording": json.dumps([part.path.name for part in contents]),
         "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",

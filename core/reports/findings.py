@@ -15,7 +15,8 @@ from uncertain_lti import __version__
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import sha256, target
-from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.reports.text import check_data, number
@@ -39,7 +40,7 @@ def findings(
     model: UncertainLTI,
     model_file: str | os.PathLike[str],
     checked: Sequence[Verdicts],
-    rule: Alarm | None = None,
+    rule: AlarmRule | None = None,
 ) -> dict[str, Any]:
     """Facts about a model and about recordings that were checked against it.
 
@@ -50,7 +51,7 @@ def findings(
         Where it came from, or its name.
     checked : sequence of Verdicts
         One per recording, of `EnvelopeMonitor.check`.
-    rule : Alarm, optional
+    rule : AlarmRule, optional
         That the check went by; default the model's.
 
     Returns
@@ -65,7 +66,7 @@ def findings(
     OSError
         A file of a recording cannot be read.
     """
-    rule = rule or model.alarm
+    rule = rule or model.alarm_rule
     recordings = [_recording(model, verdicts) for verdicts in checked]
     validation = _validation(model)
     reasons = [
@@ -113,7 +114,7 @@ def shortened(name: str, longest: int = 40) -> str:
 
 
 def _model(model: UncertainLTI, model_file: str | os.PathLike[str]) -> dict[str, Any]:
-    fit = model.fit
+    fit = model.fit_summary
     known = {
         key: fit[key]
         for key in ("criterion", "additive", "transitions", "transients", "violations", "objective", "gap", "rank")
@@ -263,10 +264,10 @@ def _reason(weight: str, about: str, text: str) -> dict[str, str]:
 
 
 def _fit_reasons(model: UncertainLTI) -> list[dict[str, str]]:
-    messages = [str(message) for message in _list(model.fit.get("messages"))]
+    messages = [str(message) for message in _list(model.fit_summary.get("messages"))]
     # of widths it is said below, from the recordings at hand too
     found = [_reason(CARE, "fit", message) for message in messages if not message.startswith("the bounds are over")]
-    if not model.fit:
+    if not model.fit_summary:
         found.append(_reason(CARE, "fit", "the model file does not say how it was fitted"))
     return found
 
@@ -275,7 +276,7 @@ def _stability_reasons(model: UncertainLTI) -> list[dict[str, str]]:
     """A nominal model that multiplies a deviation at every step is no picture of the machine."""
     if model.sampling.dt_median is None or not math.isfinite(radius := model.spectral_radius()) or radius <= RUNS_AWAY:
         return []
-    if any("spectral radius" in str(message) for message in _list(model.fit.get("messages"))):
+    if any("spectral radius" in str(message) for message in _list(model.fit_summary.get("messages"))):
         return []  # the fit said so
     text = f"the nominal model runs away: a deviation can grow {number(radius)} times in a step (spectral radius)"
     return [_reason(CARE, "stability", text)]
@@ -309,7 +310,7 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
     """
     wide: dict[str, float] = {}
     span = model.domain.x_max - model.domain.x_min
-    widths = _numbers(model.fit.get("mean_width"), model.n) or [math.nan] * model.n
+    widths = _numbers(model.fit_summary.get("mean_width"), model.n) or [math.nan] * model.n
     for name, width, of in zip(model.state_names, widths, span, strict=True):
         if math.isfinite(of) and of > 0 and math.isfinite(width):
             wide[name] = width / float(of)
@@ -333,7 +334,7 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
 
 def _recording_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     found = []
-    fitted = {s.get("sha256") for s in _list(model.fit.get("sources")) if isinstance(s, Mapping)} - {None, ""}
+    fitted = {s.get("sha256") for s in _list(model.fit_summary.get("sources")) if isinstance(s, Mapping)} - {None, ""}
     judged = sum(r["verdicts"] for r in recordings)
     same = [r["recording"] for r in recordings if any(f["sha256"] in fitted for f in r["files"])]
     if same:

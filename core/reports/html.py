@@ -148,7 +148,7 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
     rule = facts["rule"]
     return (
         f"<header><h1>{_text(name)}</h1>"
-        f'<p class="soft">{_text(_summary(facts))}. Alarm: {_rule(rule)}, margin '
+        f'<p class="soft">{_text(_summary(facts))}. AlarmRule: {_rule(rule)}, margin '
         f"{number(rule['margin'])}.</p>"
         '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a><a href="#trust">How far to trust it'
         '</a><a href="#origin">Where it comes from</a></nav></header>\n'

@@ -60,7 +60,7 @@ def recording_text(transient: Transient) -> str:
 
 def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
     """Summary of a fit: widths beside what the states do, and what the user should know."""
-    facts = model.fit
+    facts = model.fit_summary
     criterion = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}[facts["criterion"]]
     steps = [t.transitions() for t in transients]
     moves = np.vstack([s.x_next - s.x for s in steps])
@@ -96,7 +96,7 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
 
 def archive_text(model: UncertainLTI) -> str:
     """Summary of a fit whose transitions were not all in memory."""
-    facts = model.fit
+    facts = model.fit_summary
     rows = [
         [s.name + (f" [{s.unit}]" if s.unit else ""), number(a), number(b)]
         for s, a, b in zip(model.signals.states, facts["mean_width_recorded"], facts["max_width_recorded"], strict=True)
@@ -134,7 +134,7 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
     left_out : dict, optional
         What `leave_out_cheaply` found.
     """
-    facts = model.fit
+    facts = model.fit_summary
     span = model.domain.x_max - model.domain.x_min
     share = np.asarray(facts["mean_width"]) / np.where(span > 0, span, np.inf)
     widest = int(np.argmax(share))
@@ -171,7 +171,7 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
 
 def model_text(model: UncertainLTI) -> str:
     """Summary of a model file."""
-    s, facts = model.sampling, model.fit
+    s, facts = model.sampling, model.fit_summary
     lines = [repr(model)]
     if s.clock:
         lines.append(
@@ -214,7 +214,7 @@ def model_text(model: UncertainLTI) -> str:
             )
         ]
         lines.append(table(("one-step envelope", "mean width", "largest"), widths))
-    alarm = model.alarm
+    alarm = model.alarm_rule
     lines.append(
         f"alarm: {alarm.violations} of the last {plural(alarm.window, 'verdict')} violated; margin "
         f"{number(alarm.margin)}"

@@ -476,7 +476,7 @@ class Sampler:
                 if topic == self.clock or age <= self._max_age[i]:
                     z[i] = value
                 elif final:
-                    self.counters[f"stale {self.signals.signals[i].name}"] += 1
+                    self.counters[f"stale {self.signals[i].name}"] += 1
         for i, delay in self._delays:
             line = self._history.setdefault(i, deque(maxlen=delay + 1))
             line = line if final else line.copy()

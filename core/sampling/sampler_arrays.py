@@ -195,7 +195,7 @@ class _Sampling:
         """Values with angles on the branch nearest to the one before, or to steady where `opens`."""
         result = values
         for column, position in enumerate(self.signals.on(topic)):
-            signal = self.signals.signals[position]
+            signal = self.signals[position]
             if FieldPath(signal.field).unwrap:
                 result = result.copy() if result is values else result
                 steady = 0.0 if signal.steady == "auto" else signal.steady
@@ -227,7 +227,7 @@ class _Sampling:
         age = at[:-1][there] - time[which]
         for column, position in enumerate(self.signals.on(name)):
             fresh = age <= self.max_age[position]
-            self._count(f"stale {self.signals.signals[position].name}", ~fresh)
+            self._count(f"stale {self.signals[position].name}", ~fresh)
             z[there, position] = np.where(fresh, values[which, column], math.nan)
 
     def _late(self, others: _Messages, samples: _Messages, time: Integers, at: Integers, chosen: Integers) -> Mask:

@@ -417,6 +417,16 @@ class SignalMap:
         if not (math.isfinite(self.min_step) and self.min_step >= 0):
             raise SignalError(f"{self.source}: min_step is {self.min_step}; it must be 0 s or more")
 
+    def __len__(self) -> int:
+        return len(self.states) + len(self.controls)
+
+    def __iter__(self) -> Iterator[Signal]:
+        return iter(self.signals)
+
+    def __getitem__(self, position: int) -> Signal:
+        """Signal at a position of [x; u]."""
+        return self.signals[position]
+
     @property
     def signals(self) -> tuple[Signal, ...]:
         """States, then controls, in the order of z = [x; u]."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.model.uncertain_lti import Alarm
+from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.validation.intervals import cluster_size, rate_interval
 from uncertain_lti.validation.left_out import Part, Validation, borrowed_margin, rising
 
@@ -50,7 +50,7 @@ class Candidate:
 class Calibration:
     """The alarm that `calibrate` chose (None where no rule can be shown to keep to the wish), and all it tried."""
 
-    alarm: Alarm | None
+    alarm_rule: AlarmRule | None
     wish: float
     confidence: float
     hours: float
@@ -67,7 +67,7 @@ class Calibration:
             "confidence": self.confidence,
             "hours": self.hours,
             "needed_hours": self.needed_hours,
-            "reached": self.alarm is not None,
+            "reached": self.alarm_rule is not None,
             "words": self.words,
             "warning": self.warning,
             "fault": f"one state moved by {FAULT_SIZE:g} mean width more in every step",
@@ -147,7 +147,7 @@ def calibrate(
             else f"in {best.detected[slow]:.0%} of the cases only (worst state: {names[slow]})"
         )
     )
-    rule = Alarm(best.violations, best.window, best.margin)
+    rule = AlarmRule(best.violations, best.window, best.margin)
     return Calibration(rule, wish, confidence, hours, needed, candidates, words, _deaf(best.detected, names))
 
 
@@ -181,11 +181,11 @@ def _candidate(parts: Sequence[Part], m: int, n: int, wish: float, confidence: f
     if chosen is None:
         nothing = np.full(parts[0].utilisation.shape[1], np.nan)
         return Candidate(m, n, None, count, limit, nothing, nothing)
-    detected, delay = detection(parts, Alarm(m, n, chosen))
+    detected, delay = detection(parts, AlarmRule(m, n, chosen))
     return Candidate(m, n, chosen, count, limit, detected, delay)
 
 
-def detection(parts: Sequence[Part], rule: Alarm, size: float = FAULT_SIZE) -> tuple[Array, Array]:
+def detection(parts: Sequence[Part], rule: AlarmRule, size: float = FAULT_SIZE) -> tuple[Array, Array]:
     """Share of stated faults that raise the alarm, and the median time to it in s, each (n,).
 
     The fault: from one verdict on, one state moves by `size` mean widths of its bounds more in every step than

@@ -15,7 +15,8 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.model.uncertain_lti import Alarm, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
@@ -93,7 +94,7 @@ class Part:
                 level[start:stop] = np.partition(windows, window - violations, axis=1)[:, window - violations]
         return level
 
-    def alarms(self, rule: Alarm) -> int:
+    def alarms(self, rule: AlarmRule) -> int:
         """How often the alarm is raised (rising edges)."""
         return rising(self.level(rule.violations, rule.window) > rule.margin, self.starts)
 
@@ -157,7 +158,7 @@ def validate(
     *,
     operating_point: OperatingPoint | None = None,
     weights: ArrayLike | Sequence[ArrayLike] | None = None,
-    alarm: Alarm | None = None,
+    alarm_rule: AlarmRule | None = None,
     blocks: int | None = None,
     gap: float | None = None,
     confidence: float = 0.9,
@@ -170,7 +171,7 @@ def validate(
     Parameters
     ----------
     transients : Transient or sequence of Transient
-    operating_point, weights, alarm : as in `fit`
+    operating_point, weights, alarm_rule : as in `fit`
         Weights per sample go with their samples.
     blocks : int, optional
         Cut every recording into so many contiguous blocks and leave out one block at a time. Default: whole
@@ -198,9 +199,9 @@ def validate(
     if blocks is not None and blocks < 2:
         raise FitError(f"blocks is {blocks}; at least 2 are needed to leave one out")
     if full is None:
-        full = fit(transients, weights=weights, operating_point=operating_point, alarm=alarm, **options)
-    elif alarm is not None:
-        full = full.with_(alarm=alarm)
+        full = fit(transients, weights=weights, operating_point=operating_point, alarm_rule=alarm_rule, **options)
+    elif alarm_rule is not None:
+        full = full.replace(alarm_rule=alarm_rule)
     if blocks is None and len(transients) == 1:
         blocks = BLOCKS
     if blocks is None:
@@ -358,7 +359,7 @@ def summary(validation: Validation) -> dict[str, Any]:
             "unit": model.signals.states[i].unit,
         }
     low, high = rate_interval(violated, judged, v.confidence) if judged else (0.0, math.inf)
-    rules = [model.alarm, *(Alarm(m, n, model.alarm.margin) for m, n in REFERENCE_RULES)]
+    rules = [model.alarm_rule, *(AlarmRule(m, n, model.alarm_rule.margin) for m, n in REFERENCE_RULES)]
     alarms = [false_alarms(parts, rule, v.confidence) for rule in dict.fromkeys(rules)]
     return {
         "kind": v.kind,
@@ -385,7 +386,7 @@ def summary(validation: Validation) -> dict[str, Any]:
     }
 
 
-def false_alarms(parts: Sequence[Part], rule: Alarm, confidence: float) -> dict[str, Any]:
+def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> dict[str, Any]:
     """Alarms per hour on what was left out, with the interval for the rate of a model fitted to so many parts."""
     counts = [p.alarms(rule) for p in parts]
     hours = sum(p.hours for p in parts)
@@ -403,7 +404,7 @@ def false_alarms(parts: Sequence[Part], rule: Alarm, confidence: float) -> dict[
     }
 
 
-def typical_cluster(parts: Sequence[Part], rule: Alarm) -> float:
+def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
     """Alarms that come at once, where few or none are counted: those of the same rule at a smaller margin.
 
     The margin is that at which three parts alarm, but not below NEARBY times the rule's: far below, alarms are of
@@ -473,15 +474,15 @@ def _variables(model: UncertainLTI) -> int:
 
 def _discarded(model: UncertainLTI) -> int:
     """Recordings at most that lost a transition to the budget of outliers."""
-    listed = model.fit.get("discarded", [])
+    listed = model.fit_summary.get("discarded", [])
     return len(listed) if isinstance(listed, (list, tuple)) else 0
 
 
 def full_widths(model: UncertainLTI) -> tuple[list[float], list[float]]:
     """Mean and largest width of the full fit on its own samples, recorded units."""
     return (
-        [float(w) for w in model.fit["mean_width_recorded"]],
-        [float(w) for w in model.fit["max_width_recorded"]],
+        [float(w) for w in model.fit_summary["mean_width_recorded"]],
+        [float(w) for w in model.fit_summary["max_width_recorded"]],
     )
 
 
@@ -505,7 +506,7 @@ def _notes(validation: Validation) -> list[str]:
     ]
     if G < 6:
         notes.append(f"{G} {what} say little: an interval from so few is wide, and rests on them being typical")
-    if count := len(v.model.fit.get("discarded", [])):
+    if count := len(v.model.fit_summary.get("discarded", [])):
         notes.append(
             f"every left-out fit may discard {count} transitions as well; in what is left out nothing is discarded, so "
             f"outliers there count as violations"
@@ -554,7 +555,7 @@ def validate_model(
     return validate(
         transients,
         operating_point=model.operating_point,
-        alarm=model.alarm,
+        alarm_rule=model.alarm_rule,
         blocks=blocks,
         gap=gap,
         confidence=confidence,
@@ -566,7 +567,7 @@ def validate_model(
 
 def _options(model: UncertainLTI) -> Mapping[str, Any]:
     """Options of `fit` that a model says it was fitted with; see `validate_model`."""
-    facts = model.fit
+    facts = model.fit_summary
     for key in ("criterion", "additive"):
         if key not in facts:
             raise FitError(f"the model does not say by which {key} it was fitted; fit it again")
@@ -581,9 +582,9 @@ def _options(model: UncertainLTI) -> Mapping[str, Any]:
 
 def _same(one: UncertainLTI, other: UncertainLTI) -> bool:
     """The same widths from as many transitions; another numpy may round otherwise, so not to the bit."""
-    if one.fit["transitions"] != other.fit.get("transitions"):
+    if one.fit_summary["transitions"] != other.fit_summary.get("transitions"):
         return False
-    return np.allclose(one.fit["mean_width"], np.asarray(other.fit["mean_width"]), rtol=1e-6, atol=0.0)
+    return np.allclose(one.fit_summary["mean_width"], np.asarray(other.fit_summary["mean_width"]), rtol=1e-6, atol=0.0)
 
 
 def leave_out_cheaply(
@@ -595,13 +596,13 @@ def leave_out_cheaply(
 ) -> dict[str, Any] | None:
     """The summary of `validate` beside a fit that took so many seconds; None where it would take over `budget` s."""
     parts = len(transients) if len(transients) > 1 else BLOCKS
-    if parts * seconds > budget or model.fit.get("weights", "ones") != "ones":
+    if parts * seconds > budget or model.fit_summary.get("weights", "ones") != "ones":
         return None
     try:
         return validate(
             transients,
             operating_point=model.operating_point,
-            alarm=model.alarm,
+            alarm_rule=model.alarm_rule,
             full=model,
             progress=progress,
             **_options(model),

@@ -1,0 +1,34 @@
+"""AlarmRule: which verdicts raise the alarm."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from dataclasses import dataclass
+
+from uncertain_lti.base.errors import ModelError
+
+LONGEST_WINDOW = 1_000_000
+"""Verdicts that the alarm looks at, at most."""
+
+
+@dataclass(frozen=True)
+class AlarmRule:
+    """The alarm is raised while `violations` of the last `window` verdicts are violations.
+
+    margin multiplies the half-widths of the bounds that are judged.
+    """
+
+    violations: int = 1
+    window: int = 1
+    margin: float = 1.0
+
+    def __post_init__(self) -> None:
+        whole = isinstance(self.violations, int) and isinstance(self.window, int)
+        if not (whole and 1 <= self.violations <= self.window <= LONGEST_WINDOW):
+            raise ModelError(
+                f"alarm: violations is {reprlib.repr(self.violations)} of window {reprlib.repr(self.window)}; it takes "
+                f"whole numbers, 1 <= violations <= window <= {LONGEST_WINDOW}"
+            )
+        if not (math.isfinite(self.margin) and self.margin > 0):
+            raise ModelError(f"alarm: margin is {self.margin}; it must be a positive number")
