@@ -18,10 +18,10 @@ def write(folder: Path) -> None:
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
     """Name -> arguments of every command."""
-    from uncertain_lti.cli.main import _parser
+    from uncertain_lti.cli.main import build_parser
 
     def subparsers(chosen: str) -> dict[str, argparse.ArgumentParser]:
-        actions = _parser(chosen)._subparsers._group_actions  # argparse has no public way
+        actions = build_parser(chosen)._subparsers._group_actions  # argparse has no public way
         return dict(actions[0].choices)
 
     return {name: subparsers(name)[name] for name in subparsers("")}

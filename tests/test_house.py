@@ -1,6 +1,9 @@
 """The house: rooms that import in one direction, modules without circles, a sentence at every door."""
 
 import ast
+import subprocess
+import sys
+from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -76,3 +79,22 @@ def test_the_core_knows_no_ros():
         names += [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
         tops = {name.split(".")[0] for name in names}
         assert not tops & {"rclpy", "std_msgs", "sensor_msgs", "uncertain_lti_ros"}, path
+
+
+def test_every_command_has_a_file_and_is_registered():
+    from uncertain_lti.cli.command import Command
+    from uncertain_lti.cli.main import COMMANDS
+
+    declared = set()
+    for path in sorted((ROOT / "core" / "cli").glob("*.py")):
+        module = import_module(f"uncertain_lti.cli.{path.stem}")
+        found = [value for value in vars(module).values() if isinstance(value, Command)]
+        assert path.stem in ("__init__", "command", "main") or found, f"{path.name} declares no command"
+        declared |= {command.name for command in found}
+    assert declared == {command.name for command in COMMANDS}
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys; from uncertain_lti.cli.main import build_parser; build_parser(); print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numpy", "cvxpy", "osqp", "scipy", "matplotlib", "rclpy", "yaml", "mcap", "tqdm"} & set(loaded)

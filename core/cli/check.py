@@ -1,0 +1,68 @@
+"""Command `uncertain-lti check`: check recordings against a model."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, print_json, print_notes, print_summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti check`."""
+    parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
+    parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders")
+    parser.add_argument("--violations", type=int, help="alarm: so many violations (default: the model's)")
+    parser.add_argument("--window", type=int, help="alarm: among so many last verdicts (default: the model's)")
+    parser.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
+    parser.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
+    parser.add_argument(
+        "--write",
+        metavar="OUT.mcap",
+        help="write a copy of the recording with bounds, utilisation and flags on topics of their own; "
+        "for several recordings a folder",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Check each recording and return whether the alarm was raised."""
+    from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.base.english import plural
+    from uncertain_lti.recordings.bag import group_recordings
+    from uncertain_lti.reports.text import check_data, check_text
+    from uncertain_lti.sampling.reading import read_as_fitted_with_decisions
+
+    model = load_model(options.model)
+    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
+    bags = group_recordings(options.bags)
+    copies: Sequence[Path | None] = [None] * len(bags)
+    if options.write is not None:
+        from uncertain_lti.reports.annotate import annotate, targets
+
+        copies = targets(options.write, bags)
+    results = []
+    for bag, copy in zip(bags, copies, strict=True):
+        transient, decisions = read_as_fitted_with_decisions(bag, model.signals, options.progress.iterate("reading"))
+        print_notes(options, transient.notes)
+        verdicts = monitor.check(transient)
+        data = check_data(model, verdicts, samples=options.json)
+        results.append(data)
+        print_summary(options, check_text(data))
+        if copy is not None:
+            writing = options.progress.iterate("writing")
+            made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, monitor.rule, writing)
+            print_notes(options, made.notes)
+            data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
+            print_summary(
+                options,
+                f"{plural(made.messages, 'message')} and the verdicts below {made.topics} written to {made.path}",
+            )
+    if options.json:
+        print_json({"model": options.model, "alarm": any(r["alarm"] for r in results), "recordings": results})
+    return ALARM if any(r["alarm"] for r in results) else DONE
+
+
+COMMAND = Command(
+    "check", "check a recording against a model", add_arguments, run, quiet=SILENT, verbose="say what took how long"
+)

@@ -1,0 +1,97 @@
+"""What every command shares: its declaration, exit statuses, printing, and the model named on the command line."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from uncertain_lti.base.errors import ModelError
+
+if TYPE_CHECKING:
+    from uncertain_lti import UncertainLTI
+
+DONE, ALARM, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+"""Exit statuses: 1 means that the alarm was raised, and nothing else."""
+
+SILENT = "print errors only (and with --json the data): no summary, no notes, no progress"
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command of `uncertain-lti`.
+
+    Each file of this room declares one as `COMMAND`, and `main.COMMANDS` lists the files. The file imports at its top
+    nothing that takes time to load: every command is declared whenever one is run.
+
+    Parameters
+    ----------
+    name, help : str
+        The word on the command line, and what it does, for the list of commands.
+    add_arguments : callable
+        Declares the arguments on a parser.
+    run : callable
+        Runs the command with the parsed options and returns the exit status. `options.progress` is a `Progress`.
+    quiet, verbose : str
+        What `--quiet` and `--verbose` do, for the help; "" if the command has no such option.
+    deferred : bool
+        `add_arguments` imports what not every installation has: it is called for the chosen command alone.
+    """
+
+    name: str
+    help: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+    quiet: str = ""
+    verbose: str = ""
+    deferred: bool = False
+
+
+def print_summary(options: argparse.Namespace, text: str) -> None:
+    """Print part of the summary for a person, unless JSON is asked for or nothing at all."""
+    if not options.json:
+        options.progress.say(text)
+
+
+def print_json(data: Any) -> None:
+    """Print data for a program."""
+    json.dump(data, sys.stdout, allow_nan=False, indent=1)
+    sys.stdout.write("\n")
+
+
+def print_notes(options: argparse.Namespace, notes: Iterable[str]) -> None:
+    """Print remarks on standard error, unless quiet."""
+    for note in notes:
+        options.progress.note(note)
+
+
+def load_model(name: str) -> UncertainLTI:
+    """Load the model of a file, or the published one by its name.
+
+    Raises
+    ------
+    ModelError
+        There is no such file, or it holds no model.
+    """
+    from uncertain_lti import UncertainLTI
+    from uncertain_lti.base.english import meant
+    from uncertain_lti.plants.leibov import leibov2006
+
+    if not os.path.exists(name):
+        if name == "leibov2006":
+            return leibov2006()
+        if near := meant(name, ["leibov2006"]):
+            raise ModelError(f"{name}: there is no such model file{near}; write one with `uncertain-lti fit`")
+    return UncertainLTI.load(name)
+
+
+def model_target(path: str) -> Path:
+    """Where a model file goes; raises as `files.target`."""
+    from uncertain_lti.base.files import target
+
+    return target(path, holds=b'"uncertain-lti/', kind="model file", example="machine.model.json")

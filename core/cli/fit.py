@@ -1,0 +1,172 @@
+"""Command `uncertain-lti fit`: fit a model to recordings."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import shlex
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.cli.command import DONE, SILENT, Command, model_target, print_json, print_notes, print_summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti fit`."""
+    parser.add_argument(
+        "bags", metavar="BAG", nargs="+", help="MCAP files and folders; parts of a split bag are one recording"
+    )
+    parser.add_argument(
+        "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
+    )
+    parser.add_argument("--output", required=True, metavar="MODEL", help="model file to write (*.model.json)")
+    parser.add_argument("--criterion", choices=("qp", "lp"), default="qp", help="(10) squared or (11) largest width")
+    parser.add_argument(
+        "--additive",
+        choices=("none", "disturbance", "noise", "both"),
+        help="further terms: drift with its half-width, measurement noise (default: the signals file's, else none)",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "--discard",
+        type=_budget,
+        default=0,
+        metavar="K",
+        help="leave at most K transitions outside (or a share such as 0.001), chosen by effect and listed",
+    )
+    parser.add_argument(
+        "--count",
+        choices=("sample", "transient"),
+        default="sample",
+        help="let every sample weigh the same (default), or every recording however long it is",
+    )
+    parser.add_argument("--cache", metavar="FOLDER", help="more recordings than memory: keep the arrays in this folder")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="fit on the workers of this Dask scheduler")
+    parser.add_argument("--workers", type=int, metavar="N", help="fit on a Dask cluster of N workers on this machine")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fit a model and write it."""
+    from uncertain_lti import fit, read_transients
+    from uncertain_lti.base.files import sha256
+    from uncertain_lti.reports.text import fit_text, left_out_text, next_text, recording_text
+    from uncertain_lti.validation.left_out import leave_out_cheaply
+
+    output = model_target(options.output)
+    if options.workers is not None and options.workers < 1:
+        raise FitError(f"--workers is {options.workers}; give 1 or more")
+    if options.cache or options.scheduler or options.workers:
+        return _fit_archive(options, output)
+    transients = read_transients(options.bags, options.signals, options.progress.iterate("reading"), processes=None)
+    for transient in transients:
+        if not options.json:
+            print_notes(options, transient.notes)
+        print_summary(options, recording_text(transient))
+    began = time.perf_counter()
+    with options.progress.stage("fitting") as step:
+        model = fit(
+            transients,
+            options.criterion,
+            additive=options.additive,
+            discard=options.discard,
+            count=options.count,
+            seek_carriers=True,
+            progress=step,
+        )
+    sources = [{"file": name, "sha256": sha256(name)} for t in transients for name in t.sources]
+    model = model.replace(fit_summary={**model.fit_summary, "sources": sources})
+    with options.progress.stage("validating") as step:
+        left_out = leave_out_cheaply(transients, model, time.perf_counter() - began, step)
+    if left_out is not None:
+        model = model.replace(validation=left_out)
+    model.save(output)
+    if options.json:
+        data = model.to_dict()
+        print_json({"model": str(output), "fit": data["fit"], "validation": data["validation"]})
+    else:
+        print_summary(options, fit_text(model, transients))
+        if left_out is not None:
+            print_summary(options, left_out_text(left_out))
+        print_summary(options, f"model written to {output}")
+        print_summary(options, next_text(model, shlex.quote(str(output)), left_out))
+    return DONE
+
+
+def _fit_archive(options: argparse.Namespace, output: Path) -> int:
+    from contextlib import ExitStack
+
+    from uncertain_lti.base.files import sha256
+    from uncertain_lti.identification.archive import fit_archive
+    from uncertain_lti.reports.text import archive_text, next_text
+
+    if options.discard:
+        raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
+    if options.count != "sample":
+        raise FitError("--count transient needs all recordings in memory; leave out --cache, --scheduler and --workers")
+    if options.cache and (options.scheduler or options.workers):
+        raise FitError("--cache keeps the arrays on disk and --scheduler or --workers on a cluster; choose one")
+    with ExitStack() as stack:
+        client = None
+        if options.scheduler or options.workers:
+            dask: Any = import_module("distributed")
+
+            where = options.scheduler or stack.enter_context(_local_cluster(dask, options.workers))
+            try:
+                client = stack.enter_context(dask.Client(where, timeout=10))
+            except (OSError, TimeoutError, ValueError):
+                raise FitError(f"no Dask scheduler answers at {where}; start one with `dask scheduler`") from None
+        with options.progress.stage("fitting") as step:
+            model = fit_archive(
+                options.bags,
+                options.signals,
+                options.criterion,
+                options.additive,
+                cache=options.cache,
+                client=client,
+                progress=step,
+            )
+    sources = [{**s, "sha256": sha256(s["file"])} for s in model.fit_summary["sources"]]
+    model = model.replace(fit_summary={**model.fit_summary, "sources": sources})
+    model.save(output)
+    if options.json:
+        print_json({"model": str(output), "fit": model.to_dict()["fit"]})
+    else:
+        print_summary(options, archive_text(model))
+        print_summary(options, f"model written to {output}")
+        print_summary(options, next_text(model, shlex.quote(str(output)), None))
+    return DONE
+
+
+def _local_cluster(dask: Any, workers: int) -> Any:
+    """Worker processes that leave Ctrl-C to this one, which ends them."""
+    from uncertain_lti.sampling.reading_processes import children_ignore_ctrl_c
+
+    with children_ignore_ctrl_c():
+        return dask.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,  # of work that is broken off; what goes wrong comes back as an error
+        )
+
+
+def _budget(text: str) -> float:
+    """A whole number, or a share below 1."""
+    try:
+        return int(text) if text.isdigit() else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor a share such as 0.001") from None
+
+
+COMMAND = Command(
+    "fit",
+    "fit a model to recordings",
+    add_arguments,
+    run,
+    quiet=SILENT,
+    verbose="say every pass over the data, and what took how long",
+)

@@ -1,0 +1,28 @@
+"""Command `uncertain-lti info`: show what is in a model file."""
+
+from __future__ import annotations
+
+import argparse
+
+from uncertain_lti.cli.command import DONE, Command, load_model, print_json
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti info`."""
+    parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
+    parser.add_argument("--json", action="store_true", help="print the file as JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the model."""
+    from uncertain_lti.reports.text import model_text
+
+    model = load_model(options.model)
+    if options.json:
+        print_json(model.to_dict())
+    else:
+        print(model_text(model))
+    return DONE
+
+
+COMMAND = Command("info", "show what is in a model file", add_arguments, run)

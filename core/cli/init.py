@@ -1,0 +1,54 @@
+"""Command `uncertain-lti init`: propose a signals file."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.cli.command import DONE, Command, print_notes
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti init`."""
+    parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders of the same machine")
+    parser.add_argument(
+        "--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write or print the proposed signals file."""
+    from uncertain_lti.base.files import whole_file
+    from uncertain_lti.proposal.init import propose
+
+    output = options.output
+    if output is not None and os.path.exists(output):
+        raise SignalError(f"{output}: is there already; choose another output, or move it away")
+    proposal = propose(options.bags, options.progress.iterate("reading"))
+    print_notes(options, proposal.warnings)
+    if output is None:
+        print(proposal.text, end="")
+        return DONE
+    try:
+        with whole_file(output) as stream:
+            stream.write(proposal.text.encode())
+    except OSError as error:
+        raise SignalError(f"{output}: cannot be written: {error.strerror}; choose another place") from None
+    options.progress.say(
+        f"states: {', '.join(c.name for c in proposal.states)}\n"
+        f"controls: {', '.join(c.name for c in proposal.controls) or 'none found'}\n"
+        f"signals file written to {output}: read it and edit it, it says why; then\n"
+        f"  uncertain-lti fit {shlex.join(options.bags)} --signals {shlex.quote(output)} --output machine.model.json"
+    )
+    return DONE
+
+
+COMMAND = Command(
+    "init",
+    "propose a signals file for a recording, with reasons, for you to edit",
+    add_arguments,
+    run,
+    quiet="print errors only (and without --output the file): no summary, no notes, no progress",
+)

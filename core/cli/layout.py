@@ -1,0 +1,27 @@
+"""Command `uncertain-lti layout`: write layouts of viewers."""
+
+from __future__ import annotations
+
+import argparse
+
+from uncertain_lti.cli.command import DONE, Command, load_model
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti layout`."""
+    parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
+    parser.add_argument("--foxglove", metavar="FILE.json", help="for Foxglove and Lichtblick")
+    parser.add_argument("--plotjuggler", metavar="FILE.xml", help="for PlotJuggler")
+    parser.add_argument("--topics", metavar="NAME", help="what the topics begin with (default: /envelope_monitor)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the layouts that are asked for."""
+    from uncertain_lti.reports.layouts import write_layouts
+
+    for path in write_layouts(load_model(options.model), options.foxglove, options.plotjuggler, options.topics):
+        print(f"layout written to {path}")
+    return DONE
+
+
+COMMAND = Command("layout", "write layouts of viewers for what a model's monitor publishes", add_arguments, run)

@@ -1,0 +1,54 @@
+"""Command `uncertain-lti report`: write a page about a model and recordings."""
+
+from __future__ import annotations
+
+import argparse
+
+from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, print_json, print_notes, print_summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti report`."""
+    parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
+    parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders to check against it")
+    parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
+    parser.add_argument("--json", action="store_true", help="print the same facts as JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the page or print its facts, and return whether the alarm was raised."""
+    from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.recordings.bag import group_recordings
+    from uncertain_lti.reports.findings import findings, page_target
+    from uncertain_lti.reports.text import findings_text
+    from uncertain_lti.sampling.reading import read_as_fitted
+
+    model = load_model(options.model)
+    bags = group_recordings(options.bags)
+    output = page_target(options.output or (None if options.json else "report.html"), options.model, bags)
+    monitor = EnvelopeMonitor(model)
+    checked = []
+    for bag in bags:
+        transient = read_as_fitted(bag, model.signals, options.progress.iterate("reading"))
+        print_notes(options, transient.notes)
+        checked.append(monitor.check(transient))
+    facts = findings(model, options.model, checked, monitor.rule)
+    print_summary(options, findings_text(facts))
+    if output is not None:
+        from uncertain_lti.reports.html import html_report, write_page
+
+        write_page(output, html_report(model, checked, facts, options.progress.iterate("drawing", "sections")))
+        print_summary(options, f"report written to {output}")
+    if options.json:
+        print_json(facts)
+    return ALARM if facts["alarm"] else DONE
+
+
+COMMAND = Command(
+    "report",
+    "write a page that says whether a model may be relied on, and what happened in recordings",
+    add_arguments,
+    run,
+    quiet=SILENT,
+    verbose="say what took how long",
+)

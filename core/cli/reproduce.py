@@ -1,0 +1,36 @@
+"""Command `uncertain-lti reproduce`: run the paper's experiment."""
+
+from __future__ import annotations
+
+import argparse
+
+from uncertain_lti.base.errors import BagError
+from uncertain_lti.cli.command import DONE, Command
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti reproduce`."""
+    parser.add_argument(
+        "--output", default="reproduce-output", metavar="FOLDER", help="for figures, models and numbers"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the experiment into a folder."""
+    from uncertain_lti.plants.reproduce import reproduce
+
+    try:
+        with options.progress.stage("reproducing") as step:
+            reproduce(options.output, options.progress.say, step)
+    except OSError as error:
+        raise BagError(f"{options.output}: cannot be written: {error.strerror}; choose another folder") from None
+    return DONE
+
+
+COMMAND = Command(
+    "reproduce",
+    "run the paper's experiment on the nonlinear turbofan",
+    add_arguments,
+    run,
+    quiet="print errors only; everything is in the folder",
+)

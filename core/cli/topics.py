@@ -1,0 +1,68 @@
+"""Command `uncertain-lti topics`: list the topics of a recording."""
+
+from __future__ import annotations
+
+import argparse
+
+from uncertain_lti.cli.command import DONE, Command, print_json, print_notes
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti topics`."""
+    parser.add_argument("bag", metavar="BAG", help="MCAP file, or folder of a recording")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print the topics of a recording and what each holds."""
+    from uncertain_lti.recordings.bag import Bag, describe
+    from uncertain_lti.reports.text import number, table
+
+    bag = Bag(options.bag)
+    facts = describe(bag, options.progress.iterate("reading"))
+    if options.json:
+        print_json(
+            {
+                "recording": str(bag.path),
+                "warnings": bag.warnings,
+                "topics": [
+                    {
+                        "topic": f.info.topic,
+                        "type": f.info.type,
+                        "count": f.info.count,
+                        "readable": f.info.readable,
+                        "reason": f.info.reason,
+                        "rate": f.rate,
+                        "largest_gap": f.largest_gap,
+                        "header_stamps": f.stamps,
+                        "log_minus_header": f.stamp_offset,
+                        "fields": list(f.fields),
+                    }
+                    for f in facts
+                ],
+            }
+        )
+        return DONE
+    print_notes(options, bag.warnings)
+    rows = []
+    for f in facts:
+        stamps: str = f.stamps
+        if f.stamp_offset is not None and abs(f.stamp_offset) > 1.0:
+            stamps += f", log {f.stamp_offset:+.0f} s"
+        rows.append([f.info.topic, f.info.type, str(f.info.count), number(f.rate), number(f.largest_gap), stamps])
+    print(table(("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps"), rows))
+    for f in facts:
+        if not f.info.readable or f.info.reason:
+            print(f"{f.info.topic}: {f.info.reason}")
+        if f.fields:
+            print(f"{f.info.topic}: {', '.join(f.fields)}")
+    return DONE
+
+
+COMMAND = Command(
+    "topics",
+    "list the topics of a recording, and which fields could be signals",
+    add_arguments,
+    run,
+    quiet="print the list and errors only: no notes, no progress",
+)

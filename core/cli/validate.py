@@ -1,0 +1,89 @@
+"""Command `uncertain-lti validate`: validate a model by leaving out what it was fitted to."""
+
+from __future__ import annotations
+
+import argparse
+
+from uncertain_lti.base.errors import BagError, FitError
+from uncertain_lti.cli.command import DONE, SILENT, Command, model_target, print_json, print_notes, print_summary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti validate`."""
+    parser.add_argument("model", metavar="MODEL", help="model file")
+    parser.add_argument(
+        "bags", metavar="BAG", nargs="*", help="MCAP files and folders (default: those the model was fitted to)"
+    )
+    parser.add_argument("--blocks", type=int, help="leave out blocks: so many per recording (a single one: 10)")
+    parser.add_argument("--gap", type=float, help="s beside a left-out block that are not fitted either")
+    parser.add_argument("--confidence", type=float, default=0.9, help="of every interval (default: 0.9)")
+    parser.add_argument(
+        "--false-alarms", type=float, metavar="PER_HOUR", help="find the alarm rule that stays below so many per hour"
+    )
+    parser.add_argument(
+        "--output",
+        metavar="MODEL",
+        help="write the model with this validation, and the alarm rule found, to this file; where --false-alarms "
+        "finds none, nothing is written and the exit status is 2",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Validate the model and write it with the result, if an output is named."""
+    from uncertain_lti import UncertainLTI
+    from uncertain_lti.recordings.bag import group_recordings
+    from uncertain_lti.reports.text import validation_text
+    from uncertain_lti.sampling.reading import read_as_fitted
+    from uncertain_lti.validation.calibration import calibrate
+    from uncertain_lti.validation.left_out import validate_model
+
+    model = UncertainLTI.load(options.model)
+    sources = model.fit_summary.get("sources", [])
+    bags = options.bags or [s["file"] for s in sources]
+    if not bags:
+        raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
+    if options.output is not None:
+        model_target(options.output)
+    reading = options.progress.iterate("reading")
+    transients = [read_as_fitted(bag, model.signals, reading) for bag in group_recordings(bags)]
+    for transient in transients:
+        print_notes(options, transient.notes)
+    with options.progress.stage("validating") as step:
+        validation = validate_model(
+            model, transients, blocks=options.blocks, gap=options.gap, confidence=options.confidence, progress=step
+        )
+    data = validation.to_dict()
+    refusal = ""
+    if options.false_alarms is not None:
+        calibration = calibrate(validation, options.false_alarms)
+        data["calibration"] = calibration.to_dict()
+        if calibration.alarm_rule is not None:
+            model = model.replace(alarm_rule=calibration.alarm_rule)
+        elif options.output is not None:
+            refusal = f"{options.output}: not written: {calibration.words}"
+    model = model.replace(validation=data)
+    output = None if refusal else options.output
+    if output is not None:
+        model.save(output)
+    if options.json:
+        print_json({"model": output or options.model, "validation": model.to_dict()["validation"]})
+    else:
+        print_summary(options, validation_text(data))
+        if output is not None:
+            rule = f"{model.alarm_rule.violations} of {model.alarm_rule.window}, margin {model.alarm_rule.margin:.3g}"
+            kept = ", unchanged" if options.false_alarms is None else ""
+            print_summary(options, f"model written to {output}; its alarm rule{kept}: {rule}")
+    if refusal:  # whoever asked for a rule and deploys the file would deploy one without it
+        raise FitError(refusal)
+    return DONE
+
+
+COMMAND = Command(
+    "validate",
+    "tell how far to trust a model, by leaving out what it was fitted to",
+    add_arguments,
+    run,
+    quiet=SILENT,
+    verbose="say every fit, and what took how long",
+)
