@@ -7,22 +7,72 @@ from collections.abc import Iterable, Sequence
 
 
 def plural(count: object, word: str) -> str:
-    """1 state, 2 states, no state as 0 states, and 1 pass, 2 passes; `word` may be several, the last one counted."""
+    """A count and its noun: 1 state, 2 states, 0 states; 1 pass, 2 passes.
+
+    Parameters
+    ----------
+    count : object
+        What is counted; 1 takes the singular.
+    word : str
+        The noun in the singular; of several words the last is inflected.
+
+    Returns
+    -------
+    str
+        The count, a space and the noun.
+    """
     return f"{count} {word}" if count == 1 else f"{count} {_several(word)}"
 
 
 def times(count: int) -> str:
-    """Once, or how many times."""
+    """Once, or how many times.
+
+    Parameters
+    ----------
+    count : int
+        How often something happened.
+
+    Returns
+    -------
+    str
+        `once`, or `3 times`.
+    """
     return "once" if count == 1 else f"{count} times"
 
 
 def shortlist(names: Sequence[str], limit: int) -> str:
-    """The first names, and how many more there are."""
+    """The first names, and how many more there are.
+
+    Parameters
+    ----------
+    names : sequence of str
+        All names, in the order in which they are shown.
+    limit : int
+        Names shown at most.
+
+    Returns
+    -------
+    str
+        The first names with commas between, and how many more there are.
+    """
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
 def meant(word: object, known: Iterable[str]) -> str:
-    """(is X meant?), with the known names that are near to a word, or nothing."""
+    """(is X meant?), with the known names that are near to a word, or nothing.
+
+    Parameters
+    ----------
+    word : object
+        What was written; compared as text, without regard to case.
+    known : iterable of str
+        The names that exist.
+
+    Returns
+    -------
+    str
+        ` (is X meant?)` with up to three names near to the word, or an empty text.
+    """
     names = {name.lower(): name for name in sorted(known)}
     near = difflib.get_close_matches(str(word).lower(), names, n=3, cutoff=0.7)
     return f" (is {' or '.join(names[n] for n in near)} meant?)" if near else ""

@@ -23,6 +23,16 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     Whatever ends the block early, Ctrl-C included, leaves what was there before. What is no file, such as /dev/null
     or a pipe, is written to as it stands; a link goes on pointing where it does.
 
+    Parameters
+    ----------
+    path : path
+        The file to write.
+
+    Yields
+    ------
+    binary stream
+        Open for writing; a temporary file in the same folder, renamed to `path` at the end of the block.
+
     Raises
     ------
     OSError
@@ -51,7 +61,23 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
-    """Checksum of a file; raises OSError."""
+    """Checksum of a file's content.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Returns
+    -------
+    str
+        The SHA-256 in hexadecimal digits.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    """
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -60,6 +86,18 @@ def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
     """Whether nothing is lost at this path when a file is written there that has such words in its first 500 bytes.
 
     So it is where there is nothing yet, and where an older file of the same kind stands; of a folder it is not asked.
+
+    Parameters
+    ----------
+    path : path
+        The file that is to be written.
+    holds : bytes
+        Words that every file of the kind has in its first 500 bytes.
+
+    Returns
+    -------
+    bool
+        True where nothing can be read, and where an older file of the same kind is; False where any other file is.
     """
     try:
         with open(path, "rb") as stream:
@@ -71,6 +109,22 @@ def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
 
 def target(wish: str | os.PathLike[str], *, holds: bytes, kind: str, example: str) -> Path:
     """Where a file of a kind goes, that holds such words (`may_replace`); an older one gives way, and nothing else.
+
+    Parameters
+    ----------
+    wish : path
+        The path that was asked for.
+    holds : bytes
+        Words that every file of the kind has in its first 500 bytes.
+    kind : str
+        Name of the kind, for the error.
+    example : str
+        File name that the error suggests when `wish` is a folder.
+
+    Returns
+    -------
+    Path
+        The path asked for.
 
     Raises
     ------
@@ -88,7 +142,18 @@ def target(wish: str | os.PathLike[str], *, holds: bytes, kind: str, example: st
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """What a file is by its first bytes, with an article: a recording, a model, signals; "" where that is not known."""
+    """What a file is by its first bytes, with an article: a recording, a model, signals; "" where that is not known.
+
+    Parameters
+    ----------
+    path : path
+        A file or a folder.
+
+    Returns
+    -------
+    str
+        `a folder`, `an MCAP recording`, `a model file`, `a signals file`, or an empty text where the kind is unknown.
+    """
     if os.path.isdir(path):
         return "a folder"
     try:

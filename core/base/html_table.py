@@ -11,7 +11,24 @@ MOST = 12
 
 
 def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]], below: Sequence[str] = ()) -> str:
-    """A plain table; every text is escaped. The first column stands to the left, the others to the right."""
+    """A plain table; every text is escaped. The first column stands to the left, the others to the right.
+
+    Parameters
+    ----------
+    caption : str
+        Heading of the table, in bold.
+    header : sequence of str
+        Names of the columns.
+    rows : iterable of sequence of str
+        Cells of each row, as many as `header` has.
+    below : sequence of str, optional
+        Lines under the table, optional.
+
+    Returns
+    -------
+    str
+        HTML; every text in it is escaped.
+    """
     head = "".join(f"<th style='text-align:{_side(i)}'>{escape(cell)}</th>" for i, cell in enumerate(header))
     body = "".join(
         "<tr>" + "".join(f"<td style='text-align:{_side(i)}'>{escape(c)}</td>" for i, c in enumerate(row)) + "</tr>"
@@ -29,10 +46,34 @@ def _side(column: int) -> str:
 
 
 def number_text(value: float | None) -> str:
-    """Four digits; a dash where there is no finite number."""
+    """Four digits; a dash where there is no finite number.
+
+    Parameters
+    ----------
+    value : float or None
+        The number; None where there is none.
+
+    Returns
+    -------
+    str
+        Four significant digits, or a dash.
+    """
     return "–" if value is None or not math.isfinite(value) else f"{value:.4g}"
 
 
 def name_with_unit(name: str, unit: str) -> str:
-    """`name [unit]`, or the name alone where there is no unit."""
+    """`name [unit]`, or the name alone where there is no unit.
+
+    Parameters
+    ----------
+    name : str
+        Name of a signal.
+    unit : str
+        Its unit, or an empty text.
+
+    Returns
+    -------
+    str
+        `name [unit]`, or `name`.
+    """
     return f"{name} [{unit}]" if unit else name

@@ -51,12 +51,24 @@ class Progress:
         return not self.quiet and self._stream.isatty()
 
     def note(self, text: str) -> None:
-        """A remark that the reader should know, unless quiet."""
+        """A remark that the reader should know, unless quiet.
+
+        Parameters
+        ----------
+        text : str
+            The remark, without `note:`.
+        """
         if not self.quiet:
             self._write(f"note: {text}")
 
     def say(self, text: str) -> None:
-        """Part of the result, on standard output, unless quiet; a bar stays below it."""
+        """Part of the result, on standard output, unless quiet; a bar stays below it.
+
+        Parameters
+        ----------
+        text : str
+            Lines of the result.
+        """
         if self.quiet:
             return
         if any(not bar.disable for bar in self._bars):
@@ -67,12 +79,31 @@ class Progress:
             print(text)
 
     def detail(self, text: str) -> None:
-        """A line for who asked to see the work."""
+        """A line for who asked to see the work.
+
+        Parameters
+        ----------
+        text : str
+            The line, without its time.
+        """
         if self.verbose:
             self._write(f"{time.perf_counter() - self._began:8.2f} s  {text}")
 
     def iterate(self, what: str, unit: str = "messages") -> Callable[[Iterable[object], int], Iterable[object]] | None:
-        """Wrapper (iterable, total) -> iterable that shows how far it has come; None where nobody would see it."""
+        """Wrapper (iterable, total) -> iterable that shows how far it has come; None where nobody would see it.
+
+        Parameters
+        ----------
+        what : str
+            What is gone through, in front of the bar.
+        unit : str, default "messages"
+            What is counted, in the plural.
+
+        Returns
+        -------
+        callable or None
+            Wrapper, or None where nothing would show it.
+        """
 
         def wrap(items: Iterable[object], total: int) -> Iterator[object]:
             began = time.perf_counter()
@@ -86,7 +117,18 @@ class Progress:
 
     @contextmanager
     def stage(self, what: str) -> Iterator[Callable[[str], None]]:
-        """Yields a callable for one line of text per step; a line that says `3 of 10` moves the bar there."""
+        """Yields a callable for one line of text per step; a line that says `3 of 10` moves the bar there.
+
+        Parameters
+        ----------
+        what : str
+            Name of the stage, in front of every line.
+
+        Yields
+        ------
+        callable
+            Takes one line of text per step.
+        """
         began = drawn = time.perf_counter()
         with ExitStack() as stack:
             bar: Any = None
