@@ -19,6 +19,24 @@ def signal_paths(
 
     The entries of an array stand as one path, `data[0..99]` for `data[0]` to `data[99]`, or as
     `position[fan]` each where the message names them; a quaternion is also offered as roll, pitch and yaw.
+
+    Parameters
+    ----------
+    type_fields : callable
+        Type name -> {field name: FieldType}.
+    type_name : str
+        Type of the message, as package/msg/Name.
+    message : object
+        A decoded message of that type.
+    before : str, default ""
+        Path that leads to this message from the outermost one, with its dot.
+    depth : int, optional
+        Levels of nested messages that are opened.
+
+    Yields
+    ------
+    str
+        A field path; an array as one path with the range of its indices.
     """
     fields = type_fields(type_name)
     for name, field in fields.items():

@@ -28,8 +28,14 @@ TimeSource = Literal["header", "log"]
 class FieldType:
     """Type of one message field.
 
-    kind is what one element is; type_name the element's type; array is None for a single value, 0 for a
-    sequence of any length and n for n elements.
+    Parameters
+    ----------
+    kind : {"number", "bool", "string", "message", "other"}
+        What one element is.
+    type_name : str
+        Type of one element, as the message definition writes it.
+    array : int or None, optional
+        None for a single value, 0 for a sequence of any length, n for n elements.
     """
 
     kind: Literal["number", "bool", "string", "message", "other"]
@@ -42,7 +48,22 @@ TypeFields = Callable[[str], Mapping[str, FieldType]]
 
 
 def numeric_paths(type_name: str, type_fields: TypeFields, depth: int = 6) -> Iterator[str]:
-    """Field paths of a type that can be signals; arrays end in `[]` (sequence) or `[n]` (fixed length)."""
+    """Field paths of a type that can be signals; arrays end in `[]` (sequence) or `[n]` (fixed length).
+
+    Parameters
+    ----------
+    type_name : str
+        Type of the message, as package/msg/Name.
+    type_fields : callable
+        Type name -> {field name: FieldType}.
+    depth : int, default 6
+        Levels of nested messages that are opened.
+
+    Yields
+    ------
+    str
+        A path that leads to numbers or booleans.
+    """
     for name, kind in type_fields(type_name).items():
         suffix = "" if kind.array is None else "[]" if kind.array == 0 else f"[{kind.array}]"
         if kind.kind in ("number", "bool"):
@@ -64,16 +85,31 @@ _NAN = math.nan
 class Derived(NamedTuple):
     """A number worked out from the parts of a value, in two steps so that many messages share the first.
 
-    terms takes the parts (x, y, z, w of a quaternion; floats, or arrays of them: the arithmetic is the same to the
-    last bit) to the arguments of number, and to what has to be positive for there to be one. number is for floats
-    alone: numpy's functions round otherwise than those of math.
+    Parameters
+    ----------
+    terms : callable
+        Takes the parts (x, y, z, w of a quaternion; floats, or arrays of them: the arithmetic is the same to the last
+        bit) to the arguments of `number`, and to what has to be positive for there to be one.
+    number : callable
+        Takes these arguments, floats alone, to the number: numpy's functions round otherwise than those of math.
     """
 
     terms: Callable[..., tuple[tuple[Any, ...], Any]]
     number: Callable[..., float]
 
     def of(self, value: Any) -> float:
-        """The number for one value of a message; NaN where there is none."""
+        """The number for one value of a message; NaN where there is none.
+
+        Parameters
+        ----------
+        value : object
+            A quaternion, a vector or an array in a decoded message.
+
+        Returns
+        -------
+        float
+            Angle in rad, or norm; NaN where there is none.
+        """
         if self is not NORM:
             return self.of_parts(value.x, value.y, value.z, value.w)
         if hasattr(value, "x"):
@@ -81,7 +117,18 @@ class Derived(NamedTuple):
         return math.hypot(*(float(v) for v in value))
 
     def of_parts(self, *parts: Any) -> float:
-        """The same from the parts of the value."""
+        """The same from the parts of the value.
+
+        Parameters
+        ----------
+        *parts : float
+            x, y, z, w of a quaternion, or the elements of a vector.
+
+        Returns
+        -------
+        float
+            Angle in rad, or norm; NaN where there is none.
+        """
         arguments, size = self.terms(*parts)
         return self.number(*arguments) if size > 0.0 else _NAN
 
@@ -130,6 +177,11 @@ class FieldPath:
     holds the array (as in sensor_msgs/JointState), `["3"]` a name that looks like an index. Derived: roll,
     pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle
     in rad (the sampler does the unwrapping, as it knows where a stream starts anew).
+
+    Parameters
+    ----------
+    text : str
+        The path as a signals file writes it.
 
     Raises
     ------
@@ -195,7 +247,18 @@ class FieldPath:
         return hash(self.text)
 
     def read(self, message: Any) -> float:
-        """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero."""
+        """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero.
+
+        Parameters
+        ----------
+        message : object
+            A decoded message of the type that the path was checked against.
+
+        Returns
+        -------
+        float
+            The number as recorded, in rad for a derived angle; not unwrapped.
+        """
         value, parent = message, message
         for kind, key in self.steps:
             if kind == "attribute":
@@ -222,7 +285,18 @@ class FieldPath:
         return -1
 
     def absent(self, message: Any) -> str:
-        """What this path looks up and the message has not, in words, with what is there; empty where it has."""
+        """What this path looks up and the message has not, in words, with what is there; empty where it has.
+
+        Parameters
+        ----------
+        message : object
+            A decoded message of the type that the path was checked against.
+
+        Returns
+        -------
+        str
+            A sentence, or an empty text where the message has the value.
+        """
         value, parent, name = message, message, ""
         for kind, key in self.steps:
             if kind == "attribute":
@@ -242,7 +316,16 @@ class FieldPath:
         return ""
 
     def check(self, topic: str, type_name: str, type_fields: TypeFields) -> None:
-        """Hold the path against a message type.
+        """Check the path against a message type.
+
+        Parameters
+        ----------
+        topic : str
+            Topic that carries the type, for the error.
+        type_name : str
+            Type of the message, as package/msg/Name.
+        type_fields : callable
+            Type name -> {field name: FieldType}.
 
         Raises
         ------
@@ -314,9 +397,26 @@ def _some(paths: Iterator[str], limit: int = 24) -> str:
 class Signal:
     """One state or control: where it is read, and the operating point it is measured from.
 
-    steady and scale are in recorded units; `auto` asks for the rule in `operating_point`. max_hold (s, controls
-    only; None = no limit) is the greatest age at which a held control still counts; delay (samples, controls
-    only) shifts the control: sample k takes u(t_{k - delay}).
+    Parameters
+    ----------
+    name : str
+        Name of the signal; each in a map has its own.
+    topic : str
+        Topic that carries it.
+    field : str
+        Path of the number in the message, as `FieldPath` reads it.
+    steady : float or "auto", default 0.0
+        Steady state in recorded units; `auto` asks for the rule in `operating_point`.
+    scale : float or "auto", default 1.0
+        Positive scale in recorded units; `auto` likewise.
+    unit : str, default ""
+        Unit as it is shown.
+    type : str, default ""
+        Message type of the topic; empty while it is unknown.
+    max_hold : float or None, optional
+        Greatest age, s, at which a held control still counts; None for no limit. For controls only.
+    delay : int, default 0
+        Samples by which a control is shifted: sample k takes u(t_{k - delay}). For controls only.
     """
 
     name: str
@@ -331,7 +431,15 @@ class Signal:
 
 
 class UncarriedTopicError(SignalError):
-    """A signals file speaks of a topic that carries no signal; topics: those that do, any of which may be misspelt."""
+    """A signals file names a topic that carries no signal.
+
+    Parameters
+    ----------
+    text : str
+        The sentence for a person.
+    topics : tuple of str
+        The topics that do carry a signal, any of which may be misspelt.
+    """
 
     def __init__(self, text: str, topics: tuple[str, ...]) -> None:
         super().__init__(text)
@@ -342,12 +450,29 @@ class UncarriedTopicError(SignalError):
 class SignalMap:
     """Which topic and field is which state or control, and how samples are cut from the messages.
 
-    clock is the topic whose messages define the sample instants (None: the slowest state topic); max_gap (s)
-    the longest step that is still a transition (None: 2.5 x the median step); min_step (s) the shortest;
-    max_skew (s) the greatest age of a state from another topic than the clock (None: max_gap); time says per
-    topic whether its instant is the header stamp or the log time (not said: header where the type has one
-    and stamps are not zero). additive is the term that a fit uses where it is not told another, and
-    structure the rules on single elements that it keeps (`identification.structure`).
+    Parameters
+    ----------
+    states : tuple of Signal
+        States, in the order of x; at least one.
+    controls : tuple of Signal, optional
+        Controls, in the order of u.
+    clock : str or None, optional
+        Topic whose messages define the sample instants; None for the slowest state topic.
+    max_gap : float or None, optional
+        Longest step that is still a transition, s; None for 2.5 x the median step.
+    min_step : float, default 0.0
+        Shortest step, s; a message sooner than that is dropped.
+    max_skew : float or None, optional
+        Greatest age of a state from another topic than the clock, s; None for `max_gap`.
+    time : mapping of str to {"header", "log"}, optional
+        Per topic whether its instant is the header stamp or the log time; for a topic that is left out, header where
+        most of its messages carry a stamp.
+    additive : {"none", "disturbance", "noise", "both"} or None, optional
+        The additive term of a fit that is given none.
+    structure : object, optional
+        The rules on single elements that a fit keeps (`identification.structure`); None for no rule.
+    source : str, default "signals"
+        What errors call the map: the path of its file.
 
     Raises
     ------
@@ -438,16 +563,53 @@ class SignalMap:
         return tuple(dict.fromkeys(s.topic for s in self.signals))
 
     def on(self, topic: str) -> list[int]:
-        """Positions in `signals` of what this topic carries."""
+        """Positions in `signals` of what this topic carries.
+
+        Parameters
+        ----------
+        topic : str
+            Name of a topic.
+
+        Returns
+        -------
+        list of int
+            Positions, increasing; empty for a topic that carries no signal.
+        """
         return [i for i, s in enumerate(self.signals) if s.topic == topic]
 
     def check(self, topic: str, type_name: str, type_fields: TypeFields) -> None:
-        """Hold every field path of one topic against its message type; raises SignalError."""
+        """Check every field path of one topic against its message type.
+
+        Parameters
+        ----------
+        topic : str
+            Name of the topic.
+        type_name : str
+            Type of its messages, as package/msg/Name.
+        type_fields : callable
+            Type name -> {field name: FieldType}.
+
+        Raises
+        ------
+        SignalError
+            A path is not in the type, or is not one number.
+        """
         for i in self.on(topic):
             FieldPath(self.signals[i].field).check(topic, type_name, type_fields)
 
     def with_types(self, types: Mapping[str, str]) -> SignalMap:
-        """The same map with the message type of each topic filled in."""
+        """The same map with the message type of each topic filled in.
+
+        Parameters
+        ----------
+        types : mapping of str to str
+            Topic -> message type; a topic that is left out keeps the type it has.
+
+        Returns
+        -------
+        SignalMap
+            A new map.
+        """
         return replace(
             self,
             states=tuple(replace(s, type=types.get(s.topic, s.type)) for s in self.states),
@@ -457,6 +619,16 @@ class SignalMap:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SignalMap:
         """Read a signals file (YAML).
+
+        Parameters
+        ----------
+        path : path
+            The file.
+
+        Returns
+        -------
+        SignalMap
+            The map as the file says it; `auto`, clock and max_gap are still open.
 
         Raises
         ------
@@ -493,9 +665,26 @@ class SignalMap:
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "signals", need_topics: bool = True) -> SignalMap:
-        """Build from the structure of a signals file (see `load`); raises SignalError.
+        """Build from the structure of a signals file (see `load`).
 
-        need_topics: every signal must name its topic; a model fitted to arrays has none.
+        Parameters
+        ----------
+        data : object
+            Mappings, lists, numbers and text, as YAML or JSON gives them.
+        source : str, default "signals"
+            What errors call it.
+        need_topics : bool, default True
+            Whether every signal must name its topic; a model fitted to arrays has none.
+
+        Returns
+        -------
+        SignalMap
+            The map.
+
+        Raises
+        ------
+        SignalError
+            A key is unknown or missing, or a value is wrong; the sentence names it.
         """
         top = _keys(
             data,
