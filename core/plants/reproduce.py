@@ -38,9 +38,32 @@ SHORT_CONTROLS = ("fuel", "area", "fan vanes", "comp. vanes")
 class Case:
     """One identification and its check.
 
-    name: what it was identified from; outside: transitions outside in the identification transients; inside (n,) and
-    inside_all: shares of the check's transitions; mean_width, max_width (n,): of the bounds over the check, normalised,
-    per step; squared and largest (n,): discrepancies (4) and (5) of the nominal model over the check.
+    Parameters
+    ----------
+    name : str
+        What it was identified from.
+    model : UncertainLTI
+        The model fitted.
+    verdicts : Verdicts
+        On the check transient.
+    outside : int
+        Transitions outside the bounds in the identification transients.
+    inside : array (n,)
+        Share of the check's transitions inside the bounds of each state.
+    inside_all : float
+        Share of the check's transitions inside all bounds.
+    mean_width : array (n,)
+        Mean width of the bounds over the check, normalised, per step.
+    max_width : array (n,)
+        Largest such width.
+    squared : float
+        Discrepancy of the nominal model over the check, Leibov (2006), eq. (4), W = I.
+    largest : array (n,)
+        The same, eq. (5).
+    outside_domain : int
+        Transitions of the check outside the fitted domain.
+    seconds : float
+        Wall-clock time of the fit.
     """
 
     name: str
@@ -65,7 +88,26 @@ class Case:
     def of(
         cls, name: str, transients: Sequence[Transient], check: Transient, criterion: Any, additive: Any = "none"
     ) -> Case:
-        """Fit and check."""
+        """Fit a model and check it on another transient.
+
+        Parameters
+        ----------
+        name : str
+            What it is identified from.
+        transients : sequence of Transient
+            To fit.
+        check : Transient
+            To check.
+        criterion : {"qp", "lp"}
+            Criterion (10) or (11) of Leibov (2006).
+        additive : {"none", "disturbance", "noise", "both"}, default "none"
+            The additive term.
+
+        Returns
+        -------
+        Case
+            The result.
+        """
         began = time.perf_counter()
         model = fit(transients, criterion, additive=additive)
         seconds = time.perf_counter() - began
@@ -90,7 +132,13 @@ class Case:
         )
 
     def data(self) -> dict[str, Any]:
-        """The numbers, as plain data."""
+        """The numbers, as plain data for JSON.
+
+        Returns
+        -------
+        dict of str to object
+            Lists and numbers; widths normalised, eigenvalues as [real, imaginary] in 1/s.
+        """
         return {
             "identified_from": self.name,
             "criterion": self.model.fit_summary["criterion"],
@@ -208,7 +256,13 @@ def reproduce(
 
 
 def trim_text() -> str:
-    """Steady states at 68 and 60 deg."""
+    """Steady states at 68 and 60 deg.
+
+    Returns
+    -------
+    str
+        A table: speeds in rpm, thrust in kN, consumption in kg/(kgf h), temperatures in K, flows in kg/s.
+    """
     rows = []
     for pla in (68.0, 60.0):
         t = trim(pla)
@@ -226,7 +280,18 @@ def trim_text() -> str:
 
 
 def cases_text(cases: Sequence[Case]) -> str:
-    """Shares of the check inside."""
+    """Shares of the check inside.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        All cases.
+
+    Returns
+    -------
+    str
+        A table.
+    """
     rows = [
         [
             c.name, *c.fitted_by, str(c.outside), f"{c.inside_all:.0%}",
@@ -241,7 +306,18 @@ def cases_text(cases: Sequence[Case]) -> str:
 
 
 def width_text(cases: Sequence[Case]) -> str:
-    """Widths and discrepancies over the check."""
+    """Widths and discrepancies over the check.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        All cases, checked on transients of the same length.
+
+    Returns
+    -------
+    str
+        A table in 1e-4 of the scale.
+    """
     rows = [
         [
             c.name, *c.fitted_by, *(f"{1e4 * w:.2f}" for w in c.mean_width),
@@ -260,7 +336,18 @@ def width_text(cases: Sequence[Case]) -> str:
 
 
 def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
-    """Eigenvalues beside the published ones."""
+    """Eigenvalues beside the published ones.
+
+    Parameters
+    ----------
+    models : dict of str to UncertainLTI
+        Models by the name that the table shows.
+
+    Returns
+    -------
+    str
+        A table, 1/s.
+    """
     point, plant = operating_point(), engine()
     A = plant.linearise(point.x_s, point.u_s, point.X, point.U)[0]
     sampled = (expm(A * DT) - np.eye(len(A))) / DT
@@ -281,7 +368,20 @@ def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
 
 
 def matrix_text(model: UncertainLTI, name: str) -> str:
-    """A, B and their half-widths beside the published ones."""
+    """A, B and their half-widths beside the published ones.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model fitted.
+    name : str
+        What the heading calls it.
+
+    Returns
+    -------
+    str
+        Two tables, 1/s.
+    """
     parts = []
     published = leibov2006()
     for title, m in (("published", published), (name, model)):
@@ -294,7 +394,18 @@ def matrix_text(model: UncertainLTI, name: str) -> str:
 
 
 def search_text(searches: Sequence[dict[str, Any]]) -> str:
-    """The paper's solver beside the exact one."""
+    """The paper's solver beside the exact one.
+
+    Parameters
+    ----------
+    searches : sequence of dict
+        Per identification the objectives and the times of both solvers; the keys are those of `reproduce.json`.
+
+    Returns
+    -------
+    str
+        A table.
+    """
     rows = [
         [
             s["identified_from"], number(s["exact"]), number(s["direct_search"]),
@@ -311,6 +422,18 @@ def check_figure(case: Case, path: str | os.PathLike[str]) -> None:
     """The paper's figure: each state between the bounds; beside it the same relative to the bounds' centre.
 
     Left, in recorded units, as the paper draws it; the bounds are so close there that right shows what they leave.
+
+    Parameters
+    ----------
+    case : Case
+        The case to draw.
+    path : path
+        The figure; its ending chooses the format, PNG where it has none.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -56,6 +56,45 @@ class DesignPoint:
 
     Flow, pressure ratio and bypass ratio are those published for the RD-33; the turbine inlet temperature is the one
     that gives its thrust in a cycle without cooling air; the others are typical of the class, and chosen.
+
+    Parameters
+    ----------
+    flow : float, default 76.0
+        Air flow, kg/s.
+    fan_ratio : float, default 3.15
+        Pressure ratio of the fan.
+    compressor_ratio : float, default 6.9
+        Pressure ratio of the compressor.
+    bypass_ratio : float, default 0.49
+        Bypass flow over core flow.
+    turbine_inlet : float, default 1440.0
+        Temperature in front of the turbine, K.
+    fan_efficiency : float, default 0.82
+        Isentropic.
+    compressor_efficiency : float, default 0.84
+        Isentropic.
+    high_turbine_efficiency : float, default 0.87
+        Isentropic.
+    low_turbine_efficiency : float, default 0.88
+        Isentropic.
+    combustion_efficiency : float, default 0.99
+        Share of the heating value that is released.
+    combustor_loss : float, default 0.05
+        Share of total pressure.
+    bypass_loss : float, default 0.03
+        Share of total pressure.
+    mixer_loss : float, default 0.03
+        Share of total pressure, in mixer, jet pipe and unlit afterburner.
+    mechanical_efficiency : float, default 0.99
+        Of either spool.
+    velocity_coefficient : float, default 0.985
+        Of the nozzle.
+    core_mach : float, default 0.5
+        In the mixing plane, behind the turbine.
+    fan_speed : float, default 11000.0
+        rpm.
+    compressor_speed : float, default 15500.0
+        rpm.
     """
 
     flow: float = 76.0  # kg/s
@@ -80,7 +119,21 @@ class DesignPoint:
 
 @dataclass(frozen=True)
 class Rotors:
-    """Moments of inertia, kg m^2, and sensor lags, s: chosen for the modes of the paper (see docs/turbofan.md)."""
+    """Moments of inertia and sensor lags, chosen for the modes of the paper (see docs/turbofan.md).
+
+    Parameters
+    ----------
+    low : float, default 16.0
+        Moment of inertia of the fan's spool, kg m^2.
+    high : float, default 7.25
+        Moment of inertia of the compressor's spool, kg m^2.
+    compressor_pressure : float, default 0.055
+        Lag of the sensor behind the compressor, s.
+    turbine_pressure : float, default 0.045
+        Lag of the pressure sensor behind the turbine, s.
+    turbine_temperature : float, default 0.07
+        Lag of the temperature sensor behind the turbine, s.
+    """
 
     low: float = 16.0
     high: float = 7.25
@@ -91,7 +144,15 @@ class Rotors:
 
 @dataclass(frozen=True)
 class Health:
-    """Factors on the efficiencies of fan and compressor; 1 is healthy."""
+    """Factors on the efficiencies of fan and compressor; 1 is healthy.
+
+    Parameters
+    ----------
+    fan : float, default 1.0
+        Factor on the fan's efficiency.
+    compressor : float, default 1.0
+        Factor on the compressor's efficiency.
+    """
 
     fan: float = 1.0
     compressor: float = 1.0
@@ -99,7 +160,59 @@ class Health:
 
 @dataclass(frozen=True)
 class GasPath:
-    """Everything at one operating condition. P Pa, T K, W kg/s by station; powers W; thrust N; speeds rpm."""
+    """Everything at one operating condition; the stations are those of the module's docstring.
+
+    Parameters
+    ----------
+    P3 : float
+        Total pressure, Pa.
+    T3 : float
+        Total temperature, K.
+    T4 : float
+        Total temperature, K.
+    P5 : float
+        Total pressure, Pa.
+    T5 : float
+        Total temperature, K.
+    P13 : float
+        Total pressure, Pa.
+    T13 : float
+        Total temperature, K.
+    P6 : float
+        Total pressure, Pa.
+    T6 : float
+        Total temperature, K.
+    w4 : float
+        Mass fraction of burnt fuel at station 4.
+    w6 : float
+        Mass fraction of burnt fuel at station 6.
+    W2 : float
+        Flow, kg/s.
+    W25 : float
+        Flow, kg/s.
+    W4 : float
+        Flow, kg/s.
+    W5 : float
+        Flow, kg/s.
+    W16 : float
+        Flow, kg/s.
+    W8 : float
+        Flow, kg/s.
+    fuel : float
+        Fuel flow, kg/s.
+    thrust : float
+        Gross thrust, N.
+    fan_power : float
+        Taken by the fan, W.
+    compressor_power : float
+        Taken by the compressor, W.
+    high_turbine_power : float
+        Given by the turbine of the compressor's spool, W.
+    low_turbine_power : float
+        Given by the turbine of the fan's spool, W.
+    residual : float
+        Largest relative mismatch of the five flow balances.
+    """
 
     P3: float
     T3: float
@@ -149,8 +262,15 @@ class Engine:
 
     Parameters
     ----------
-    design : DesignPoint
-    rotors : Rotors
+    design : DesignPoint, optional
+        Sizes; default `DesignPoint()`.
+    rotors : Rotors, optional
+        Inertias and sensor lags; default `Rotors()`.
+
+    Raises
+    ------
+    UncertainLTIError
+        The sizes leave no pressure for the bypass.
     """
 
     def __init__(self, design: DesignPoint | None = None, rotors: Rotors | None = None) -> None:
@@ -275,6 +395,22 @@ class Engine:
     ) -> GasPath:
         """Matched gas path at spool speeds x[:2] and controls u, to a relative mismatch of 1e-12.
 
+        Parameters
+        ----------
+        x : sequence of float (5,)
+            States in recorded units; the speeds alone count.
+        u : sequence of float (4,)
+            Controls in recorded units.
+        health : Health, optional
+            Default healthy.
+        solver : GasPathSolver, optional
+            Keeps the last solution as the next guess; default a new one.
+
+        Returns
+        -------
+        GasPath
+            Flows matched to a relative 1e-12.
+
         Raises
         ------
         UncertainLTIError
@@ -285,7 +421,29 @@ class Engine:
     def derivative(
         self, x: Sequence[float], u: Sequence[float], health: Health | None = None, solver: GasPathSolver | None = None
     ) -> Array:
-        """dx/dt, (5,), recorded units per s."""
+        """Rate of the states.
+
+        Parameters
+        ----------
+        x : sequence of float (5,)
+            States in recorded units.
+        u : sequence of float (4,)
+            Controls in recorded units.
+        health : Health, optional
+            Default healthy.
+        solver : GasPathSolver, optional
+            As for `gas_path`.
+
+        Returns
+        -------
+        array (5,)
+            dx/dt, recorded units per s.
+
+        Raises
+        ------
+        UncertainLTIError
+            As `gas_path`.
+        """
         path = self.gas_path(x, u, health, solver)
         r, loss = self.rotors, self.design.mechanical_efficiency
         radian = 2.0 * pi / 60.0
@@ -303,7 +461,33 @@ class Engine:
     def linearise(
         self, x: ArrayLike, u: ArrayLike, X: ArrayLike, U: ArrayLike, step: float = 1e-5
     ) -> tuple[Array, Array]:
-        """A (5, 5) and B (5, 4), 1/s, of the deviations scaled by X and U; central differences."""
+        """A and B of the scaled deviations, by central differences.
+
+        Parameters
+        ----------
+        x : array (5,)
+            States of the operating point, recorded units.
+        u : array (4,)
+            Its controls.
+        X : array (5,)
+            Scales of the states.
+        U : array (4,)
+            Scales of the controls.
+        step : float, default 1e-05
+            Half the difference, over the scale.
+
+        Returns
+        -------
+        array (5, 5)
+            A, 1/s.
+        array (5, 4)
+            B, 1/s.
+
+        Raises
+        ------
+        UncertainLTIError
+            As `gas_path`.
+        """
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
         X, U = np.asarray(X, dtype=np.float64), np.asarray(U, dtype=np.float64)
         solver = GasPathSolver(self)
@@ -330,6 +514,11 @@ class GasPathSolver:
 
     The Jacobian is kept as long as it serves, and made anew by differences where convergence is slow. Where the step
     from the last condition is too large, the condition is approached from the design point in several.
+
+    Parameters
+    ----------
+    engine : Engine
+        The engine whose flows are matched.
     """
 
     TOLERANCE = 1e-12
@@ -341,7 +530,27 @@ class GasPathSolver:
         self._inverse: Array | None = None
 
     def solve(self, x: Sequence[float], u: Sequence[float], health: Health) -> GasPath:
-        """Matched gas path; see `Engine.gas_path`."""
+        """Matched gas path; see `Engine.gas_path`.
+
+        Parameters
+        ----------
+        x : sequence of float (5,)
+            States in recorded units; the speeds alone count.
+        u : sequence of float (4,)
+            Controls in recorded units.
+        health : Health
+            Factors on the efficiencies.
+
+        Returns
+        -------
+        GasPath
+            Flows matched to a relative 1e-12, or to 1e-10 where rounding allows no more.
+
+        Raises
+        ------
+        UncertainLTIError
+            The flows cannot be matched: outside what the engine can do.
+        """
         path = self._newton(x, u, health)
         if path is None:
             path = self._approach(x, u, health)
@@ -443,5 +652,11 @@ def _fuel_for(air: float, T3: float, T4: float, efficiency: float) -> float:
 
 @cache
 def engine() -> Engine:
-    """The engine with its default sizes."""
+    """The engine with its default sizes.
+
+    Returns
+    -------
+    Engine
+        Made once.
+    """
     return Engine()

@@ -21,20 +21,72 @@ IDLE, MAXIMUM = 12.0, 68.0
 
 
 def power(pla: float) -> float:
-    """Lever position between idle, 0, and the maximum regime, 1."""
+    """Lever position between idle, 0, and the maximum regime, 1.
+
+    Parameters
+    ----------
+    pla : float
+        Power-lever angle, deg.
+
+    Returns
+    -------
+    float
+        0 to 1.
+
+    Raises
+    ------
+    UncertainLTIError
+        The lever is out of range.
+    """
     if not IDLE <= pla <= MAXIMUM:
         raise UncertainLTIError(f"turbofan: PLA is {pla:g} deg; it must be from {IDLE:g} to {MAXIMUM:g}")
     return (pla - IDLE) / (MAXIMUM - IDLE)
 
 
 def fan_speed(pla: float, plant: Engine) -> float:
-    """Scheduled fan speed, rpm: 50 % at idle, flatter towards the maximum (chosen)."""
+    """Scheduled fan speed, rpm: 50 % at idle, flatter towards the maximum (chosen).
+
+    Parameters
+    ----------
+    pla : float
+        Power-lever angle, deg.
+    plant : Engine
+        The engine.
+
+    Returns
+    -------
+    float
+        Fan speed, rpm.
+
+    Raises
+    ------
+    UncertainLTIError
+        The lever is out of range.
+    """
     share: float = 0.5 + 0.5 * power(pla) ** 0.75
     return share * plant.design.fan_speed
 
 
 def nozzle_area(pla: float, plant: Engine) -> float:
-    """Scheduled throat area, m^2: opened by 20 % at idle, to keep thrust low and the fan away from surge (chosen)."""
+    """Scheduled throat area, m^2: opened by 20 % at idle, to keep thrust low and the fan away from surge (chosen).
+
+    Parameters
+    ----------
+    pla : float
+        Power-lever angle, deg.
+    plant : Engine
+        The engine.
+
+    Returns
+    -------
+    float
+        Area, m^2.
+
+    Raises
+    ------
+    UncertainLTIError
+        The lever is out of range.
+    """
     return float(plant.nozzle_area * (1.0 + 0.20 * (1.0 - power(pla)) ** 1.2))
 
 
@@ -43,6 +95,22 @@ def vanes(low: float, high: float, plant: Engine) -> tuple[float, float]:
 
     The compressor's inlet temperature, which its corrected speed needs, is taken from the fan speed, as its rise goes
     nearly with the square of that.
+
+    Parameters
+    ----------
+    low : float
+        Fan speed, rpm.
+    high : float
+        Compressor speed, rpm.
+    plant : Engine
+        The engine.
+
+    Returns
+    -------
+    float
+        Angle of the fan's vanes, deg.
+    float
+        Angle of the compressor's vanes, deg.
     """
     n = low / plant.design.fan_speed
     share = T_STANDARD / plant.compressor.T_design
@@ -52,7 +120,19 @@ def vanes(low: float, high: float, plant: Engine) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Trim:
-    """A steady state: x (5,), u (4,) in recorded units and the gas path there."""
+    """A steady state and its gas path.
+
+    Parameters
+    ----------
+    pla : float
+        Power-lever angle, deg.
+    x : array (5,)
+        States in recorded units.
+    u : array (4,)
+        Controls in recorded units.
+    path : GasPath
+        The gas path there.
+    """
 
     pla: float
     x: Array
@@ -62,6 +142,20 @@ class Trim:
 
 def trim(pla: float, plant: Engine | None = None, health: Health | None = None) -> Trim:
     """Steady state at a lever angle: fan speed, area and vanes by schedule, fuel and compressor speed by balance.
+
+    Parameters
+    ----------
+    pla : float
+        Power-lever angle, deg.
+    plant : Engine, optional
+        Default `turbofan.engine()`.
+    health : Health, optional
+        Default healthy.
+
+    Returns
+    -------
+    Trim
+        The steady state, balanced to a relative 1e-9.
 
     Raises
     ------
@@ -106,7 +200,13 @@ def trim(pla: float, plant: Engine | None = None, health: Health | None = None) 
 
 @cache
 def operating_point() -> OperatingPoint:
-    """PLA 68 deg, scaled by the largest steady magnitude from idle to there (Leibov's normalisation)."""
+    """PLA 68 deg, scaled by the largest steady magnitude from idle to there (Leibov's normalisation).
+
+    Returns
+    -------
+    OperatingPoint
+        States and controls in recorded units.
+    """
     trims = [trim(pla) for pla in np.linspace(IDLE, MAXIMUM, 15)]
     X = np.abs([t.x for t in trims]).max(axis=0)
     U = np.abs([t.u for t in trims]).max(axis=0)
@@ -123,8 +223,9 @@ class Controller:
     Parameters
     ----------
     plant : Engine
+        The engine.
     start : Trim
-        The steady state it takes over.
+        The steady state that the controller takes over.
     dt : float
         Step, s.
     """
@@ -151,7 +252,25 @@ class Controller:
         self._cap = self._start / plant.fuel + self.CLEARANCE
 
     def step(self, pla: float, x: Array) -> Array:
-        """Commands (4,) from the lever and the measured states (5,), recorded units."""
+        """Commands from the lever and the measured states, once per sample.
+
+        Parameters
+        ----------
+        pla : float
+            Power-lever angle, deg.
+        x : array (5,)
+            Measured states, recorded units.
+
+        Returns
+        -------
+        array (4,)
+            Commands, recorded units.
+
+        Raises
+        ------
+        UncertainLTIError
+            The lever is out of range.
+        """
         fuel, dt, u = self._plant.fuel, self._dt, self._command.copy()
         demand = fan_speed(pla, self._plant) + self._offset
         error = float((demand - x[0]) / demand)

@@ -29,7 +29,14 @@ DAMAGE = 0.02  # of the efficiency
 
 @dataclass(frozen=True)
 class Fault:
-    """A kind of fault and the instant of its onset, s after the first sample.
+    """A kind of fault and the instant of its onset.
+
+    Parameters
+    ----------
+    kind : str
+        One of KINDS.
+    at : float
+        Onset, s after the first sample.
 
     Raises
     ------
@@ -45,12 +52,34 @@ class Fault:
             raise UncertainLTIError(f"turbofan: there is no fault '{self.kind}'; there are {', '.join(KINDS)}")
 
     def first_sample(self, dt: float) -> int:
-        """The first sample that can show it: a sensor's at the onset, anything else one step later."""
+        """The first sample that can show it: a sensor's at the onset, anything else one step later.
+
+        Parameters
+        ----------
+        dt : float
+            Step, s.
+
+        Returns
+        -------
+        int
+            Position of the sample.
+        """
         onset = int(np.ceil(self.at / dt - 1e-9))
         return onset if self.kind.startswith("sensor") else onset + 1
 
     def health(self, t: float) -> Health:
-        """Efficiency factors at the instant t, s."""
+        """Efficiency factors at one instant.
+
+        Parameters
+        ----------
+        t : float
+            Instant, s.
+
+        Returns
+        -------
+        Health
+            Both factors 1 before the onset, and for faults of other parts.
+        """
         if self.kind == "compressor_wear" and t > self.at:
             return Health(compressor=1.0 - min(WEAR * (t - self.at), WORST_WEAR))
         if self.kind == "fan_damage" and t >= self.at:
@@ -58,7 +87,22 @@ class Fault:
         return Health()
 
     def reading(self, t: float, x: Array, X: Array) -> Array:
-        """What the sensors say of the states x (5,) with scales X (5,)."""
+        """What the sensors read.
+
+        Parameters
+        ----------
+        t : float
+            Instant, s.
+        x : array (5,)
+            States, recorded units.
+        X : array (5,)
+            Scales of the states.
+
+        Returns
+        -------
+        array (5,)
+            Readings; `x` itself where no sensor is at fault.
+        """
         if t < self.at or not self.kind.startswith("sensor"):
             return x
         x = x.copy()
@@ -71,7 +115,18 @@ class Fault:
         return x
 
     def stuck(self, t: float) -> int | None:
-        """Position of the control that no longer follows its command, if any."""
+        """Position of the control that no longer follows its command, if any.
+
+        Parameters
+        ----------
+        t : float
+            Instant, s.
+
+        Returns
+        -------
+        int or None
+            Position in CONTROLS, or None.
+        """
         if t < self.at:
             return None
         return {

@@ -57,7 +57,13 @@ LEVELS = ((0.0, 68.0), (4.0, 64.0), (9.0, 67.0), (13.0, 61.0), (18.0, 65.0), (22
 
 @cache
 def turbofan_signals() -> SignalMap:
-    """States and controls as the plant node publishes them, around PLA 68 deg; `config/signals/turbofan.yaml`."""
+    """States and controls as the plant node publishes them, around PLA 68 deg; `config/signals/turbofan.yaml`.
+
+    Returns
+    -------
+    SignalMap
+        Resolved: clock, max_gap, time sources and types are there.
+    """
     point = operating_point()
 
     def signals(names: tuple[str, ...], units: tuple[str, ...], topic: str, steady: Array, scale: Array,
@@ -81,8 +87,26 @@ def turbofan_signals() -> SignalMap:
 class Run:
     """One run of the plant.
 
-    amplitude: of the pulses of an open-loop run, see `pulses`, negative downwards; None for a closed-loop run along
-    `lever`. noise: standard deviation of every reading, over its scale.
+    Parameters
+    ----------
+    samples : int
+        Number of samples, at least 2.
+    amplitude : float or None, optional
+        Height of the pulses of an open-loop run, see `pulses`, negative downwards; None for a closed-loop run along
+        `lever`.
+    lever : tuple of (float, float), default ((0.0, MAXIMUM),)
+        (instant s, angle deg) of each jump of the lever.
+    noise : float, default 0.0
+        Standard deviation of every reading, over its scale.
+    seed : int, default 0
+        Seed of the noise.
+    fault : Fault or None, optional
+        What goes wrong; None for a healthy run.
+
+    Raises
+    ------
+    UncertainLTIError
+        There are fewer than 2 samples, or noise is negative.
     """
 
     samples: int
@@ -100,9 +124,22 @@ class Run:
 
 
 def pulses(t: float, amplitude: float) -> Array:
-    """Deviation of the controls over their scales at t, (4,): one pulse on each in turn, separated by rests.
+    """Deviation of the controls over their scales: one pulse on each in turn, separated by rests.
 
-    1.875 s of rest, then for each control 3.75 s of pulse and 3.75 s of rest: 30 s (METHOD section 6).
+    1.875 s of rest, then for each control 3.75 s of pulse and 3.75 s of rest: 30 s, as in the numerical example of
+    Leibov (2006).
+
+    Parameters
+    ----------
+    t : float
+        Instant, s.
+    amplitude : float
+        Height; each control takes its PROPORTION of it.
+
+    Returns
+    -------
+    array (4,)
+        Normalised deviations.
     """
     u = np.zeros(len(CONTROLS))
     number, phase = divmod(t - PULSE / 2.0, 2.0 * PULSE)
@@ -116,6 +153,20 @@ def simulate(run: Run, start_ns: int = START_NS, plant: Engine | None = None) ->
 
     Between samples the nonlinear equations are integrated by SciPy's DOP853 to a relative tolerance of 1e-9, with the
     commands held.
+
+    Parameters
+    ----------
+    run : Run
+        What is commanded and what goes wrong.
+    start_ns : int, default START_NS
+        Stamp of the first sample, ns.
+    plant : Engine, optional
+        Default `turbofan.engine()`.
+
+    Returns
+    -------
+    Transient
+        Readings and commands in recorded units, with `turbofan_signals`.
 
     Raises
     ------
@@ -189,9 +240,29 @@ def make_run(
     fault_at: float = 24.0,
     samples: int = 0,
 ) -> Run:
-    """A run by name: `pulses` (open loop, see `pulses`), `check` (lever from 68 to 60 deg) or `levels` (see LEVELS).
+    """A run by name.
 
-    samples: 0 for the usual number. fault: one of `turbofan_faults.KINDS`, or empty; fault_at in s.
+    Parameters
+    ----------
+    manoeuvre : str
+        `pulses` (open loop, see `pulses`), `check` (lever from 68 to 60 deg) or `levels` (see LEVELS).
+    amplitude : float, default 0.0
+        Height of the pulses; other than 0 for `pulses` and for it alone.
+    noise : float, default 0.0
+        Standard deviation of every reading, over its scale.
+    seed : int, default 0
+        Seed of the noise.
+    fault : str, default ""
+        One of `turbofan_faults.KINDS`, or empty.
+    fault_at : float, default 24.0
+        Onset of the fault, s.
+    samples : int, default 0
+        Number of samples; 0 for the usual one.
+
+    Returns
+    -------
+    Run
+        The run.
 
     Raises
     ------
