@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.identification.problem import BLOCK, Block, Columns, Problem
-
-Array = NDArray[np.float64]
 
 _FORMAT = "uncertain-lti-cache/1"
 _DATA, _FACTS = "transitions.f64", "facts.json"

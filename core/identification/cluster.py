@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import excitation, sensors
@@ -18,8 +19,6 @@ from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
-
-Array = NDArray[np.float64]
 
 LOOKED_AT, STRETCHES = 20_000, 20
 """At most so many transitions, in so many stretches, are looked at for what shows in any of them."""

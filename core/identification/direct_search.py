@@ -21,15 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import golden
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
-
-Array = NDArray[np.float64]
 
 EXPONENTS = (8.0, 32.0, 128.0, 512.0, np.inf)
 """Of the power mean in place of the maximum, one stage of the search each."""

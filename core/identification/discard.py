@@ -7,15 +7,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import TOLERANCE, Row, WorkingSet
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 _ACTIVE = 1e-7
 """Slack, in scaled units, below which a sample carries the envelope."""

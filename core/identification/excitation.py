@@ -7,10 +7,9 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
-
-Array = NDArray[np.float64]
 
 COLLINEAR = 1e-3
 """Smallest eigenvalue of the regressors' correlation below which signals move nearly together (and above rank)."""

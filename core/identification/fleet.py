@@ -9,14 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.passes import Candidate, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Columns, Partition, Problem
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 _WORTH_A_THREAD = 100_000

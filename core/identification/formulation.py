@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.problem import Problem
-
-Array = NDArray[np.float64]
 
 
 def solve(problem: Problem, criterion: str, solver: str | None = None, **options: Any) -> tuple[Array, Array, Array]:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.excitation import successive
 from uncertain_lti.identification.problem import Problem
-
-Array = NDArray[np.float64]
 
 NOISE = 0.5
 """A state of whose variance less than this share is predicted from one sample to the next moves like noise."""

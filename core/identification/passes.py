@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.problem import Block, Partition
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 @dataclass

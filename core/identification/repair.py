@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Judged, Moments
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
-Array = NDArray[np.float64]
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 40
 

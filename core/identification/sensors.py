@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.identification.excitation import quoted, successive, unexplained
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal
-
-Array = NDArray[np.float64]
 
 LONGEST_DELAY = 10
 """Delays of a control that are tried, samples."""

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 
-Array = NDArray[np.float64]
 Sense = NDArray[np.int32]
 
 FEASIBLE = 1e-9

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
-
-Array = NDArray[np.float64]
 
 NOMINAL, HALF_WIDTH = ("A", "B", "c"), ("dA", "dB", "dc", "v")
 

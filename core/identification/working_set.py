@@ -6,17 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Moments, Samples
 from uncertain_lti.identification.solvers import Sense, Simplex, dual_bound, solve_qp
 from uncertain_lti.identification.structure import Structure
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 SUBSAMPLE = 10_000
 """Transitions of the first solve; up to twice as many are held as a whole."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from uncertain_lti.base.arrays import Array
 
 
 @dataclass(frozen=True)

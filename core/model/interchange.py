@@ -8,14 +8,13 @@ import os
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-
-Array = NDArray[np.float64]
 
 DRIFT = "drift"
 """Name of the input, to be held at 1, that carries the drift c of a model in a state-space system."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import kind_of, whole_file
@@ -23,8 +24,6 @@ from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-
-Array = NDArray[np.float64]
 
 FORMAT = "uncertain-lti/1"
 MAX_FILE_BYTES = 64 * 2**20

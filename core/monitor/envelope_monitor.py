@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
@@ -21,9 +22,6 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.sampler import Status, Step
 from uncertain_lti.sampling.transient import Transient
-
-Array = NDArray[np.float64]
-
 
 NUMBERS = ("flags", "lower", "upper", "state", "utilisation")
 """What a verdict says of each state."""

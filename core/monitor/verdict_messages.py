@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.recordings.mcap_writer import INDEX_ENTRY, MESSAGE_HEAD
 
@@ -29,8 +30,6 @@ _STAMP = struct.Struct("<iI")
 _FIRST_S, _LAST_S = -(2**31), 2**31 - 1  # seconds that a stamp holds
 _MESSAGE = 5  # opcode
 _NAN = float("nan")
-
-Array = NDArray[np.float64]
 
 
 class NamedVector:

@@ -6,13 +6,11 @@ import json
 from importlib.resources import files
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-
-Array = NDArray[np.float64]
 
 STATE_TOPIC = "/engine/state"
 CONTROL_TOPIC = "/engine/control"

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.direct_search import direct_search
@@ -26,8 +26,6 @@ from uncertain_lti.plants.turbofan_runs import DT, LARGE, NOISE, SMALL, make_run
 from uncertain_lti.reports.figures import ENVELOPE, RECORDED, VIOLATED
 from uncertain_lti.reports.text import number, table
 from uncertain_lti.sampling.transient import Transient
-
-Array = NDArray[np.float64]
 
 SHORT = ("N1", "N2", "P3", "P5", "T5")
 """Fan and compressor speed, pressures behind compressor and turbine, temperature behind the turbine."""

@@ -18,8 +18,9 @@ from functools import cache
 from math import pi, sqrt
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
 from uncertain_lti.plants.turbofan_components import (
@@ -30,8 +31,6 @@ from uncertain_lti.plants.turbofan_components import (
     burn,
     nozzle,
 )
-
-Array = NDArray[np.float64]
 
 STATES = (
     "fan_speed",

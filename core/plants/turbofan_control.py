@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import root
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants.turbofan import Engine, GasPath, GasPathSolver, Health, engine
 from uncertain_lti.plants.turbofan_components import T_STANDARD
 from uncertain_lti.sampling.operating_point import OperatingPoint
-
-Array = NDArray[np.float64]
 
 IDLE, MAXIMUM = 12.0, 68.0
 """Power-lever angle, deg."""

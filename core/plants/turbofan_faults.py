@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants.turbofan import CONTROLS, STATES, Health
-
-Array = NDArray[np.float64]
 
 KINDS = {
     "fuel_stuck": "the fuel flow stays where it is, whatever is commanded",

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, JOINT_STATE, STATE_TOPIC
@@ -30,8 +30,6 @@ from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating
 from uncertain_lti.plants.turbofan_faults import KINDS, Fault
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-
-Array = NDArray[np.float64]
 
 DT = DT_NS * 1e-9
 """Step, s: that of the paper."""

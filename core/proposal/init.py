@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.identification.noise import NOISE, predicted
@@ -22,7 +23,6 @@ from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.sampling.operating_point import resolve_auto
 from uncertain_lti.signals.signal_map import FieldPath, Signal
 
-Array = NDArray[np.float64]
 Iterate = Callable[[Iterable[object], int], Iterable[object]]
 
 FEWEST = 20

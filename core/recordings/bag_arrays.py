@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.cdr_arrays import FieldReader, Messages
@@ -16,7 +17,6 @@ from uncertain_lti.recordings.mcap_batches import Batch, IndexMismatchError, bat
 from uncertain_lti.recordings.message_types import Definition
 from uncertain_lti.signals.signal_map import FieldPath
 
-Integers = NDArray[np.int64]
 Progress = Callable[[Iterable[object], int], Iterable[object]]
 LATEST = 2**63 - 1  # ns; log times are kept with a sign
 

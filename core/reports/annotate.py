@@ -16,7 +16,6 @@ from itertools import chain, repeat
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import BagError
@@ -37,9 +36,6 @@ METADATA = "uncertain_lti_check"
 """Name of the metadata record that says what was checked with what."""
 _CHUNK = 1 << 20  # bytes of verdicts
 _SMALL = 1 << 18  # bytes of verdicts that wait for more
-
-Integers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

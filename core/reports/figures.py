@@ -17,6 +17,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -30,9 +31,6 @@ _FEW = 8  # states that get a panel of full size each, and columns whose numbers
 _WIDTH = 10.0  # inches
 _LONGEST_NAME = 34
 _MANY = 30  # names beside each other are written smaller from here on
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def envelope_figure(

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
-
-Array = NDArray[np.float64]
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

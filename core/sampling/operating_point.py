@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.signals.signal_map import Signal
-
-Array = NDArray[np.float64]
 
 STILL_SAMPLES = 10
 """A still stretch has at least this many samples."""

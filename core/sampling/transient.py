@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.sampling.sampler import Status, median_step_ns, to_ns
 from uncertain_lti.signals.signal_map import SignalMap
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

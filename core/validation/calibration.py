@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.validation.intervals import cluster_size, rate_interval
 from uncertain_lti.validation.left_out import Part, Validation, borrowed_margin, rising
-
-Array = NDArray[np.float64]
 
 RULES = ((1, 1), (3, 5), (5, 10))
 """(violations, window) tried unless told otherwise."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from uncertain_lti.base.arrays import Array
 
 
 def cluster_size(counts: ArrayLike) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
@@ -27,8 +28,6 @@ from uncertain_lti.validation.intervals import (
     scenario_interval,
     share_interval,
 )
-
-Array = NDArray[np.float64]
 
 BLOCKS = 10
 """Parts that a single recording is cut into, unless told otherwise."""
