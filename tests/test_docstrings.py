@@ -3,8 +3,8 @@
 The rule. A callable is public when its name and that of its class begin with a letter and it is not nested in another
 function. Its docstring lists its parameters by name, all of them and in the order of the signature, each with a type
 and a description; a class lists those of `__init__`, or its fields, as Parameters or as Attributes. What is returned
-is under Returns, what a generator or a context manager yields under Yields, and every error that the body raises, itself
-or through a private helper of the same module, under Raises. Excepted are:
+is under Returns, what a generator or a context manager yields under Yields, and every error that the body raises,
+itself or through a private helper of the same module, under Raises. Excepted are:
 
 - properties, which a sentence describes, from Returns;
 - methods of the language's own protocols (`__iter__`, `__eq__`, ...);
