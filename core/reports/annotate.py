@@ -40,7 +40,21 @@ _SMALL = 1 << 18  # bytes of verdicts that wait for more
 
 @dataclass(frozen=True)
 class Annotated:
-    """What was written: messages of the recording, clock messages that something is said of, the topics' beginning."""
+    """What `annotate` wrote.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    messages : int
+        Messages of the recording that were copied.
+    verdicts : int
+        Clock messages with a verdict, or with the reason why there is none.
+    topics : str
+        What the names of the monitor's topics begin with.
+    notes : tuple of str
+        What the reader should know, a sentence each.
+    """
 
     path: Path
     messages: int
@@ -53,6 +67,18 @@ def targets(wish: str | os.PathLike[str], bags: Sequence[Bag]) -> list[Path]:
     """Where annotated copies of these recordings go: a file `*.mcap` for one, any other path is a folder.
 
     In a folder, which is made, the copy of `run.mcap` is `run_annotated.mcap`.
+
+    Parameters
+    ----------
+    wish : path
+        What the user named.
+    bags : sequence of Bag
+        The recordings.
+
+    Returns
+    -------
+    list of Path
+        One path per recording, none of which exists.
 
     Raises
     ------
@@ -104,7 +130,7 @@ def annotate(
 
     Parameters
     ----------
-    parts : paths
+    parts : iterable of path
         Files of the recording in order; together they become one file.
     verdicts : Verdicts
         Of `EnvelopeMonitor.check`.
@@ -112,8 +138,12 @@ def annotate(
         Of the same reading (`reading.read_as_fitted_with_decisions`).
     output : path
         MCAP file to write; it bears this name once it is whole.
-    model, model_file, rule
+    model : UncertainLTI
         What was checked with, for the record.
+    model_file : path, default ""
+        Its file, for the record.
+    rule : AlarmRule, optional
+        The alarm rule of the check, for the record; default the model's.
     progress : callable, optional
         As for `read_transients`.
 

@@ -45,6 +45,7 @@ def envelope_figure(
     Parameters
     ----------
     model : UncertainLTI
+        The model checked with.
     verdicts : Verdicts
         Of `EnvelopeMonitor.check`.
     states : sequence of str, optional
@@ -57,6 +58,7 @@ def envelope_figure(
     Returns
     -------
     matplotlib.figure.Figure
+        Not written yet; see `save`.
 
     Raises
     ------
@@ -101,8 +103,29 @@ def utilisation_figure(
 ) -> Any:
     """Where between its bounds each state lay over time: -1 at the lower bound, 1 at the upper one.
 
-    Up to eight states have a panel each; more become the rows of a map of the greatest |utilisation| in each stretch
-    of time. Parameters, return value and errors as for `envelope_figure`.
+    Up to eight states have a panel each; more become the rows of a map of the greatest |utilisation| in each stretch of
+    time.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model checked with.
+    verdicts : Verdicts
+        Of `EnvelopeMonitor.check`.
+    states : sequence of str, optional
+        Names of the states to show; default all.
+    span : (float, float), optional
+        Show only this time, s.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not written yet; see `save`.
+
+    Raises
+    ------
+    ModelError
+        A name is not a state of the model.
     """
     chosen = _chosen(model, states)
     axis_time = _Time(verdicts.transient)
@@ -143,6 +166,16 @@ def matrices_figure(model: UncertainLTI) -> Any:
 
     A dot marks an element whose half-width is greater than itself: its sign is not known. Columns c (drift) and
     v (noise, not multiplied by Δt) appear where the model has them.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not written yet; see `save`.
     """
     from matplotlib.colors import LogNorm, SymLogNorm
 
@@ -198,6 +231,18 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
     The width of state i is 2 (Δt (ΔA |x| + ΔB |u| + Δc) + v) X_i, eqs. (6)(7) with additive terms: each column is one
     summand as a share of its mean; the width itself stands beside the names in recorded units.
 
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    transients : sequence of Transient
+        In recorded units, with the model's signals.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not written yet; see `save`.
+
     Raises
     ------
     ModelError
@@ -240,9 +285,25 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
 
 
 def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[Array, Array, list[str]]:
-    """Shares (n, columns) of the mean one-step width, that width in recorded units (n,), and the columns' names.
+    """Which element contributes how much of the mean one-step width.
 
-    Columns are states, controls, and what the model has of drift and noise; a row of zeros where the width is 0.
+    Columns are states, controls, and what the model has of drift and noise.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    transients : sequence of Transient
+        In recorded units, with the model's signals.
+
+    Returns
+    -------
+    array (n, columns)
+        Share of each column; a row of zeros where the width is 0.
+    array (n,)
+        Mean width, recorded units.
+    list of str
+        Names of the columns.
 
     Raises
     ------
@@ -273,7 +334,20 @@ def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[
 
 
 def coverage_figure(model: UncertainLTI, checked: Sequence[Verdicts]) -> Any:
-    """Share of the verdicts outside the bounds, per recording: of any state, and state by state."""
+    """Share of the verdicts outside the bounds, per recording: of any state, and state by state.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model checked with.
+    checked : sequence of Verdicts
+        One per recording, of `EnvelopeMonitor.check`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not written yet; see `save`.
+    """
     names = [_short(os.path.basename(v.transient.name) or v.transient.name, 40) for v in checked]
     outside, of_any, judged = _outside(checked, model.n)
     rows = [f"{name}  ({_count(n)})" for name, n in zip(names, judged, strict=True)]
@@ -325,7 +399,24 @@ def coverage_figure(model: UncertainLTI, checked: Sequence[Verdicts]) -> Any:
 
 
 def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) -> None:
-    """Write a figure to an image file, whose ending says the format, or as PNG to a stream. Raises OSError."""
+    """Write a figure to an image file, or as PNG to a stream.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        Of this module.
+    path : path or binary stream
+        Where to; the ending of a path chooses the format, PNG where it has none.
+    dpi : int, default 110
+        Dots per inch; a figure's size is in inches.
+
+    Raises
+    ------
+    ModelError
+        No image is written with such an ending.
+    OSError
+        The file cannot be written.
+    """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names may be in any script
         if not isinstance(path, (str, os.PathLike)):

@@ -47,12 +47,13 @@ def findings(
     Parameters
     ----------
     model : UncertainLTI
+        The model checked with.
     model_file : path
         Where it came from, or its name.
     checked : sequence of Verdicts
         One per recording, of `EnvelopeMonitor.check`.
     rule : AlarmRule, optional
-        That the check went by; default the model's.
+        The alarm rule of the check; default the model's.
 
     Returns
     -------
@@ -94,6 +95,20 @@ def findings(
 def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Bag]) -> Path | None:
     """Where the page goes; an older page gives way, a recording or the model never.
 
+    Parameters
+    ----------
+    wish : path or None
+        What the user named; None for no page.
+    model_file : str
+        The model, which is never replaced.
+    bags : sequence of Bag
+        The recordings, which are never replaced.
+
+    Returns
+    -------
+    Path or None
+        The path, or None without a wish.
+
     Raises
     ------
     BagError
@@ -109,7 +124,20 @@ def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequ
 
 
 def shortened(name: str, longest: int = 40) -> str:
-    """A name for a sentence, with its middle left out where it is long."""
+    """A name for a sentence, with its middle left out where it is long.
+
+    Parameters
+    ----------
+    name : str
+        Any name.
+    longest : int, default 40
+        Its length at most, in characters.
+
+    Returns
+    -------
+    str
+        The name, with an ellipsis where its middle is left out.
+    """
     return name if len(name) <= longest else f"{name[: longest // 2]}…{name[len(name) - longest // 2 + 1 :]}"
 
 

@@ -69,16 +69,23 @@ nav a { margin-right: 1rem; } a { color: #0550ae; }
 def html_report(
     model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any], progress: Progress | None = None
 ) -> str:
-    """The page.
+    """The report as one page.
 
     Parameters
     ----------
     model : UncertainLTI
+        The model checked with.
     checked : sequence of Verdicts
+        One per recording, of `EnvelopeMonitor.check`.
     facts : mapping
-        What `findings` gave for them.
+        What `findings` returned for them.
     progress : callable, optional
         Wraps what goes through the sections, given their number.
+
+    Returns
+    -------
+    str
+        HTML with everything in it; no script.
     """
     name = os.path.basename(facts["model"]["file"]) or "model"
     title = f"{name}: may I rely on it, and what happened?"
@@ -103,7 +110,20 @@ def html_report(
 
 
 def write_page(path: str | os.PathLike[str], page: str) -> None:
-    """Write a page, whole or not at all; raises BagError where that is not possible."""
+    """Write a page, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    page : str
+        Its text; what UTF-8 cannot hold is replaced.
+
+    Raises
+    ------
+    BagError
+        The file cannot be written.
+    """
     try:
         with whole_file(path) as stream:
             stream.write(page.encode("utf-8", "replace"))

@@ -28,9 +28,14 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any
     Parameters
     ----------
     states : sequence of Signal
-        Of the model (`model.signals.states`).
-    base : str
-        What the topics begin with.
+        States of the model (`model.signals.states`).
+    base : str, optional
+        What the names of the topics begin with; default that of the node.
+
+    Returns
+    -------
+    dict
+        The layout, as JSON takes it.
     """
     panels: dict[str, Any] = {}
 
@@ -113,7 +118,17 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any
 def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
     """Layout of PlotJuggler: bounds and samples of each state, utilisation, flags and alarm, in tabs.
 
-    Parameters as for `foxglove_layout`.
+    Parameters
+    ----------
+    states : sequence of Signal
+        States of the model (`model.signals.states`).
+    base : str, optional
+        What the names of the topics begin with; default that of the node.
+
+    Returns
+    -------
+    str
+        XML.
     """
     tabs: list[tuple[str, list[tuple[str, list[tuple[str, str]]]]]] = []
     for begin in range(0, len(states), _PAGE):
@@ -158,7 +173,23 @@ def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
 def write_layouts(
     model: UncertainLTI, foxglove: str | None, plotjuggler: str | None, base: str | None = None
 ) -> list[str]:
-    """Write one or both of the layouts, each whole or not at all; returns their paths.
+    """Write one or both of the layouts, each whole or not at all.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Gives the states.
+    foxglove : path or None
+        JSON file for Foxglove and Lichtblick.
+    plotjuggler : path or None
+        XML file for PlotJuggler.
+    base : str, optional
+        What the names of the topics begin with; default that of the node.
+
+    Returns
+    -------
+    list of str
+        Paths written.
 
     Raises
     ------
@@ -185,7 +216,20 @@ def write_layouts(
 
 
 def foxglove_text(states: Sequence[Signal], base: str = NODE) -> str:
-    """`foxglove_layout` as a file holds it."""
+    """`foxglove_layout` as text.
+
+    Parameters
+    ----------
+    states : sequence of Signal
+        States of the model (`model.signals.states`).
+    base : str, optional
+        What the names of the topics begin with; default that of the node.
+
+    Returns
+    -------
+    str
+        JSON, as a file holds it.
+    """
     return json.dumps(foxglove_layout(states, base), indent=1, ensure_ascii=False) + "\n"
 
 

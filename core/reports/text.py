@@ -19,7 +19,20 @@ from uncertain_lti.sampling.transient import Transient
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Columns aligned with spaces; the first to the left, the others to the right."""
+    """Columns aligned with spaces; the first to the left, the others to the right.
+
+    Parameters
+    ----------
+    header : sequence of str
+        Names of the columns.
+    rows : iterable of sequence of str
+        Cells of each row, as many as `header` has.
+
+    Returns
+    -------
+    str
+        Lines, each indented by two spaces.
+    """
     lines = [list(header), *(list(row) for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     return "\n".join(
@@ -33,12 +46,34 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def number(value: float | None) -> str:
-    """Four digits, or a dash for nothing."""
+    """Four digits, or a dash for nothing.
+
+    Parameters
+    ----------
+    value : float or None
+        The number; None or NaN for nothing.
+
+    Returns
+    -------
+    str
+        Four significant digits, or a dash.
+    """
     return "-" if value is None or math.isnan(value) else f"{value:.4g}"
 
 
 def beyond(utilisation: float) -> str:
-    """A violated utilisation with as many digits as show that it is beyond -1 or 1."""
+    """A violated utilisation with as many digits as show that it is beyond -1 or 1.
+
+    Parameters
+    ----------
+    utilisation : float
+        Utilisation of a violated verdict, over 1 in magnitude.
+
+    Returns
+    -------
+    str
+        Three to nine digits, or `just beyond 1`.
+    """
     for digits in range(3, 10):
         text = f"{utilisation:.{digits}g}"
         if abs(float(text)) > 1.0:
@@ -47,7 +82,18 @@ def beyond(utilisation: float) -> str:
 
 
 def recording_text(transient: Transient) -> str:
-    """One recording: what was read, and what of it is not used."""
+    """One recording: what was read, and what of it is not used.
+
+    Parameters
+    ----------
+    transient : Transient
+        The recording.
+
+    Returns
+    -------
+    str
+        One line.
+    """
     usable = int(transient.usable.sum())
     span = float(np.ptp(transient.t_ns)) * 1e-9 if len(transient) else 0.0
     text = (
@@ -58,7 +104,20 @@ def recording_text(transient: Transient) -> str:
 
 
 def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
-    """Summary of a fit: widths beside what the states do, and what the user should know."""
+    """Summary of a fit: widths beside what the states do, and what the user should know.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit`.
+    transients : sequence of Transient
+        What it was fitted to.
+
+    Returns
+    -------
+    str
+        A table in recorded units, and the notes of the fit.
+    """
     facts = model.fit_summary
     criterion = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}[facts["criterion"]]
     steps = [t.transitions() for t in transients]
@@ -94,7 +153,18 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
 
 
 def archive_text(model: UncertainLTI) -> str:
-    """Summary of a fit whose transitions were not all in memory."""
+    """Summary of a fit whose transitions were not all in memory.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit_archive`.
+
+    Returns
+    -------
+    str
+        A table in recorded units.
+    """
     facts = model.fit_summary
     rows = [
         [s.name + (f" [{s.unit}]" if s.unit else ""), number(a), number(b)]
@@ -128,10 +198,16 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
     Parameters
     ----------
     model : UncertainLTI
+        Of `fit`.
     file : str
         Its file, as it would be typed.
-    left_out : dict, optional
-        What `leave_out_cheaply` found.
+    left_out : dict or None
+        What `leave_out_cheaply` returned.
+
+    Returns
+    -------
+    str
+        Lines.
     """
     facts = model.fit_summary
     span = model.domain.x_max - model.domain.x_min
@@ -169,7 +245,18 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
 
 
 def model_text(model: UncertainLTI) -> str:
-    """Summary of a model file."""
+    """Summary of a model file.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+
+    Returns
+    -------
+    str
+        Signals, matrices in 1/s of normalised quantities, domain, alarm rule and notes.
+    """
     s, facts = model.sampling, model.fit_summary
     lines = [repr(model)]
     if s.clock:
@@ -227,6 +314,20 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     Counts, the first and the longest violation of each state, the spans in which the alarm was raised, widths beside
     coverage; with samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no
     verdict).
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model checked with.
+    verdicts : Verdicts
+        Of `EnvelopeMonitor.check`.
+    samples : bool, default True
+        Whether a verdict per sample is among it.
+
+    Returns
+    -------
+    dict
+        Plain data for JSON.
     """
     transient = verdicts.transient
     t = transient.t_ns
@@ -281,7 +382,18 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
 
 
 def check_text(data: dict[str, Any]) -> str:
-    """Summary of `check_data` for a person."""
+    """Summary of `check_data` for a person.
+
+    Parameters
+    ----------
+    data : dict
+        Of `check_data`.
+
+    Returns
+    -------
+    str
+        A table in recorded units, and when the alarm was raised.
+    """
     rows = []
     for name, s in data["states"].items():
         longest = s["longest_violation"]
@@ -335,7 +447,18 @@ def _list(row: Array) -> list[float | None]:
 
 
 def validation_text(data: dict[str, Any]) -> str:
-    """Summary of `Validation.to_dict()`, with the calibration if there is one, for a person."""
+    """Summary of `Validation.to_dict()`, with the calibration if there is one, for a person.
+
+    Parameters
+    ----------
+    data : dict
+        Of `Validation.to_dict`; with the key `calibration` if there is one.
+
+    Returns
+    -------
+    str
+        Tables, intervals and notes.
+    """
     what = "recording" if data["kind"] == "transients" else "block"
     gap = f", {number(data['gap'])} s on both sides not fitted either" if data["kind"] == "blocks" else ""
     lines = [
@@ -392,7 +515,18 @@ def validation_text(data: dict[str, Any]) -> str:
 
 
 def left_out_text(data: dict[str, Any]) -> str:
-    """Short form of `validation_text`, one line, for a fit."""
+    """Short form of `validation_text`, one line, for a fit.
+
+    Parameters
+    ----------
+    data : dict
+        Of `Validation.to_dict`.
+
+    Returns
+    -------
+    str
+        One line.
+    """
     what = "recording" if data["kind"] == "transients" else "block"
     ratio = max((s["left_out_to_full"] for s in data["states"].values()), default=math.nan)
     alarm = data["false_alarms"][0]
@@ -412,7 +546,18 @@ def _interval(low: float, high: float | None) -> str:
 
 
 def findings_text(facts: dict[str, Any]) -> str:
-    """The answers of `findings.findings`, with the reasons, for a person."""
+    """The answers of `findings.findings`, with the reasons, for a person.
+
+    Parameters
+    ----------
+    facts : dict
+        Of `findings.findings`.
+
+    Returns
+    -------
+    str
+        Both answers, a reason per line.
+    """
     lines = [f"may I rely on it? {facts['rely']['answer']}"]
     lines += [f"  {r['weight']}: {r['text']}" for r in facts["rely"]["reasons"]]
     lines.append("what happened?")
