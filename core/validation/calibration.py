@@ -29,10 +29,24 @@ STARTS = 8
 
 @dataclass(frozen=True)
 class Candidate:
-    """One rule at the smallest margin that keeps to the wish; margin None where none does.
+    """One alarm rule at the smallest margin that keeps to the wish.
 
-    upper: one-sided confidence limit of its false alarms per hour. detected (n,): share of the stated faults that
-    raise the alarm before the part ends; delay (n,): median time to it, s, inf where most are missed.
+    Parameters
+    ----------
+    violations : int
+        m of the rule.
+    window : int
+        n of the rule, in verdicts.
+    margin : float or None
+        The smallest margin; None where none keeps to the wish.
+    alarms : int
+        False alarms on the left-out parts at that margin.
+    upper : float
+        One-sided upper confidence limit of the false alarms per hour.
+    detected : array (n,)
+        Share of the stated faults on each state that raise the alarm before the part ends.
+    delay : array (n,)
+        Median time to the alarm, s; inf where most are missed.
     """
 
     violations: int
@@ -46,7 +60,27 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The alarm that `calibrate` chose (None where no rule can be shown to keep to the wish), and all it tried."""
+    """The alarm rule that `calibrate` chose, and all it tried.
+
+    Parameters
+    ----------
+    alarm_rule : AlarmRule or None
+        The choice; None where no rule can be shown to keep to the wish.
+    wish : float
+        False alarms per hour at most.
+    confidence : float
+        That the true rate is below the wish.
+    hours : float
+        Time under verdict in the left-out parts, h.
+    needed_hours : float
+        Time without a false alarm that would show the wish, h.
+    candidates : tuple of Candidate
+        One per rule tried.
+    words : str
+        The outcome as a sentence.
+    warning : str, default ""
+        What the chosen rule does not see; empty where it sees at least BLIND of the stated faults on every state.
+    """
 
     alarm_rule: AlarmRule | None
     wish: float
@@ -59,7 +93,13 @@ class Calibration:
     """What the chosen rule does not see; empty where it sees at least BLIND of the stated faults on every state."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for the model file."""
+        """Plain data for the model file.
+
+        Returns
+        -------
+        dict
+            Plain data for JSON; null for what is infinite.
+        """
         return {
             "wish_per_hour": self.wish,
             "confidence": self.confidence,
@@ -102,11 +142,18 @@ def calibrate(
     Parameters
     ----------
     validation : Validation
+        Of `validate`; its parts are what the search counts on.
     wish : float
         False alarms per hour at most.
-    rules : sequence of (violations, window)
+    rules : sequence of (int, int), optional
+        (violations, window) of each rule; default RULES.
     confidence : float, optional
         That the true rate is below the wish; default that of the validation.
+
+    Returns
+    -------
+    Calibration
+        The rule, or the reason why there is none.
 
     Raises
     ------
@@ -184,11 +231,27 @@ def _candidate(parts: Sequence[Part], m: int, n: int, wish: float, confidence: f
 
 
 def detection(parts: Sequence[Part], rule: AlarmRule, size: float = FAULT_SIZE) -> tuple[Array, Array]:
-    """Share of stated faults that raise the alarm, and the median time to it in s, each (n,).
+    """Share of stated faults that raise the alarm, and the time to it.
 
     The fault: from one verdict on, one state moves by `size` mean widths of its bounds more in every step than
-    recorded, in either direction, the step still starting from the measured state. It is put into the left-out parts
-    at STARTS instants each; one that is not seen before the part ends counts as missed (infinite time).
+    recorded, in either direction, the step still starting from the measured state. It is put into the left-out parts at
+    STARTS instants each; one that is not seen before the part ends counts as missed (infinite time).
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Left-out parts.
+    rule : AlarmRule
+        The alarm rule.
+    size : float, optional
+        Of the fault, in mean widths; default FAULT_SIZE.
+
+    Returns
+    -------
+    array (n,)
+        Share detected, of the faults on each state; NaN without a verdict.
+    array (n,)
+        Median time to the alarm, s.
     """
     n = parts[0].utilisation.shape[1]
     times: list[list[float]] = [[] for _ in range(n)]

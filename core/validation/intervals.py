@@ -11,7 +11,18 @@ from uncertain_lti.base.arrays import Array
 
 
 def cluster_size(counts: ArrayLike) -> float:
-    """Σc² / Σc of the events c_g counted on transient g: how many come at once, weighted by events; 1 without any."""
+    """Σc² / Σc of the events c_g counted on transient g: how many come at once, weighted by events; 1 without any.
+
+    Parameters
+    ----------
+    counts : array (G,)
+        Events on each transient.
+
+    Returns
+    -------
+    float
+        At least 1 for whole counts.
+    """
     c = np.asarray(counts, dtype=np.float64)
     return float(np.sum(c**2) / np.sum(c)) if c.any() else 1.0
 
@@ -36,11 +47,15 @@ def rate_interval(
         Of the interval; with `one_sided`, of its upper limit alone.
     size : float, optional
         Cluster size; at least that of `counts` is used. Counts that are all 0 tell none: give one seen elsewhere.
+    one_sided : bool, default False
+        Whether the upper limit alone is wanted; the lower one is then 0.
 
     Returns
     -------
-    lower, upper : float
-        (0, inf) for fewer than two transients or no exposure.
+    float
+        Lower limit; 0 for fewer than two transients or no exposure.
+    float
+        Upper limit; inf likewise.
     """
     from scipy.special import gammainccinv, gammaincinv, ndtr, stdtrit
 
@@ -56,7 +71,24 @@ def rate_interval(
 
 
 def share_interval(hits: int, trials: int, confidence: float) -> tuple[float, float]:
-    """Exact binomial (Clopper-Pearson) interval for the share of whole transients."""
+    """Exact binomial (Clopper-Pearson) interval for the share of whole transients.
+
+    Parameters
+    ----------
+    hits : int
+        Transients with the property.
+    trials : int
+        All transients.
+    confidence : float
+        Of the interval, two-sided.
+
+    Returns
+    -------
+    float
+        Lower limit.
+    float
+        Upper limit.
+    """
     from scipy.stats import beta
 
     tail = (1.0 - confidence) / 2.0
@@ -77,6 +109,22 @@ def scenario_interval(support: int, transients: int, confidence: float) -> tuple
         C(N,k) t^(N-k) - β/2N Σ_{i=k}^{N-1} C(i,k) t^(i-k) - β/6N Σ_{i=N+1}^{4N} C(i,k) t^(i-k) = 0,
 
     k = support, β = 1 - confidence.
+
+    Parameters
+    ----------
+    support : int
+        Transients that would change the solution if left out, k.
+    transients : int
+        All transients, N.
+    confidence : float
+        1 - β.
+
+    Returns
+    -------
+    float
+        Lower limit, 1 - t_2.
+    float
+        Upper limit, 1 - t_1.
     """
     from scipy.optimize import brentq
     from scipy.special import gammaln, logsumexp
@@ -119,6 +167,22 @@ def discarding_bound(variables: int, discarded: int, transients: int, confidence
     C(k+d-1, k) P[Binomial(N, ε) <= k+d-1] = 1 - confidence, with d decision variables and k discarded of N
     independent transients, whichever rule discards them. 1 where there are too few. discarded = 0 is the plain
     bound before looking at the solution.
+
+    Parameters
+    ----------
+    variables : int
+        Decision variables, d.
+    discarded : int
+        Transients discarded, k.
+    transients : int
+        All transients, N.
+    confidence : float
+        Of the bound.
+
+    Returns
+    -------
+    float
+        ε, 0 to 1.
     """
     from scipy.optimize import brentq
     from scipy.special import gammaln

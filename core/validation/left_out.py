@@ -43,12 +43,32 @@ REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
 class Part:
     """A recording, or a block of one, judged by the model that was fitted without it.
 
-    utilisation (K, n): (x_next - centre) / half of every judged transition; narrowness (K, n): mean half-width over
-    half-width; dt (K,) s; starts: positions at which the alarm starts anew (0, and after
-    every step back in time). violations (n,), violated: verdicts at margin 1, by state and of any state;
-    outside_domain: verdicts from outside the domain fitted without this part; unseen: violated ones inside it.
-    mean_width, max_width (n,): of the left-out model's bounds on this part, in recorded units; relative_width (n,):
-    the mean over that of the full model on the same samples.
+    Parameters
+    ----------
+    name : str
+        What was left out.
+    dt : array (K,)
+        Step of each judged transition, s.
+    utilisation : array (K, n)
+        (x_next - centre) / half of every judged transition.
+    narrowness : array (K, n)
+        Mean half-width over half-width.
+    starts : tuple of int
+        Positions at which the alarm starts anew: 0, and after every step back in time.
+    violations : array (n,) of int
+        Violated verdicts of each state at margin 1.
+    violated : int
+        Verdicts violated on any state at margin 1.
+    outside_domain : int
+        Verdicts from outside the domain fitted without this part.
+    unseen : int
+        Violated verdicts from inside that domain.
+    mean_width : array (n,)
+        Of the left-out model's bounds on this part, recorded units.
+    max_width : array (n,)
+        The largest such width.
+    relative_width : array (n,)
+        The mean over that of the full model on the same samples.
     """
 
     name: str
@@ -83,7 +103,22 @@ class Part:
         return np.asarray(np.abs(self.utilisation).max(axis=1))
 
     def level(self, violations: int, window: int, severity: Array | None = None) -> Array:
-        """(K,): the margin below which the alarm is raised: the m-th largest severity of the last n verdicts."""
+        """The margin below which the alarm is raised: the m-th largest severity of the last n verdicts.
+
+        Parameters
+        ----------
+        violations : int
+            m.
+        window : int
+            n, in verdicts.
+        severity : array (K,), optional
+            Default that of the part.
+
+        Returns
+        -------
+        array (K,)
+            -inf until m verdicts are there.
+        """
         severity = self.severity if severity is None else severity
         level = np.empty(len(severity))
         for start, stop in zip(self.starts, [*self.starts[1:], len(severity)], strict=True):
@@ -94,12 +129,36 @@ class Part:
         return level
 
     def alarms(self, rule: AlarmRule) -> int:
-        """How often the alarm is raised (rising edges)."""
+        """How often the alarm is raised (rising edges).
+
+        Parameters
+        ----------
+        rule : AlarmRule
+            The alarm rule, with its margin.
+
+        Returns
+        -------
+        int
+            Rising edges.
+        """
         return rising(self.level(rule.violations, rule.window) > rule.margin, self.starts)
 
 
 def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:
-    """Rising edges of an alarm that starts anew, lowered, at each of `starts`."""
+    """Rising edges of an alarm that starts anew, lowered, at each of `starts`.
+
+    Parameters
+    ----------
+    raised : array (K,) of bool
+        Whether the alarm is raised.
+    starts : sequence of int
+        Positions at which it starts lowered.
+
+    Returns
+    -------
+    int
+        Rising edges.
+    """
     before = np.concatenate([[False], raised[:-1]])
     before[[s for s in starts if s < len(raised)]] = False
     return int(np.count_nonzero(raised & ~before))
@@ -107,7 +166,21 @@ def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:
 
 @dataclass(frozen=True, repr=False)
 class Validation:
-    """What `validate` found. `kind` is "transients" or "blocks"; gap, s, is left between a block and its training."""
+    """What `validate` found.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The fit to all recordings.
+    parts : tuple of Part
+        What was left out, one after the other.
+    kind : str
+        `transients` or `blocks`.
+    gap : float
+        Time on both sides of a left-out block that was not fitted either, s; 0 for transients.
+    confidence : float
+        Of every interval.
+    """
 
     model: UncertainLTI
     parts: tuple[Part, ...]
@@ -148,7 +221,13 @@ class Validation:
         return html_table(repr(self), ("left out", "inside", "whole parts", "mean width", "fitted"), rows, below)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data: coverage beside widths, false alarms per hour with intervals, scenario bound in words."""
+        """Plain data: coverage beside widths, false alarms per hour with intervals, scenario bound in words.
+
+        Returns
+        -------
+        dict
+            As `summary`.
+        """
         return summary(self)
 
 
@@ -170,22 +249,32 @@ def validate(
     Parameters
     ----------
     transients : Transient or sequence of Transient
-    operating_point, weights, alarm_rule : as in `fit`
-        Weights per sample go with their samples.
+        The recordings.
+    operating_point : OperatingPoint, optional
+        As in `fit`.
+    weights : array or sequence of array, optional
+        As in `fit`; weights per sample go with their samples.
+    alarm_rule : AlarmRule, optional
+        As in `fit`.
     blocks : int, optional
-        Cut every recording into so many contiguous blocks and leave out one block at a time. Default: whole
-        recordings where there are two or more, else BLOCKS blocks.
+        Cut every recording into so many contiguous blocks and leave out one block at a time. Default: whole recordings
+        where there are two or more, else BLOCKS blocks.
     gap : float, optional
-        s on both sides of a left-out block that are not fitted either, because they resemble it. Default: three
-        times the slowest time constant of the nominal model, at most half a block.
-    confidence : float
-        Of every interval.
+        Time on both sides of a left-out block that is not fitted either, s, because it resembles the block. Default:
+        three times the slowest time constant of the nominal model, at most half a block.
+    confidence : float, default 0.9
+        Of every interval, 0.5 to below 1.
     full : UncertainLTI, optional
         The fit to all recordings, where it is there already.
     progress : callable, optional
         Called with one line of text per fit.
-    **options
+    **options : object
         Further arguments of `fit`.
+
+    Returns
+    -------
+    Validation
+        The parts, each judged by the model that was fitted without it.
 
     Raises
     ------
@@ -238,7 +327,21 @@ def validate(
 def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str) -> Part:
     """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1.
 
-    full gives the widths that the left-out ones are compared with.
+    Parameters
+    ----------
+    model : UncertainLTI
+        Fitted without the transient.
+    full : UncertainLTI
+        Gives the widths that the left-out ones are compared with.
+    transient : Transient
+        What was left out.
+    name : str
+        What it is called.
+
+    Returns
+    -------
+    Part
+        The verdicts.
     """
     verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
     judged = verdicts.judged
@@ -272,7 +375,22 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
 
 
 def cut(transient: Transient, start: int, stop: int) -> Transient:
-    """Samples start..stop-1 as a transient of their own."""
+    """Samples start..stop-1 as a transient of their own.
+
+    Parameters
+    ----------
+    transient : Transient
+        The whole.
+    start : int
+        First sample.
+    stop : int
+        First sample after it.
+
+    Returns
+    -------
+    Transient
+        Without counters and notes.
+    """
     part = slice(start, stop)
     return Transient(
         transient.t_ns[part],
@@ -336,7 +454,18 @@ def _split_weights(
 
 
 def summary(validation: Validation) -> dict[str, Any]:
-    """Everything `validate` found as plain data; the fields are described in docs/validation.md."""
+    """Everything `validate` found as plain data; the fields are described in docs/validation.md.
+
+    Parameters
+    ----------
+    validation : Validation
+        Of `validate`.
+
+    Returns
+    -------
+    dict
+        Plain data for JSON; widths in recorded units.
+    """
     v, model, parts = validation, validation.model, validation.parts
     judged = sum(p.judged for p in parts)
     hours = sum(p.hours for p in parts)
@@ -386,7 +515,22 @@ def summary(validation: Validation) -> dict[str, Any]:
 
 
 def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> dict[str, Any]:
-    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to so many parts."""
+    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to so many parts.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Left-out parts.
+    rule : AlarmRule
+        The alarm rule.
+    confidence : float
+        Of the interval, two-sided.
+
+    Returns
+    -------
+    dict
+        The rule, counts, `raised_share` of the time, `per_hour` and its `interval`; None without a verdict.
+    """
     counts = [p.alarms(rule) for p in parts]
     hours = sum(p.hours for p in parts)
     raised = sum(float(p.dt[p.level(rule.violations, rule.window) > rule.margin].sum()) for p in parts) / 3600.0
@@ -408,6 +552,18 @@ def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
 
     The margin is that at which three parts alarm, but not below NEARBY times the rule's: far below, alarms are of
     another kind.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Left-out parts.
+    rule : AlarmRule
+        The alarm rule.
+
+    Returns
+    -------
+    float
+        As `cluster_size`.
     """
     levels = [p.level(rule.violations, rule.window) for p in parts]
     margin = borrowed_margin([float(level.max(initial=0.0)) for level in levels], rule.margin)
@@ -415,14 +571,38 @@ def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
 
 
 def borrowed_margin(peaks: Sequence[float], margin: float) -> float:
-    """The margin at which to see how many alarms come at once; peaks: largest level of each part."""
+    """The margin at which to see how many alarms come at once.
+
+    Parameters
+    ----------
+    peaks : sequence of float
+        Largest level of each part.
+    margin : float
+        The rule's.
+
+    Returns
+    -------
+    float
+        At most the rule's, at least NEARBY times it.
+    """
     third = sorted(peaks, reverse=True)[min(2, len(peaks) - 1)]
     # a little below the third peak: an alarm that only just starts is always alone
     return min(margin, max(0.95 * third, NEARBY * margin))
 
 
 def scenario(validation: Validation) -> dict[str, Any]:
-    """The scenario bound on leaving the envelope anywhere in a whole fresh transient, or why there is none."""
+    """The scenario bound on leaving the envelope anywhere in a whole fresh transient, or why there is none.
+
+    Parameters
+    ----------
+    validation : Validation
+        Of `validate`.
+
+    Returns
+    -------
+    dict
+        `words`, and where there is a bound its `interval` and what was counted.
+    """
     v = validation
     G = len(v.parts)
     discarded = _discarded(v.model)
@@ -478,7 +658,20 @@ def _discarded(model: UncertainLTI) -> int:
 
 
 def full_widths(model: UncertainLTI) -> tuple[list[float], list[float]]:
-    """Mean and largest width of the full fit on its own samples, recorded units."""
+    """Widths of the full fit on its own samples.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit`.
+
+    Returns
+    -------
+    list of float
+        Mean width of each state, recorded units.
+    list of float
+        Largest width of each state, recorded units.
+    """
     return (
         [float(w) for w in model.fit_summary["mean_width_recorded"]],
         [float(w) for w in model.fit_summary["max_width_recorded"]],
@@ -536,7 +729,25 @@ def validate_model(
 ) -> Validation:
     """Validate a fitted model, or one from a file, with the recordings it was fitted to and the options it names.
 
-    Arguments as in `validate`.
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit`, with its summary.
+    transients : sequence of Transient
+        The recordings it was fitted to.
+    blocks : int, optional
+        As in `validate`.
+    gap : float, optional
+        As in `validate`.
+    confidence : float, default 0.9
+        As in `validate`.
+    progress : callable, optional
+        As in `validate`.
+
+    Returns
+    -------
+    Validation
+        As of `validate`.
 
     Raises
     ------
@@ -593,7 +804,27 @@ def leave_out_cheaply(
     progress: Callable[[str], None] | None = None,
     budget: float = 5.0,
 ) -> dict[str, Any] | None:
-    """The summary of `validate` beside a fit that took so many seconds; None where it would take over `budget` s."""
+    """The summary of `validate`, if it takes little time beside a fit.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        What the model was fitted to.
+    model : UncertainLTI
+        Of `fit`.
+    seconds : float
+        Time that the fit took, s.
+    progress : callable, optional
+        As in `validate`.
+    budget : float, default 5.0
+        Time that the validation may take, s, estimated as that of one fit per part.
+
+    Returns
+    -------
+    dict or None
+        As `summary`; None where it would take longer, the fit has weights, or too little is left when a part is left
+        out.
+    """
     parts = len(transients) if len(transients) > 1 else BLOCKS
     if parts * seconds > budget or model.fit_summary.get("weights", "ones") != "ones":
         return None
