@@ -231,9 +231,13 @@ def _wanting(module: Module, name: str, node: Function | ast.ClassDef, said: dic
     return wanting
 
 
-ROOMS = ("base", "signals", "plants")
-"""Rooms whose docstrings have every section."""
-FILES = sorted(path for room in ROOMS for path in (ROOT / "core" / room).glob("*.py"))
+PENDING = (
+    "core/cli", "core/identification", "core/model", "core/monitor", "core/proposal", "core/recordings",
+    "core/sampling/sampler", "uncertain_lti_ros",
+)  # fmt: skip
+"""Beginnings of the paths whose docstrings do not have every section yet."""
+FILES = sorted([*(ROOT / "core").rglob("*.py"), *(ROOT / "uncertain_lti_ros").glob("*.py")])
+FILES = [path for path in FILES if not str(path.relative_to(ROOT)).startswith(PENDING)]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))

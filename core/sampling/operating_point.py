@@ -22,14 +22,19 @@ STILL_BAND = 0.05
 class OperatingPoint:
     """Steady state and scales, in recorded units.
 
-    x_i = (x_i^a - x_i^s) / X_i and u_j = (u_j^a - u_j^s) / U_j, METHOD section 1 (Leibov 2006).
+    x_i = (x_i^a - x_i^s) / X_i and u_j = (u_j^a - u_j^s) / U_j, with ^a what is recorded and ^s the steady state
+    (Leibov 2006; docs/theory.md).
 
     Parameters
     ----------
-    x_s, X : array (n,)
-        Steady state and positive scales of the states.
-    u_s, U : array (m,)
-        The same of the controls.
+    x_s : array (n,)
+        Steady state of the states.
+    u_s : array (m,)
+        Steady state of the controls.
+    X : array (n,)
+        Positive scales of the states.
+    U : array (m,)
+        Positive scales of the controls.
 
     Raises
     ------
@@ -57,12 +62,43 @@ class OperatingPoint:
 
     @classmethod
     def identity(cls, n: int, m: int) -> OperatingPoint:
-        """Values used as they are."""
+        """Values used as they are.
+
+        Parameters
+        ----------
+        n : int
+            Number of states.
+        m : int
+            Number of controls.
+
+        Returns
+        -------
+        OperatingPoint
+            Steady states 0, scales 1.
+        """
         return cls(np.zeros(n), np.zeros(m), np.ones(n), np.ones(m))
 
     @classmethod
     def of(cls, states: Sequence[Signal], controls: Sequence[Signal]) -> OperatingPoint:
-        """From signals whose steady and scale are numbers."""
+        """From signals whose steady and scale are numbers.
+
+        Parameters
+        ----------
+        states : sequence of Signal
+            In the order of x.
+        controls : sequence of Signal
+            In the order of u.
+
+        Returns
+        -------
+        OperatingPoint
+            Their steady states and scales.
+
+        Raises
+        ------
+        TransientError
+            A steady state or a scale is still `auto`, or not what `OperatingPoint` takes.
+        """
 
         def numbers(signals: Sequence[Signal], which: str) -> Array:
             values = [getattr(s, which) for s in signals]
@@ -79,15 +115,48 @@ class OperatingPoint:
         )
 
     def normalise_x(self, x: ArrayLike) -> Array:
-        """States in recorded units (..., n) -> deviations (..., n)."""
+        """States as deviations.
+
+        Parameters
+        ----------
+        x : array (..., n)
+            Recorded units.
+
+        Returns
+        -------
+        array (..., n)
+            Dimensionless.
+        """
         return (np.asarray(x, dtype=np.float64) - self.x_s) / self.X
 
     def normalise_u(self, u: ArrayLike) -> Array:
-        """Controls in recorded units (..., m) -> deviations (..., m)."""
+        """Controls as deviations.
+
+        Parameters
+        ----------
+        u : array (..., m)
+            Recorded units.
+
+        Returns
+        -------
+        array (..., m)
+            Dimensionless.
+        """
         return (np.asarray(u, dtype=np.float64) - self.u_s) / self.U
 
     def recorded_x(self, x: ArrayLike) -> Array:
-        """State deviations (..., n) -> recorded units (..., n)."""
+        """State deviations in recorded units.
+
+        Parameters
+        ----------
+        x : array (..., n)
+            Dimensionless.
+
+        Returns
+        -------
+        array (..., n)
+            Recorded units.
+        """
         return self.x_s + self.X * np.asarray(x, dtype=np.float64)
 
 
@@ -100,8 +169,16 @@ def still_stretches(values: Array, span: Array, band: float = STILL_BAND) -> lis
     Parameters
     ----------
     values : array (samples, signals)
+        Recorded units.
     span : array (signals,)
         Range of each signal over all recordings.
+    band : float, optional
+        Share of the range; default STILL_BAND.
+
+    Returns
+    -------
+    list of (int, int)
+        First sample, and first sample after the stretch.
     """
     stretches = []
     start, stop, count = 0, 0, len(values)
@@ -135,8 +212,18 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
     Parameters
     ----------
     signals : sequence of Signal
+        States, then controls.
     recordings : sequence of array (samples, signals)
         In recorded units.
+
+    Returns
+    -------
+    list of float
+        Steady state of each signal.
+    list of float
+        Scale of each signal.
+    str
+        The rule applied, in words.
     """
     finite = [np.where(np.isfinite(r), r, np.nan) for r in recordings]
     pooled = np.concatenate(finite)

@@ -27,7 +27,25 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
 def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, str]:
-    """Per topic `header` or `log`: as said, else header where most messages of all recordings carry a stamp."""
+    """Per topic `header` or `log`: what the map says, else header where most messages of all recordings carry a stamp.
+
+    Parameters
+    ----------
+    streams : sequence of Stream
+        All recordings.
+    signals : SignalMap
+        The map.
+
+    Returns
+    -------
+    mapping of str to str
+        Topic -> source.
+
+    Raises
+    ------
+    SignalError
+        The map says header and no message has a stamp.
+    """
     sources: dict[str, str] = {}
     for position, name in enumerate(signals.topics):
         stamps = np.concatenate([s.stamp[s.topic == position] for s in streams])
@@ -46,6 +64,25 @@ def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None)
     """One recording through the rules of the `Sampler`; signals must be resolved.
 
     In columns (`sampler_arrays`), and message after message where that is not possible; the same to the last bit.
+
+    Parameters
+    ----------
+    stream : Stream
+        The recording.
+    signals : SignalMap
+        Resolved: clock, max_gap, time sources, steady states and scales.
+    progress : Progress, optional
+        As in `read_transients`.
+
+    Returns
+    -------
+    Transient
+        In recorded units.
+
+    Raises
+    ------
+    TransientError
+        Steps are about a nanosecond.
     """
     samples = sample_arrays(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
     if samples is None:
@@ -66,7 +103,27 @@ def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None)
 
 
 def sample_by_message(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Samples:
-    """The same through the `Sampler` itself, message after message."""
+    """The samples through the `Sampler` itself, message after message.
+
+    Parameters
+    ----------
+    stream : Stream
+        The recording.
+    signals : SignalMap
+        Resolved, as for `sample`.
+    progress : Progress, optional
+        As in `read_transients`.
+
+    Returns
+    -------
+    Samples
+        As `sample_arrays` gives them.
+
+    Raises
+    ------
+    SignalError
+        Something in the map is not resolved.
+    """
     sampler = Sampler(signals)
     topics = signals.topics
     rows = [iter(v.tolist()) for v in stream.values]
@@ -108,7 +165,7 @@ def read_transients(
 
     Parameters
     ----------
-    paths : path or sequence of paths
+    paths : Paths
         MCAP files and folders; parts of one split bag are one recording (see `bag.group_recordings`).
     signals : SignalMap or path
         A map, or the signals file.
@@ -179,6 +236,20 @@ def read_as_fitted(
 ) -> Transient:
     """Read one recording with the signals and sampling that a model was fitted with.
 
+    Parameters
+    ----------
+    recording : Bag or path
+        MCAP file or folder.
+    signals : SignalMap
+        Of the model.
+    progress : Progress, optional
+        As in `read_transients`.
+
+    Returns
+    -------
+    Transient
+        In recorded units.
+
     Raises
     ------
     BagError
@@ -194,7 +265,31 @@ def read_as_fitted(
 def read_as_fitted_with_decisions(
     recording: Bag | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> tuple[Transient, Decisions]:
-    """`read_as_fitted`, and which message decided each clock message; raises as that does."""
+    """`read_as_fitted`, and which message decided each clock message.
+
+    Parameters
+    ----------
+    recording : Bag or path
+        MCAP file or folder.
+    signals : SignalMap
+        Of the model.
+    progress : Progress, optional
+        As in `read_transients`.
+
+    Returns
+    -------
+    Transient
+        In recorded units.
+    Decisions
+        Of every clock message that was decided.
+
+    Raises
+    ------
+    BagError
+        As `read_as_fitted`.
+    SignalError
+        As `read_as_fitted`.
+    """
     stream = _stream_for_model(recording, signals, progress)
     decisions = decided(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
     return sample(stream, signals, progress), decisions
@@ -236,7 +331,19 @@ def _stream_for_model(
 
 
 def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.PathLike[str]]) -> SignalMap:
-    """A signals file, whose topics are held against the recordings before one of them is recommended.
+    """A signals file; where it contradicts itself, its topics are first looked for in the recordings.
+
+    Parameters
+    ----------
+    path : path
+        The signals file.
+    recordings : sequence of path
+        MCAP files and folders.
+
+    Returns
+    -------
+    SignalMap
+        As `SignalMap.load`.
 
     Raises
     ------
@@ -256,7 +363,20 @@ def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.Pat
 
 
 def no_topic(bag: Bag, topic: str) -> str:
-    """The sentence for a topic that a recording lacks, with the nearest names and all of them."""
+    """The sentence for a topic that a recording lacks, with the nearest names and all of them.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording.
+    topic : str
+        The name that it lacks.
+
+    Returns
+    -------
+    str
+        The sentence.
+    """
     there = ", ".join(sorted(bag.topics)) or "none"
     return f"{bag.path}: there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
 
@@ -303,7 +423,18 @@ def _with_signals(transient: Transient, signals: SignalMap, note: str | None) ->
 
 
 def unused(transient: Transient) -> list[str]:
-    """In words, how many transitions of a recording are not used, and why."""
+    """In words, how many transitions of a recording are not used, and why.
+
+    Parameters
+    ----------
+    transient : Transient
+        The recording.
+
+    Returns
+    -------
+    list of str
+        One entry per reason.
+    """
     counts: dict[str, int] = {}
     for status in transient.statuses()[1:]:
         if status is not Status.OK:

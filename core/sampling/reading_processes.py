@@ -28,6 +28,16 @@ def processes_for(bags: Sequence[Bag]) -> int:
     """How many processes to read these recordings with: 1 for small ones, and on few cores.
 
     One process keeps nearly two cores busy, as it reads ahead.
+
+    Parameters
+    ----------
+    bags : sequence of Bag
+        The recordings.
+
+    Returns
+    -------
+    int
+        At most one per recording, and one for every two cores.
     """
     size = sum(part.size for bag in bags for part in bag.contents)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -35,12 +45,32 @@ def processes_for(bags: Sequence[Bag]) -> int:
 
 
 def read_streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None, processes: int) -> list[Stream]:
-    """`read_stream` of every bag; progress advances by whole recordings.
+    """`read_stream` of every recording, in processes; progress advances by whole recordings.
+
+    Parameters
+    ----------
+    bags : sequence of Bag
+        The recordings.
+    signals : SignalMap
+        The map.
+    progress : Progress or None
+        Wraps what goes through all messages, given their number.
+    processes : int
+        How many at most.
+
+    Returns
+    -------
+    list of Stream
+        One per recording, in their order.
 
     Raises
     ------
     BagError, SignalError
         As `read_stream`, of the first recording in order that cannot be read; or a process ended before its time.
+    BagError
+        As `read_stream`, of the first recording in order that cannot be read; or a process ended before its time.
+    SignalError
+        As `read_stream`.
     """
     counts = [sum(bag.topics[topic].count for topic in signals.topics) for bag in bags]
     with _pool(min(processes, len(bags))) as pool:
@@ -81,7 +111,15 @@ def _read(path: Path, contents: Sequence[Contents], signals: SignalMap) -> tuple
 
 @contextmanager
 def children_ignore_ctrl_c() -> Iterator[None]:
-    """Processes that are started here leave Ctrl-C to this one; in another than the main thread it cannot be set."""
+    """Processes that are started in the block leave Ctrl-C to this one.
+
+    In another than the main thread it cannot be set.
+
+    Yields
+    ------
+    None
+        The block in which they are started.
+    """
     main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None
     try:

@@ -22,8 +22,18 @@ from uncertain_lti.signals.signal_map import FieldPath, SignalMap
 class Stream:
     """The wanted field values of one recording in order of arrival.
 
-    topic (messages,) positions in `signals.topics`; arrival, stamp (messages,) ns, with -1 for no stamp; values,
-    one array per topic, message after message in the order of `signals.on(topic)`.
+    Parameters
+    ----------
+    bag : Bag
+        The recording.
+    topic : array (messages,) of int
+        Positions in `signals.topics`.
+    arrival : array (messages,) of int
+        Log time, ns.
+    stamp : array (messages,) of int
+        Header stamp, ns; -1 for no stamp.
+    values : list of array (messages of the topic, signals on it)
+        One array per topic, in the order of `signals.on(topic)`.
     """
 
     bag: Bag
@@ -37,6 +47,20 @@ def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) 
     """Read the fields of a signals file from one recording.
 
     Messages are read in blocks (`bag_arrays`), with what `read_stream_by_message` gives to the last bit.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording.
+    signals : SignalMap
+        The map; it need not be resolved.
+    progress : Progress, optional
+        As in `read_transients`.
+
+    Returns
+    -------
+    Stream
+        In recorded units.
 
     Raises
     ------
@@ -55,7 +79,29 @@ def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) 
 
 
 def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
-    """The same, message by message; raises as `read_stream` does."""
+    """What `read_stream` gives, message by message.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording.
+    signals : SignalMap
+        The map; it need not be resolved.
+    progress : Progress, optional
+        As in `read_transients`.
+
+    Returns
+    -------
+    Stream
+        In recorded units.
+
+    Raises
+    ------
+    BagError
+        As `read_stream`.
+    SignalError
+        As `read_stream`.
+    """
     paths = check_paths(bag, signals)
     topics = signals.topics
     messages: Iterable[tuple[str, int, object]] = bag.messages(topics)
@@ -77,7 +123,25 @@ def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | No
 
 
 def check_paths(bag: Bag, signals: SignalMap) -> list[list[FieldPath]]:
-    """Field paths per topic; every problem of the map is found before the long read."""
+    """Field paths per topic; every problem of the map is found before the long read.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording.
+    signals : SignalMap
+        The map.
+
+    Returns
+    -------
+    list of list of FieldPath
+        Per topic, in the order of `signals.on(topic)`.
+
+    Raises
+    ------
+    SignalError
+        A path is not in the message type, or is not one number.
+    """
     for name in signals.topics:
         if name in bag.topics and bag.topics[name].readable:
             signals.check(name, bag.topics[name].type, bag.type_fields(name))

@@ -23,9 +23,20 @@ from uncertain_lti.signals.signal_map import SignalMap
 
 @dataclass(frozen=True)
 class Transitions:
-    """The usable transitions k -> k+1 of one transient, in recorded units.
+    """The usable transitions k -> k+1 of one transient, in recorded units; all numbers are finite.
 
-    k (N,) is the position of sample k in the transient; dt (N,) s; x, x_next (N, n); u (N, m); all finite.
+    Parameters
+    ----------
+    k : array (N,) of int
+        Position of sample k in the transient.
+    dt : array (N,)
+        Δt_k, s.
+    x : array (N, n)
+        States at t_k.
+    u : array (N, m)
+        Controls at t_k.
+    x_next : array (N, n)
+        States at t_{k+1}.
     """
 
     k: NDArray[np.intp]
@@ -41,31 +52,29 @@ class Transient:
     Parameters
     ----------
     t : array (N+1,)
-        Instants: s where the numbers are floating point, ns where they are integers; or datetime64. Kept as
-        integer ns.
+        Instants: s where the numbers are floating point, ns where they are integers; or datetime64. Kept as integer ns.
     x : array (N+1, n)
         States in recorded units; NaN where a sample has none.
     u : array (N+1, m)
         Controls in recorded units, u[k] acting from t[k] to t[k+1]; the last row is never used.
-    name : str
+    name : str, default "transient"
         What messages call this run (the bag or file).
     signals : SignalMap, optional
         Where the arrays came from; gives names, units and the operating point to a fit.
-    state_names, control_names : sequence of str, optional
-        Where there is no SignalMap; default x1.., u1...
+    state_names : sequence of str, optional
+        Names where there is no SignalMap; default x1, x2, ...
+    control_names : sequence of str, optional
+        Names where there is no SignalMap; default u1, u2, ...
     max_gap : float, optional
-        s; a longer step starts a new segment. Default 2.5 x the median step; math.inf for no limit.
-    min_step : float
-        s; a sample less than this after the one before is dropped, one with an equal stamp always.
+        A step longer than this, s, starts a new segment. Default 2.5 x the median step; math.inf for no limit.
+    min_step : float, default 0.0
+        A sample less than this, s, after the one before is dropped, one with an equal stamp always.
     counters : mapping, optional
         Counts of a `Sampler` to start from.
     sources : sequence of paths, optional
         Files that the run was read from.
     notes : sequence of str, optional
         What the reader of the files had to say.
-
-    A sample at most max_gap earlier than the one before is dropped as late; one earlier than that starts a new
-    segment. `counters` counts what was dropped by reason, beside what the sampler counted.
 
     Raises
     ------
@@ -145,7 +154,13 @@ class Transient:
         return usable
 
     def transitions(self) -> Transitions:
-        """The usable transitions, as arrays in recorded units."""
+        """The usable transitions, as arrays in recorded units.
+
+        Returns
+        -------
+        Transitions
+            N of them; views of the transient where all are usable.
+        """
         usable = self.usable
         if usable.all():  # the usual clean case: views, no copies
             k = np.arange(len(usable))
@@ -154,7 +169,13 @@ class Transient:
         return Transitions(k, self.dt[k], self.x[k], self.u[k], self.x[k + 1])
 
     def statuses(self) -> list[Status]:
-        """What the `Sampler` says of each sample, (N+1,)."""
+        """What the `Sampler` says of each sample, (N+1,).
+
+        Returns
+        -------
+        list of Status
+            One of each sample, N+1.
+        """
         if not len(self):
             return []
         back = np.diff(self.t_ns) < 0
@@ -205,12 +226,20 @@ class Transient:
         Parameters
         ----------
         frame : pandas.DataFrame
+            One row per sample.
         time : str, optional
             Column with the instants: numbers in s, or time stamps. Default: the index.
-        states, controls : sequence of str
+        states : sequence of str
             Columns. A name that stands twice is taken once if both columns are equal.
-        **options
+        controls : sequence of str
+            Columns, likewise.
+        **options : object
             As in Transient.
+
+        Returns
+        -------
+        Transient
+            The run.
 
         Raises
         ------
@@ -244,9 +273,29 @@ class Transient:
         delimiter: str = ",",
         **options: Any,
     ) -> Transient:
-        """From a CSV file with one header line; columns by name, empty cells are NaN, time in s.
+        """From a CSV file with one header line; empty cells are NaN.
 
         A name that stands twice is taken once if both columns are equal.
+
+        Parameters
+        ----------
+        path : path
+            The file.
+        time : str
+            Column with the instants, s.
+        states : sequence of str
+            Columns.
+        controls : sequence of str
+            Columns.
+        delimiter : str, default ","
+            Between the cells of a line.
+        **options : object
+            As in Transient.
+
+        Returns
+        -------
+        Transient
+            The run.
 
         Raises
         ------
