@@ -34,7 +34,21 @@ Recording = tuple[str, tuple[str, ...]]
 
 @dataclass(frozen=True)
 class Survey:
-    """What resolving a signal map needs of one recording: types, stamped messages and instants by topic."""
+    """What resolving a signal map needs of one recording, by topic.
+
+    Parameters
+    ----------
+    types : dict of str to str
+        Message type.
+    stamped : dict of str to int
+        Messages with a stamp.
+    counted : dict of str to int
+        Messages.
+    header : dict of str to array
+        Stamps of those that have one, ns; state topics only.
+    log : dict of str to array
+        Log times, ns; state topics only.
+    """
 
     types: dict[str, str]
     stamped: dict[str, int]
@@ -62,12 +76,16 @@ def fit_archive(
         As for `read_transients`; a cluster's workers must be able to read them under the same names.
     signals : SignalMap or path
         steady and scale must be numbers: `auto` would need all recordings at once.
-    criterion, additive, alarm_rule
+    criterion : {"qp", "lp"}, default "qp"
+        As for `fit`.
+    additive : {"none", "disturbance", "noise", "both"}, optional
         As for `fit`.
     cache : path, optional
         Folder for the arrays, written while the bags are read; passes then read it block by block.
     client : distributed.Client, optional
         The workers read the recordings and keep the arrays. Give cache or client.
+    alarm_rule : AlarmRule, optional
+        As for `fit`.
     progress : callable, optional
         Called with one line of text per recording, with its number among all (`3 of 10`), and per pass, with the
         samples still outside and the size of the working set.
@@ -167,7 +185,25 @@ def fit_archive(
 
 
 def survey(recording: Recording, signals: SignalMap) -> Survey:
-    """First look at one recording; see `Survey`."""
+    """First look at one recording.
+
+    Parameters
+    ----------
+    recording : (str, tuple of str)
+        Path and files, as `Bag` takes them.
+    signals : SignalMap
+        The map, not resolved.
+
+    Returns
+    -------
+    Survey
+        What `fit_archive` resolves the map with.
+
+    Raises
+    ------
+    BagError
+        The recording cannot be read, or a topic has no message.
+    """
     stream = read_stream(Bag(recording[0], recording[1], indexed=True), signals)
     states = {s.topic for s in signals.states}
     types, stamped, counted = {}, {}, {}
@@ -206,7 +242,22 @@ def _resolve(surveys: Sequence[Survey], signals: SignalMap, recordings: Sequence
 
 
 def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
-    """The usable transitions of one recording, normalised."""
+    """The usable transitions of one recording, normalised.
+
+    Parameters
+    ----------
+    recording : (str, tuple of str)
+        Path and files, as `Bag` takes them.
+    signals : SignalMap
+        Resolved.
+    columns : Columns
+        Terms that are unknown.
+
+    Returns
+    -------
+    Problem
+        Weights are ones; empty where no transition is usable.
+    """
     transient = sample(read_stream(Bag(recording[0], recording[1], indexed=True), signals), signals)
     point = OperatingPoint.of(signals.states, signals.controls)
     return replace(assemble([transient], point, None, "none", empty=True), columns=columns)

@@ -22,9 +22,24 @@ _DATA, _FACTS = "transitions.f64", "facts.json"
 
 @dataclass(frozen=True)
 class DiskPartition:
-    """A `Partition` in a folder: blocks of [z; x_next; Δt] as float64, read anew by every pass.
+    """A `Partition` in a folder: blocks of [z; x_next; Δt] as float64, read again by every pass.
 
-    Only one block is in memory at a time. weights are (n,), constant in time.
+    Only one block is in memory at a time.
+
+    Parameters
+    ----------
+    folder : Path
+        Written by `CacheWriter`.
+    count : int
+        Number of transitions, N.
+    n : int
+        Number of states.
+    p : int
+        Number of states and controls.
+    weights : array (n,)
+        Constant in time.
+    columns : Columns
+        Terms that are unknown.
     """
 
     folder: Path
@@ -42,6 +57,11 @@ class DiskPartition:
     def blocks(self) -> Iterator[Block]:
         """All transitions, in the blocks they were written in.
 
+        Yields
+        ------
+        Block
+            z, x_next and dt of up to BLOCK transitions.
+
         Raises
         ------
         FitError
@@ -58,7 +78,18 @@ class DiskPartition:
                 yield Block(start, table[: self.p], table[self.p : -1], table[-1], self.weights)
 
     def with_columns(self, columns: Columns) -> DiskPartition:
-        """The same transitions with other unknown terms."""
+        """The same transitions with other unknown terms.
+
+        Parameters
+        ----------
+        columns : Columns
+            Terms that are unknown.
+
+        Returns
+        -------
+        DiskPartition
+            On the same files.
+        """
         return replace(self, columns=columns)
 
 
@@ -101,7 +132,18 @@ class CacheWriter:
         return self
 
     def add(self, problem: Problem) -> None:
-        """Append the transitions of a recording."""
+        """Append the transitions of a recording.
+
+        Parameters
+        ----------
+        problem : Problem
+            Transitions of one recording; the number of its signals is that of the first.
+
+        Raises
+        ------
+        FitError
+            Recordings differ in their numbers of signals, or the folder cannot be written.
+        """
         shape = (problem.n, problem.p)
         if self._shape not in (None, shape):
             raise FitError(f"{self.folder}: recordings differ in their numbers of signals")
@@ -149,7 +191,25 @@ class CacheWriter:
             self.folder.rmdir()
 
     def partition(self, weights: Array, columns: Columns) -> DiskPartition:
-        """What was written."""
+        """What was written; to be asked when the context has ended.
+
+        Parameters
+        ----------
+        weights : array (n,)
+            Constant in time.
+        columns : Columns
+            Terms that are unknown.
+
+        Returns
+        -------
+        DiskPartition
+            All transitions.
+
+        Raises
+        ------
+        FitError
+            No usable transition was written.
+        """
         if self._shape is None:
             raise FitError(f"{self.folder}: no usable transition was written")
         n, p = self._shape

@@ -21,8 +21,9 @@ class DaskFleet(Fleet):
     Parameters
     ----------
     client : distributed.Client
-    tasks : sequence of (callable, arguments)
-        Each makes one `Problem`.
+        The cluster.
+    tasks : sequence of (callable, tuple)
+        Function and arguments; each makes one `Problem`.
     done : callable, optional
         Called with the number of those made so far.
 
@@ -30,6 +31,8 @@ class DaskFleet(Fleet):
     ------
     UncertainLTIError
         What a task raised.
+    FitError
+        No recording has a usable transition.
     """
 
     def __init__(
@@ -59,11 +62,51 @@ class DaskFleet(Fleet):
         tasks: Sequence[tuple[Callable[..., T], tuple[Any, ...]]],
         done: Callable[[int], None] | None = None,
     ) -> list[T]:
-        """Results of tasks in order; done is called with the number of those that are there."""
+        """Run tasks on the workers.
+
+        Parameters
+        ----------
+        client : distributed.Client
+            The cluster.
+        tasks : sequence of (callable, tuple)
+            Function and arguments.
+        done : callable, optional
+            Called with the number of results that are there.
+
+        Returns
+        -------
+        list of T
+            Results, in the order of the tasks.
+
+        Raises
+        ------
+        FitError
+            The cluster lost the task again and again.
+        UncertainLTIError
+            What a task raised.
+        """
         return _gather(client, [client.submit(f, *arguments, pure=False, retries=3) for f, arguments in tasks], done)
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
-        """function(partition, *arguments) on the workers, results in order of the partitions."""
+        """function(partition, *arguments) on the workers.
+
+        Parameters
+        ----------
+        function : callable
+            Takes a partition and its arguments.
+        arguments : sequence of tuple of object
+            One tuple per partition.
+
+        Returns
+        -------
+        list of T
+            Results, in the order of the partitions.
+
+        Raises
+        ------
+        FitError
+            The cluster lost the task again and again.
+        """
         futures = [
             self._client.submit(function, part, *args, pure=False, retries=3)
             for part, args in zip(self._parts, arguments, strict=True)

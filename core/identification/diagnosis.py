@@ -37,7 +37,20 @@ WORTH = 1.3
 
 
 def too_few(transitions: int, unknowns: int) -> str:
-    """The sentence for fewer transitions than unknowns."""
+    """The sentence for fewer transitions than unknowns.
+
+    Parameters
+    ----------
+    transitions : int
+        Usable ones.
+    unknowns : int
+        Per row, nominal elements and half-widths.
+
+    Returns
+    -------
+    str
+        The sentence, with its remedy.
+    """
     return (
         f"{plural(transitions, 'usable transition')} for {unknowns} unknowns per row (nominal elements and "
         "half-widths); record "
@@ -47,6 +60,15 @@ def too_few(transitions: int, unknowns: int) -> str:
 
 def check_solvable(problem: Problem, transients: Sequence[Transient], names: Sequence[str]) -> None:
     """Refuse data to which no envelope can be fitted.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    transients : sequence of Transient
+        The recordings, by their position in `problem.source`.
+    names : sequence of str
+        Of the states.
 
     Raises
     ------
@@ -120,8 +142,31 @@ def describe(
 ) -> tuple[int, list[str]]:
     """Rank, and what the user must be told of a fitted model and of the recordings it was fitted to.
 
-    transients name the recordings, and say how many controls were stale; few: transitions that carry the width
-    of a state; discarded: transitions that were left out already, None where leaving out more takes long.
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model fitted.
+    problem : Problem
+        The data, or a part of it.
+    sums : Moments
+        Of all data.
+    mean_width : array (n,)
+        Normalised, per step.
+    max_width : array (n,)
+        Normalised, per step.
+    transients : sequence of Transient, optional
+        The recordings, for their names and for how many controls were stale.
+    few : Carriers, optional
+        Transitions that carry the width of a state.
+    discarded : int, optional
+        Transitions that were left out already; None where leaving out more takes long.
+
+    Returns
+    -------
+    int
+        Rank of the regressors.
+    list of str
+        Messages, a sentence or two each.
     """
     states = model.state_names
     names = [*states, *model.control_names]
@@ -322,7 +367,22 @@ def _wide(
 
 
 def remedies(messages: Sequence[str], additive: str, state: str) -> str:
-    """What of a fit's messages would narrow the bounds of a state; "" where they name nothing."""
+    """What of a fit's messages would narrow the bounds of a state; "" where they name nothing.
+
+    Parameters
+    ----------
+    messages : sequence of str
+        Of `describe`.
+    additive : str
+        The additive term of the fit.
+    state : str
+        Name of the state.
+
+    Returns
+    -------
+    str
+        Remedies, or an empty text.
+    """
     named = [m for m in messages if f"'{state}'" in m]
     found = []
     if any("as wide as the rest needs" in m for m in named):

@@ -39,8 +39,20 @@ WIDER = 1.0 + 1e-9
 class Found:
     """Result of a direct search.
 
-    model: its one-step bounds contain every sample. objective: value of (10). rows (n,): its part in each row. rounds:
-    of all rows together. evaluations: of F. seconds: of wall time.
+    Parameters
+    ----------
+    model : UncertainLTI
+        Its one-step bounds contain every sample.
+    objective : float
+        Value of (10).
+    rows : array (n,)
+        Its part in each row.
+    rounds : int
+        Of all rows together.
+    evaluations : int
+        Of the objective of a row.
+    seconds : float
+        Wall-clock time, s.
     """
 
     model: UncertainLTI
@@ -60,12 +72,17 @@ def direct_search(
     ----------
     transients : sequence of Transient
         With one SignalMap, whose operating point is used.
-    rounds : int
+    rounds : int, default 200
         At most so many per row.
-    improvement : float
+    improvement : float, default 0.0001
         A row ends when a round lowers it by less than this share.
-    tolerance : float
+    tolerance : float, default 0.001
         Relative, of each golden-section search.
+
+    Returns
+    -------
+    Found
+        The model, and what it took.
 
     Raises
     ------

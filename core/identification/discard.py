@@ -26,13 +26,32 @@ LARGEST, MOST_ELEMENTS = 200_000, 300
 
 @dataclass(frozen=True)
 class Carriers:
-    """Transitions, and for each state (n,) its mean width with them over its mean width without."""
+    """Few transitions that carry the width of the envelope.
+
+    Parameters
+    ----------
+    transitions : tuple of int
+        Positions in the problem.
+    factor : array (n,)
+        Mean width of each state with them, over its mean width without.
+    """
 
     transitions: tuple[int, ...]
     factor: Array
 
     def carry(self, state: int) -> bool:
-        """Whether they make the envelope of this state much wider."""
+        """Whether they make the envelope of this state much wider.
+
+        Parameters
+        ----------
+        state : int
+            Position of the state.
+
+        Returns
+        -------
+        bool
+            True where the factor is at least MUCH.
+        """
         return bool(self.factor[state] >= MUCH)
 
 
@@ -52,10 +71,13 @@ def choose_discards(
     Parameters
     ----------
     problem : Problem
+        All transitions.
     criterion : {"qp", "lp"}
         The objective is the sum over rows of (10), or of δ of (11) relative to what it was.
-    structure : Structure, optional
+    structure : Structure or None
+        As in `fit`.
     budget : int
+        Transitions at most.
     progress : callable, optional
         Called with one line of text per transition that is sought.
 
@@ -81,6 +103,18 @@ def carriers(problem: Problem, structure: Structure | None) -> Carriers | None:
 
     By criterion (10), which tells it in a moment. None where there are none such, where the problem is large, or where
     its weights couple the rows.
+
+    Parameters
+    ----------
+    problem : Problem
+        All transitions.
+    structure : Structure or None
+        As in `fit`.
+
+    Returns
+    -------
+    Carriers or None
+        The carriers, or None.
     """
     budget = min(FEW, int(FEW_SHARE * problem.N))
     if not budget or problem.N > LARGEST or problem.n * problem.p > MOST_ELEMENTS or problem.weights.ndim == 3:

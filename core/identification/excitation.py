@@ -26,7 +26,24 @@ FED_BACK = 0.9
 
 
 def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: float) -> list[str]:
-    """Signals that nearly move together, and the recording that would tell them apart; not those that are one."""
+    """Signals that nearly move together, and the recording that would tell them apart.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    moments : Moments
+        Of all data.
+    names : sequence of str
+        Of states and controls.
+    limit : float
+        Share of variance below which signals are one; those are named elsewhere.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
     free = np.flatnonzero(moments.phi_scale[: problem.p] > 0)
     unit = 1.0 / moments.phi_scale[free]
     values, vectors = np.linalg.eigh(moments.centre[np.ix_(free, free)] * np.outer(unit, unit) / moments.count)
@@ -63,7 +80,20 @@ def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: f
 
 
 def rare(problem: Problem, names: Sequence[str]) -> dict[int, str]:
-    """Controls, by column, that stand at one value in all but a few transitions."""
+    """Controls, by column, that stand at one value in all but a few transitions.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    names : sequence of str
+        Of states and controls.
+
+    Returns
+    -------
+    dict of int to str
+        Column -> message.
+    """
     messages = {}
     for j in range(problem.n, problem.p):
         values, counts = np.unique(problem.z[:, j], return_counts=True)
@@ -77,7 +107,22 @@ def rare(problem: Problem, names: Sequence[str]) -> dict[int, str]:
 
 
 def one_sided(problem: Problem, names: Sequence[str], known: Collection[int] = ()) -> list[str]:
-    """Controls that stay on one side of their steady value, without those of which worse is known."""
+    """Controls that stay on one side of their steady value.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    names : sequence of str
+        Of states and controls.
+    known : collection of int, optional
+        Columns of which worse is known, which are left out.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
     messages = []
     for j in range(problem.n, problem.p):
         if j in known:
@@ -97,7 +142,24 @@ def one_sided(problem: Problem, names: Sequence[str], known: Collection[int] = (
 
 
 def weak(problem: Problem, moments: Moments, names: Sequence[str], known: Collection[int] = ()) -> list[str]:
-    """Controls whose effect on every state is lost in what one step leaves unexplained; `known` as in `one_sided`."""
+    """Controls whose effect on every state is lost in what one step leaves unexplained.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    moments : Moments
+        Of all data.
+    names : sequence of str
+        Of states and controls.
+    known : collection of int, optional
+        Columns of which worse is known, which are left out.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
     free = np.flatnonzero(moments.phi_scale > 0)
     centre, target = moments.centre[np.ix_(free, free)], moments.target[free]
     if not len(free) or moments.count <= len(free):
@@ -127,6 +189,18 @@ def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
 
     u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} where a feedback sets u_k; an input that somebody steps
     at will is not.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    names : sequence of str
+        Of states and controls.
+
+    Returns
+    -------
+    list of str
+        Messages.
     """
     follows = successive(problem)
     if len(follows) <= 4 * problem.p:
@@ -153,10 +227,23 @@ def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
 
 
 def unexplained(gram: Array, cross: Array, total: Array) -> Array:
-    """Sum of squares of each target that its least-squares fit on some regressors leaves, (t,).
+    """Sum of squares of each target that its least-squares fit on some regressors leaves.
 
-    gram (b, b), cross (b, t): products of the regressors with one another and with the targets; total (t,): sums of
-    squares of the targets. Shares below 1e-11 are not told apart, which no decision here needs.
+    Shares below 1e-11 are not told apart, which no decision here needs.
+
+    Parameters
+    ----------
+    gram : array (b, b)
+        Products of the regressors with one another.
+    cross : array (b, t)
+        Products of the regressors with the targets.
+    total : array (t,)
+        Sums of squares of the targets.
+
+    Returns
+    -------
+    array (t,)
+        At least 1e-11 of `total`.
     """
     size = np.sqrt(np.diagonal(gram))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
@@ -167,13 +254,35 @@ def unexplained(gram: Array, cross: Array, total: Array) -> Array:
 
 
 def successive(problem: Problem) -> NDArray[np.intp]:
-    """Transitions that the next one in the problem continues: same recording, next sample."""
+    """Transitions that the next one in the problem continues: same recording, next sample.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+
+    Returns
+    -------
+    array of int
+        Positions, increasing.
+    """
     same = (problem.source[1:] == problem.source[:-1]) & (problem.k[1:] == problem.k[:-1] + 1)
     return np.flatnonzero(same)
 
 
 def quoted(names: Sequence[str]) -> str:
-    """'a', 'b' and 'c'; of many names the first ones, and how many others there are."""
+    """'a', 'b' and 'c'; of many names the first ones, and how many others there are.
+
+    Parameters
+    ----------
+    names : sequence of str
+        At least one; a name that begins with `the` is not quoted.
+
+    Returns
+    -------
+    str
+        The list.
+    """
     marked = [n if n.startswith("the ") else f"'{n}'" for n in names]
     if len(marked) > MOST_NAMES + 1:
         return f"{', '.join(marked[:MOST_NAMES])} and {len(marked) - MOST_NAMES} others"

@@ -63,9 +63,9 @@ def fit(
     weights : array (n,), (N, n), (N, n, n), or a list with one of the latter two per transient, optional
         W(t_{k+1}) for step k of N; positive; full matrices symmetric positive definite. Off-diagonal elements
         couple the rows in (10); (11) uses the diagonal. Default ones.
-    additive : {"none", "disturbance", "noise", "both"}
-        Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise).
-        Default: what the signals file says, else none.
+    additive : {"none", "disturbance", "noise", "both"}, optional
+        Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise). Default:
+        what the signals file says, else none.
     operating_point : OperatingPoint, optional
         Steady state and scales; default: those of the transients' signals, or values used as they are.
     transient_weights : sequence of float, optional
@@ -74,13 +74,13 @@ def fit(
         In (10) and (11), every sample weighs the same, or every transient does, however long it is.
     structure : Structure, optional
         Elements that are known, or bounded. Default: the rules of the signals file, if it has any.
-    discard : int or float
+    discard : int or float, default 0
         Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
-        their effect on the objective and listed in `fit["discarded"]`, beside the widths with them.
+        their effect on the objective and listed in `model.fit_summary["discarded"]`, beside the widths with them.
     method : {"working-set", "cvxpy"}
         cvxpy states the whole problem as written (OSQP, HiGHS); slow, without tie-breaks, for comparison.
-    describe_data : bool
-        Say in `fit["messages"]` what the user should know; a fit of many need not.
+    describe_data : bool, default True
+        Say in `model.fit_summary["messages"]` what the user should know; a fit of many need not.
     seek_carriers : bool
         Say there as well which few transitions make a state's envelope much wider than the others need. Takes several
         times as long as the fit; beyond 200 000 transitions it is not sought.
@@ -92,8 +92,8 @@ def fit(
     Returns
     -------
     UncertainLTI
-        With zero training transitions outside its own `bounds`. `fit["messages"]` says in words what the user
-        should know; `fit["gap"]` is the relative distance of the objective from a lower bound of the optimum.
+        With zero training transitions outside its own `bounds`. `fit_summary["messages"]` says in words what the user
+        should know; `fit_summary["gap"]` is the relative distance of the objective from a lower bound of the optimum.
 
     Raises
     ------
@@ -215,12 +215,21 @@ def fit_fleet(
     Parameters
     ----------
     fleet : Fleet
+        The transitions.
     signals : SignalMap
         With the operating point of the normalisation.
-    criterion, structure, method, alarm_rule, progress
-        As in `fit`; method cvxpy takes a fleet of one `Problem`.
+    criterion : {"qp", "lp"}
+        As in `fit`.
+    structure : Structure, optional
+        As in `fit`.
+    method : {"working-set", "cvxpy"}, default "working-set"
+        As in `fit`; cvxpy takes a fleet of one `Problem`.
+    alarm_rule : AlarmRule, optional
+        As in `fit`.
+    progress : callable, optional
+        As in `fit`.
     dt_median : float, optional
-        s.
+        Median step for the model, s; without it no spectral radius is given.
     describe_on : Problem, optional
         What the messages in words are made from: the data, or a part of it.
     transients : sequence of Transient
@@ -230,10 +239,15 @@ def fit_fleet(
     seek_carriers : bool
         As in `fit`.
 
+    Returns
+    -------
+    UncertainLTI
+        As of `fit`.
+
     Raises
     ------
     FitError
-        As in `fit`; InfeasibleError where the structure contradicts a transition.
+        As in `fit`; `InfeasibleError` where the structure contradicts a transition.
     """
     engine = WorkingSet(fleet, structure, progress=progress)
     sums = engine.sums
@@ -306,7 +320,22 @@ def _contradiction(
 
 
 def contradiction_in(error: InfeasibleError, where: str, signals: SignalMap) -> FitError:
-    """The sentence for a transition that the structure cannot contain."""
+    """The error for a transition that the structure cannot contain.
+
+    Parameters
+    ----------
+    error : InfeasibleError
+        What the working set found.
+    where : str
+        Names the transition.
+    signals : SignalMap
+        Names the state, and gives its scale.
+
+    Returns
+    -------
+    FitError
+        To be raised.
+    """
     signal = signals.states[error.row]
     distance = error.distance * float(signal.scale)
     return FitError(

@@ -40,7 +40,18 @@ class Fleet:
 
     @classmethod
     def of(cls, problem: Problem) -> Fleet:
-        """A problem in memory, in as many parts as there are cores where it is large."""
+        """A problem in memory, in as many parts as there are cores where it is large.
+
+        Parameters
+        ----------
+        problem : Problem
+            The data.
+
+        Returns
+        -------
+        Fleet
+            Parts without a copy.
+        """
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         count = min(cores, problem.N // _WORTH_A_THREAD)
         if count < 2:
@@ -61,7 +72,20 @@ class Fleet:
         return first if first.ndim == 1 else None
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
-        """function(partition, *arguments of that partition) for every partition, in order."""
+        """function(partition, *arguments of that partition) for every partition.
+
+        Parameters
+        ----------
+        function : callable
+            Takes a partition and its arguments.
+        arguments : sequence of tuple of object
+            One tuple per partition.
+
+        Returns
+        -------
+        list of T
+            Results, in the order of the partitions.
+        """
         if self._threads == 1:
             return [function(part, *args) for part, args in zip(self.partitions, arguments, strict=True)]
         with ThreadPoolExecutor(self._threads) as pool:
@@ -72,7 +96,20 @@ class Fleet:
         return [arguments] * len(self.counts)
 
     def moments(self, stride: int) -> tuple[Moments, list[Samples]]:
-        """Sums over all transitions, and every stride-th transition per row."""
+        """One pass for sums over all transitions, and a sample of them.
+
+        Parameters
+        ----------
+        stride : int
+            Every stride-th transition is sampled; 0 for none.
+
+        Returns
+        -------
+        Moments
+            Sums over all partitions.
+        list of Samples
+            One per row.
+        """
         results = self.map(passes.moments, [(offset, stride) for offset in self.offsets])
         total = results[0][0]
         for sums, _ in results[1:]:
@@ -80,7 +117,18 @@ class Fleet:
         return total, [Samples.join([r[1][i] for r in results], self.p) for i in range(self.n)]
 
     def scan(self, candidate: Candidate) -> list[tuple[Samples, float]]:
-        """Per row the samples of least slack, and the reach below which none is missing."""
+        """One pass for the samples of least slack; see `passes.scan`.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            The solution to check.
+
+        Returns
+        -------
+        list of (Samples, float)
+            Per row the samples, and the reach below which none is missing.
+        """
         results = self.map(passes.scan, [(candidate, offset) for offset in self.offsets])
         rows = []
         for i in range(self.n):
@@ -88,16 +136,43 @@ class Fleet:
         return rows
 
     def judge(self, model: UncertainLTI) -> Judged:
-        """What the bounds of a model are on all transitions, by the verdict's own arithmetic."""
+        """What the bounds of a model are on all transitions, by the verdict's own arithmetic.
+
+        Parameters
+        ----------
+        model : UncertainLTI
+            The model.
+
+        Returns
+        -------
+        Judged
+            Over all partitions.
+        """
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
 
     def moving_from_rest(self) -> tuple[int, int, float]:
-        """Samples with x = u = 0 and a successor that is not: how many, and the state that moves most and how far."""
+        """Samples with x = u = 0 and a successor that is not 0.
+
+        Returns
+        -------
+        int
+            How many.
+        int
+            The state that moves most.
+        float
+            How far, normalised.
+        """
         results = self.map(passes.moving_from_rest, self._same())
         _, state, step = max(results, key=lambda r: r[2])
         return sum(r[0] for r in results), state, step
 
     def median_dt(self) -> float:
-        """Median of Δt, s."""
+        """Median step.
+
+        Returns
+        -------
+        float
+            Δt, s.
+        """
         return float(np.median(np.concatenate(self.map(passes.steps, self._same()))))

@@ -1,4 +1,4 @@
-"""Criteria (10) and (11) as METHOD.md writes them, in cvxpy: for off-diagonal weights at small size, and as oracle."""
+"""Criteria (10) and (11) as written (docs/theory.md), in cvxpy: for full weights at small size, and as oracle."""
 
 from __future__ import annotations
 
@@ -17,16 +17,20 @@ def solve(problem: Problem, criterion: str, solver: str | None = None, **options
     Parameters
     ----------
     problem : Problem
-    criterion : {"qp", "lp"}
+        The data.
+    criterion : str
+        Eq. (10) or eq. (11).
     solver : str, optional
         A cvxpy solver; default OSQP (scaled, tight, polished) for (10) and HiGHS for (11).
-    **options
+    **options : object
         Passed to the solver.
 
     Returns
     -------
     theta : array (r, n)
+        Nominal elements, one column per row of the model, 1/s.
     d : array (q, n)
+        Half-widths likewise.
     objective : array
         (1,), the value of (10), or (n,), δ of every row of (11). Ties are not broken.
 

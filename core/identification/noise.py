@@ -18,21 +18,53 @@ _OWN = 0.3
 
 @dataclass(frozen=True)
 class Memory:
-    """Shares of variance predicted one sample ahead, and the fastest mode that does not come from measurement noise.
+    """What a state's own past says of its next sample.
 
-    predicted (n,): by least squares on the sample before and its control; fastest: |1 - eigenvalue| of the step.
+    Parameters
+    ----------
+    predicted : array (n,)
+        Share of variance that least squares on the sample before and its control predicts one sample ahead.
+    fastest : float
+        |1 - eigenvalue| of the fastest mode of the step that does not come from measurement noise; inf where too few
+        samples follow one another.
     """
 
     predicted: Array
     fastest: float
 
     def like_noise(self, state: int) -> bool:
-        """Whether the state moves like noise."""
+        """Whether the state moves like noise.
+
+        Parameters
+        ----------
+        state : int
+            Position of the state.
+
+        Returns
+        -------
+        bool
+            True where less than NOISE of its variance is predicted.
+        """
         return bool(self.predicted[state] < NOISE)
 
 
 def predicted(X: Array, U: Array, after: Array) -> Array:
-    """Share of the variance of `after` (N, k) that least squares on [X (N, n), U (N, m), 1] predicts, (k,)."""
+    """Share of the variance that least squares on [X, U, 1] predicts.
+
+    Parameters
+    ----------
+    X : array (N, n)
+        Regressors.
+    U : array (N, m)
+        Further regressors.
+    after : array (N, k)
+        Targets.
+
+    Returns
+    -------
+    array (k,)
+        At most 1; without the share that any regressor explains by chance, so that it can be negative.
+    """
     design = np.column_stack([X, U, np.ones(len(X))])
     design = design / np.maximum(np.abs(design).max(axis=0), 1e-300)
     rest = after - design @ np.linalg.lstsq(design, after, rcond=None)[0]
@@ -48,6 +80,16 @@ def memory(problem: Problem) -> Memory:
     Noise on a measured state makes least squares believe that it decays within a step. The sample before, as an
     instrument, carries the state and none of that noise; a mode is fast where both ways say so of a state that is
     predicted at all.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+
+    Returns
+    -------
+    Memory
+        Of each state, and of the fastest mode.
     """
     n, p = problem.n, problem.p
     share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)

@@ -17,10 +17,32 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 class Moments:
     """Sums over all transitions, which the objectives need whatever N is; they add up over partitions.
 
-    gram: (n, q, q), Σ w_ii (Δt ψ)(Δt ψ)ᵀ per row where weights differ between samples, else None; plain_gram (q, q),
-    the same without weights; coupled (n q, n q) for full weights, else None. centre (r, r) and target (r, n), the
-    normal equations of the unweighted squared distance of the bounds' centre; rate_square (n,), Σ (x_next - x)².
-    width_sum (q,), Σ Δt ψ. low, high (p,): ranges of z; dt_min, dt_max; count: transitions.
+    Parameters
+    ----------
+    plain_gram : array (q, q)
+        Σ (Δt ψ)(Δt ψ)ᵀ.
+    gram : array (n, q, q) or None
+        The same per row, weighted by w_ii; None where weights do not differ between samples.
+    coupled : array (n q, n q) or None
+        The same for full weights; None otherwise.
+    centre : array (r, r)
+        Σ (Δt φ)(Δt φ)ᵀ, the normal equations of the unweighted squared distance of the bounds' centre.
+    target : array (r, n)
+        Their right-hand sides, one per row of the model.
+    rate_square : array (n,)
+        Σ (x_next - x)².
+    width_sum : array (q,)
+        Σ Δt ψ.
+    low : array (p,)
+        Least z.
+    high : array (p,)
+        Greatest z.
+    dt_min : float
+        Shortest step, s.
+    dt_max : float
+        Longest step, s.
+    count : int
+        Number of transitions.
     """
 
     plain_gram: Array
@@ -121,9 +143,28 @@ def _product(matrix: Array, columns: Array) -> Array:
 
 
 def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Samples]]:
-    """One pass for everything in `Moments`, and every stride-th transition of the whole (none where stride is 0).
+    """One pass for everything in `Moments`, and a sample of the transitions.
 
-    offset: number of transitions in the partitions before this one. The samples are returned per row.
+    Parameters
+    ----------
+    part : Partition
+        The transitions.
+    offset : int, default 0
+        Number of transitions in the partitions before this one.
+    stride : int, default 0
+        Every stride-th transition of the whole is sampled; 0 for none.
+
+    Returns
+    -------
+    Moments
+        Sums.
+    list of Samples
+        One per row.
+
+    Raises
+    ------
+    ValueError
+        The partition has no transition.
     """
     columns, n, p = part.columns, part.n, part.p
     q = p + columns.disturbance + columns.noise
@@ -186,7 +227,21 @@ def _per_row(blocks: list[Block], index: list[Index], n: int, p: int) -> list[Sa
 
 @dataclass(frozen=True)
 class Samples:
-    """Some transitions as one row sees them: index (K,) among all, z (p, K), rate (K,), dt (K,), √w_ii (K,)."""
+    """Some transitions as one row sees them.
+
+    Parameters
+    ----------
+    index : array (K,) of int
+        Position among all transitions.
+    z : array (p, K)
+        [x; u].
+    rate : array (K,)
+        (x_next - x) / Δt of the row, 1/s.
+    dt : array (K,)
+        Δt, s.
+    root_weight : array (K,)
+        √w_ii.
+    """
 
     index: Index
     z: Array
@@ -204,7 +259,20 @@ class Samples:
 
     @classmethod
     def join(cls, parts: Sequence[Samples], p: int) -> Samples:
-        """All of them, in order of index, each index once."""
+        """All of them, in order of index, each index once.
+
+        Parameters
+        ----------
+        parts : sequence of Samples
+            Of one row.
+        p : int
+            Number of states and controls.
+
+        Returns
+        -------
+        Samples
+            In order of index, each index once.
+        """
         parts = [s for s in parts if len(s)]
         if not parts:
             nothing = np.empty(0)
@@ -235,11 +303,26 @@ def _take(block: Block, i: int, chosen: Index, offset: int) -> Samples:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A solution to hold against all samples, and the units in which its slack is measured.
+    """A solution to check on all samples, and the units in which its slack is measured.
 
-    theta (r, n), d (q, n); size_unit (q,): size of a sample is size_unit·ψ; scale (n,): slack of row i is divided by
-    size x scale_i. limit (n,): δ of (11), or None. Samples are wanted that have less slack than reach (n,) from leaving
-    the bounds, or than room (n,) from being wider than the limit; most: so many of them per row at most.
+    Parameters
+    ----------
+    theta : array (r, n)
+        Nominal elements, one column per row of the model, 1/s.
+    d : array (q, n)
+        Half-widths likewise.
+    size_unit : array (q,)
+        The size of a sample is size_unit·ψ.
+    scale : array (n,)
+        Slack of row i is divided by size x scale_i.
+    limit : array (n,) or None
+        δ of (11); None for (10).
+    reach : array (n,)
+        Samples are wanted that have less slack than this from leaving the bounds.
+    room : array (n,)
+        And those that have less slack than this from being wider than the limit.
+    most : int
+        Samples per row at most.
     """
 
     theta: Array
@@ -253,11 +336,25 @@ class Candidate:
 
 
 def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[Samples, float]]:
-    """Samples whose slack is below the reach, per row, and the reach that held to the end: one pass.
+    """Samples whose slack is below the reach, per row: one pass.
 
     The slack of a sample is its distance from leaving the bounds (8)(9), or from being wider than (11) allows, in
     scaled units; negative where it is outside. Where more than `most` samples of a row qualify, those of least slack
     are returned, and the reach is the least slack of the others.
+
+    Parameters
+    ----------
+    part : Partition
+        The transitions.
+    candidate : Candidate
+        The solution to check.
+    offset : int, default 0
+        Number of transitions in the partitions before this one.
+
+    Returns
+    -------
+    list of (Samples, float)
+        Per row the samples, and the reach that held to the end.
     """
     columns = part.columns
     theta, d = np.ascontiguousarray(candidate.theta.T), np.ascontiguousarray(candidate.d.T)
@@ -333,8 +430,17 @@ def _least(
 
 @dataclass(frozen=True)
 class Judged:
-    """What the bounds of a model are on transitions, each (n,): how many are outside by row, the largest width per
-    step, and the largest √w_ii x width, normalised."""
+    """What the bounds of a model are on transitions.
+
+    Parameters
+    ----------
+    outside : array (n,) of int
+        Transitions outside, by row.
+    largest : array (n,)
+        Largest width per step, normalised.
+    weighted : array (n,)
+        Largest √w_ii x width, normalised.
+    """
 
     outside: NDArray[np.intp]
     largest: Array
@@ -349,7 +455,20 @@ class Judged:
 
 
 def judge(part: Partition, model: UncertainLTI) -> Judged:
-    """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`."""
+    """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`.
+
+    Parameters
+    ----------
+    part : Partition
+        The transitions.
+    model : UncertainLTI
+        The model.
+
+    Returns
+    -------
+    Judged
+        Outside is 0 where every transition is contained.
+    """
     zeros = np.zeros(part.n)
     total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
     for block in _pieces(part):
@@ -368,7 +487,22 @@ def judge(part: Partition, model: UncertainLTI) -> Judged:
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:
-    """Samples with x = u = 0 and a successor that is not: how many, and the state that moves most and how far."""
+    """Samples with x = u = 0 and a successor that is not 0.
+
+    Parameters
+    ----------
+    part : Partition
+        The transitions.
+
+    Returns
+    -------
+    int
+        How many.
+    int
+        The state that moves most.
+    float
+        How far, normalised.
+    """
     count, state, step = 0, 0, 0.0
     for block in part.blocks():
         rest = ~block.z.any(axis=0)
@@ -381,5 +515,16 @@ def moving_from_rest(part: Partition) -> tuple[int, int, float]:
 
 
 def steps(part: Partition) -> Array:
-    """Δt of every transition, (N,)."""
+    """Step of every transition.
+
+    Parameters
+    ----------
+    part : Partition
+        The transitions.
+
+    Returns
+    -------
+    array (N,)
+        Δt, s.
+    """
     return np.concatenate([block.dt for block in part.blocks()])

@@ -23,14 +23,35 @@ BLOCK = 16384
 
 @dataclass(frozen=True)
 class Columns:
-    """Which terms are unknown besides A, B, ΔA, ΔB."""
+    """Which terms are unknown besides A, B, ΔA, ΔB.
+
+    Parameters
+    ----------
+    drift : bool
+        c is unknown.
+    disturbance : bool
+        dc is unknown.
+    noise : bool
+        v is unknown.
+    """
 
     drift: bool  # c
     disturbance: bool  # dc
     noise: bool  # v
 
     def unknowns(self, p: int) -> int:
-        """Number of unknowns per row with p states and controls."""
+        """Number of unknowns per row with p states and controls.
+
+        Parameters
+        ----------
+        p : int
+            Number of states and controls.
+
+        Returns
+        -------
+        int
+            Unknowns per row, nominal elements and half-widths.
+        """
         return 2 * p + self.drift + self.disturbance + self.noise
 
     @classmethod
@@ -39,6 +60,23 @@ class Columns:
 
         With a constant Δt, Δt·dc + v is one number: v takes it and dc is 0, because v is the one that still
         holds when another recording has another Δt.
+
+        Parameters
+        ----------
+        additive : Additive
+            The option of `fit`.
+        constant_dt : bool
+            Whether all steps are equal.
+
+        Returns
+        -------
+        Columns
+            Terms that are unknown.
+
+        Raises
+        ------
+        FitError
+            There is no such option.
         """
         if additive not in ("none", "disturbance", "noise", "both"):
             raise FitError(f"additive is {additive!r}; it must be none, disturbance, noise or both")
@@ -48,7 +86,21 @@ class Columns:
 
 @dataclass(frozen=True)
 class Block:
-    """Some transitions in columns: z (p, K) = [x; u], x_next (n, K), dt (K,); weights (n,), (K, n) or (K, n, n)."""
+    """Some transitions in columns.
+
+    Parameters
+    ----------
+    start : int
+        Position of the first among those of the partition.
+    z : array (p, K)
+        [x; u].
+    x_next : array (n, K)
+        Next states.
+    dt : array (K,)
+        Δt, s.
+    weights : array (n,), (K, n) or (K, n, n)
+        W(t_{k+1}).
+    """
 
     start: int
     z: Array
@@ -65,29 +117,83 @@ class Block:
         return len(self.x_next)
 
     def piece(self, start: int, stop: int) -> Block:
-        """Some consecutive transitions, without a copy."""
+        """Some consecutive transitions, without a copy.
+
+        Parameters
+        ----------
+        start : int
+            First transition.
+        stop : int
+            First transition after it.
+
+        Returns
+        -------
+        Block
+            Views.
+        """
         weights = self.weights if self.weights.ndim == 1 else self.weights[start:stop]
         part = slice(start, stop)
         return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights)
 
     def every(self, first: int, stride: int) -> Block:
-        """A copy of every stride-th transition from the first."""
+        """A copy of every stride-th transition from the first.
+
+        Parameters
+        ----------
+        first : int
+            First transition.
+        stride : int
+            Distance of those taken.
+
+        Returns
+        -------
+        Block
+            A copy; its start is that of the block.
+        """
         weights = self.weights if self.weights.ndim == 1 else self.weights[first::stride].copy()
         part = slice(first, None, stride)
         return Block(self.start, self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy(), weights)
 
     def rate(self) -> Array:
-        """(x_next - x) / Δt, 1/s, (n, K)."""
+        """(x_next - x) / Δt.
+
+        Returns
+        -------
+        array (n, K)
+            1/s.
+        """
         rate = self.x_next - self.z[: self.n]
         rate /= self.dt
         return rate
 
     def phi(self, columns: Columns) -> Array:
-        """Regressors of the nominal row, (p [+1], K): z, and 1 for the drift."""
+        """Regressors φ of the nominal row: z, and 1 for the drift.
+
+        Parameters
+        ----------
+        columns : Columns
+            Terms that are unknown.
+
+        Returns
+        -------
+        array (r, K)
+            φ / Δt.
+        """
         return np.vstack([self.z, np.ones(len(self))]) if columns.drift else self.z
 
     def psi(self, columns: Columns) -> Array:
-        """Regressors of the half-width, (p [+1] [+1], K): |z|, 1 for dc, 1/Δt for v."""
+        """Regressors ψ of the half-width: |z|, 1 for dc, 1/Δt for v.
+
+        Parameters
+        ----------
+        columns : Columns
+            Terms that are unknown.
+
+        Returns
+        -------
+        array (q, K)
+            ψ / Δt.
+        """
         p = len(self.z)
         psi = np.empty((p + columns.disturbance + columns.noise, len(self)))
         np.abs(self.z, out=psi[:p])
@@ -98,7 +204,13 @@ class Block:
         return psi
 
     def root_weights(self) -> Array:
-        """√w_ii(t_{k+1}), (n, K) or (n, 1)."""
+        """Roots of the diagonal weights.
+
+        Returns
+        -------
+        array (n, K) or (n, 1)
+            √w_ii(t_{k+1}).
+        """
         if self.weights.ndim == 1:
             return np.sqrt(self.weights)[:, None]
         diagonal = np.diagonal(self.weights, axis1=1, axis2=2) if self.weights.ndim == 3 else self.weights
@@ -142,7 +254,13 @@ class Partition(Protocol):
         ...
 
     def blocks(self) -> Iterator[Block]:
-        """All transitions, in blocks that stay in the cache."""
+        """All transitions, in blocks that stay in the cache.
+
+        Returns
+        -------
+        iterator of Block
+            In order.
+        """
         ...
 
 
@@ -150,8 +268,22 @@ class Partition(Protocol):
 class Problem:
     """A `Partition` in memory, of all recordings.
 
-    z_columns (p, N), next_columns (n, N): samples in columns; dt (N,); weights (n,), (N, n) or (N, n, n). source (N,)
-    and k (N,) say which transient and sample a transition comes from.
+    Parameters
+    ----------
+    z_columns : array (p, N)
+        [x; u], samples in columns.
+    next_columns : array (n, N)
+        Next states, samples in columns.
+    dt : array (N,)
+        Δt, s.
+    source : array (N,) of int
+        Transient that a transition comes from.
+    k : array (N,) of int
+        Its sample in that transient.
+    weights : array (n,), (N, n) or (N, n, n)
+        W(t_{k+1}).
+    columns : Columns
+        Terms that are unknown.
     """
 
     z_columns: Array
@@ -188,29 +320,90 @@ class Problem:
         return self.next_columns.T
 
     def block(self, part: slice) -> Block:
-        """Transitions of a slice, without a copy."""
+        """Transitions of a slice, without a copy.
+
+        Parameters
+        ----------
+        part : slice
+            With a step of 1.
+
+        Returns
+        -------
+        Block
+            Views.
+        """
         weights = self.weights if self.weights.ndim == 1 else self.weights[part]
         return Block(part.start or 0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights)
 
     def blocks(self) -> Iterator[Block]:
-        """All transitions, in blocks that stay in the cache."""
+        """All transitions, in blocks that stay in the cache.
+
+        Yields
+        ------
+        Block
+            Up to BLOCK transitions.
+        """
         for start in range(0, self.N, BLOCK):
             yield self.block(slice(start, min(start + BLOCK, self.N)))
 
     def rate(self, part: slice = slice(None)) -> Array:
-        """(x_next - x) / Δt with samples in rows, 1/s, (K, n)."""
+        """(x_next - x) / Δt with samples in rows.
+
+        Parameters
+        ----------
+        part : slice, optional
+            Transitions; default all.
+
+        Returns
+        -------
+        array (K, n)
+            1/s.
+        """
         return ((self.next_columns[:, part] - self.z_columns[: self.n, part]) / self.dt[part]).T
 
     def phi(self, part: slice = slice(None)) -> Array:
-        """Regressors of the nominal row with samples in rows, (K, r)."""
+        """Regressors of the nominal row with samples in rows.
+
+        Parameters
+        ----------
+        part : slice, optional
+            Transitions; default all.
+
+        Returns
+        -------
+        array (K, r)
+            As of `Block.phi`.
+        """
         return self._rows(part).phi(self.columns).T
 
     def psi(self, part: slice = slice(None)) -> Array:
-        """Regressors of the half-width with samples in rows, (K, q)."""
+        """Regressors of the half-width with samples in rows.
+
+        Parameters
+        ----------
+        part : slice, optional
+            Transitions; default all.
+
+        Returns
+        -------
+        array (K, q)
+            As of `Block.psi`.
+        """
         return self._rows(part).psi(self.columns).T
 
     def row_weights(self, part: slice = slice(None)) -> Array:
-        """w_ii(t_{k+1}) with samples in rows, (K, n)."""
+        """Diagonal weights with samples in rows.
+
+        Parameters
+        ----------
+        part : slice, optional
+            Transitions; default all.
+
+        Returns
+        -------
+        array (K, n)
+            w_ii(t_{k+1}).
+        """
         return np.broadcast_to(self._rows(part).root_weights().T ** 2, (len(self.dt[part]), self.n))
 
     def _rows(self, part: slice) -> Block:
@@ -218,7 +411,18 @@ class Problem:
         return Block(0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights)
 
     def subset(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Problem:
-        """The same problem on some transitions; a slice is no copy."""
+        """The same problem on some transitions; a slice is no copy.
+
+        Parameters
+        ----------
+        index : array of int or bool, or slice
+            Transitions.
+
+        Returns
+        -------
+        Problem
+            With the same columns.
+        """
         weights = self.weights if self.weights.ndim == 1 else self.weights[index]
         return Problem(
             self.z_columns[:, index],
@@ -231,14 +435,36 @@ class Problem:
         )
 
     def without(self, index: NDArray[np.intp]) -> Problem:
-        """The same problem without some transitions."""
+        """The same problem without some transitions.
+
+        Parameters
+        ----------
+        index : array of int
+            Transitions.
+
+        Returns
+        -------
+        Problem
+            A copy of the others.
+        """
         keep = np.ones(self.N, dtype=bool)
         keep[index] = False
         return self.subset(keep)
 
 
 def is_constant(dt: Array) -> bool:
-    """All steps are equal to a part in 1e6 (an integer clock jitters by a nanosecond)."""
+    """Whether all steps are equal to a part in 1e6 (an integer clock jitters by a nanosecond).
+
+    Parameters
+    ----------
+    dt : array (N,)
+        Steps, s.
+
+    Returns
+    -------
+    bool
+        True without a step.
+    """
     return bool(np.ptp(dt) <= 1e-6 * np.median(dt)) if dt.size else True
 
 
@@ -256,16 +482,24 @@ def assemble(
     Parameters
     ----------
     transients : sequence of Transient
+        The recordings.
     point : OperatingPoint
-    weights : None, (n,), (N, n), (N, n, n), or one such array per transient
-        N counts the steps of a transient (samples less one), usable or not.
-    additive : {"none", "disturbance", "noise", "both"}
+        The normalisation.
+    weights : array (n,), (N, n), (N, n, n), or one of the latter two per transient, or None
+        W(t_{k+1}); N counts the steps of a transient (samples less one), usable or not. None for ones.
+    additive : Additive
+        Terms besides A and B.
     empty : bool
         No transition at all is no error.
     transient_weights : sequence of float, optional
         One factor per transient on all its weights.
     count : {"sample", "transient"}
         Every transition weighs the same, or every transient does, however long it is.
+
+    Returns
+    -------
+    Problem
+        Normalised.
 
     Raises
     ------

@@ -34,13 +34,21 @@ def repair(
     ----------
     build : callable
         (theta (r, n), d (q, n)) -> UncertainLTI.
-    fleet, sums : of the fit
-    theta, d : array (r, n), (q, n)
+    fleet : Fleet
+        The data of the fit.
+    sums : Moments
+        Of the fit.
+    theta : array (r, n)
+        Nominal elements, 1/s.
+    d : array (q, n)
+        Half-widths of the solver.
     violation : array (n,)
+        Largest violation that the solver left, in scaled units.
 
     Returns
     -------
     model : UncertainLTI
+        With the lifted half-widths.
     d : array (q, n)
         Lifted.
     judged : Judged

@@ -22,7 +22,20 @@ STALE = 0.01
 
 
 def quantised(problem: Problem, signals: Sequence[Signal]) -> list[str]:
-    """States recorded in steps that are not small against what they move by from sample to sample."""
+    """States recorded in steps that are not small against what they move by from sample to sample.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    signals : sequence of Signal
+        States, then controls.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
     messages = []
     for i, signal in enumerate(signals[: problem.n]):
         x = problem.z[:, i]
@@ -50,7 +63,20 @@ def quantised(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 
 
 def held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
-    """States that repeat their last value between samples of a slower topic."""
+    """States that repeat their last value between samples of a slower topic.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    signals : sequence of Signal
+        States, then controls.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
     messages = []
     follows = successive(problem)
     for i, signal in enumerate(signals[: problem.n]):
@@ -71,7 +97,22 @@ def held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 
 
 def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Transient]) -> list[str]:
-    """States that stand at exactly one value for long while the other signals move."""
+    """States that stand at exactly one value for long while the other signals move.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    signals : sequence of Signal
+        States, then controls.
+    transients : sequence of Transient
+        The recordings, for their names.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
     messages = []
     for i, signal in enumerate(signals[: problem.n]):
         still = problem.x_next[:, i] == problem.z[:, i]
@@ -104,7 +145,24 @@ def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Tra
 
 
 def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Sequence[Transient]) -> list[str]:
-    """Controls that were too old for many samples, or that ended long before the recording did."""
+    """Controls that were too old for many samples, or that ended long before the recording did.
+
+    Parameters
+    ----------
+    signals : sequence of Signal
+        States, then controls.
+    n : int
+        Number of states.
+    problem : Problem
+        The data.
+    transients : sequence of Transient
+        The recordings, with what the sampler counted.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
     messages = []
     samples = sum(len(t) for t in transients)
     old: dict[tuple[int, float | None], list[str]] = {}
@@ -138,7 +196,20 @@ def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Seque
 
 
 def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
-    """Controls that explain the states better when taken some samples earlier."""
+    """Controls that explain the states better when taken some samples earlier.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    signals : sequence of Signal
+        States, then controls.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
     n, p = problem.n, problem.p
     follows = successive(problem)
     joined = np.zeros(problem.N, dtype=bool)
@@ -163,10 +234,23 @@ def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 
 
 def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int, float]]:
-    """Controls by number that explain the states clearly better some samples earlier: by how many, and how much.
+    """Controls that explain the states clearly better some samples earlier.
 
-    x, increment (n, N): states and what they change by in a step of dt (N,); u (lags + 1, m, N): the controls so many
-    samples before. The share is by how much less of an increment is left unexplained (root mean square).
+    Parameters
+    ----------
+    x : array (n, N)
+        States.
+    u : array (lags + 1, m, N)
+        Controls so many samples before.
+    increment : array (n, N)
+        What the states change by in a step.
+    dt : array (N,)
+        Step, s.
+
+    Returns
+    -------
+    dict of int to (int, float)
+        Control -> samples earlier, and the share by which less of an increment is left unexplained (root mean square).
     """
     n, N = x.shape
     longest, m = len(u) - 1, u.shape[1]

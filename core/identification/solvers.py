@@ -20,9 +20,17 @@ FEASIBLE = 1e-9
 
 @dataclass(frozen=True)
 class Answer:
-    """Minimiser ξ (variables,) of a programme, who found it, and what is active of [bounds of ξ; rows of G].
+    """Minimiser ξ of a programme.
 
-    active: 0 not, 1 at the upper, 3 at the lower bound (DAQP's words); None where the solver does not say.
+    Parameters
+    ----------
+    xi : array (variables,)
+        ξ.
+    solver : str
+        Who found it.
+    active : array of int, or None
+        Of [bounds of ξ; rows of G]: 0 not active, 1 at the upper, 3 at the lower bound (DAQP's words); None where the
+        solver does not say.
     """
 
     xi: Array
@@ -47,10 +55,27 @@ def solve_qp(
 
     Parameters
     ----------
+    H : array (v, v)
+        Positive definite.
+    f : array (v,)
+        Linear term.
+    G : array (K, v)
+        Rows of the constraints.
+    h : array (K,)
+        Their lower limits.
+    lower : array (v,)
+        Bounds of ξ; -inf for none.
+    upper : array (v,)
+        Bounds of ξ; inf for none.
     active : array of int, optional
         `Answer.active` of a programme like this one, to start from.
     any_solver : bool
         The others may try where DAQP gives up.
+
+    Returns
+    -------
+    Answer
+        The answer of least violation.
 
     Raises
     ------
@@ -145,6 +170,28 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
     ξ; those that balance the gradient there, Cᵀλ = f + Hξ, give a tight one where ξ is optimal. They are found by
     least squares, in the units of the gradient and in those of L, of which either can be the better. -inf where
     there are none.
+
+    Parameters
+    ----------
+    H : array (v, v)
+        As in `solve_qp`.
+    f : array (v,)
+        As in `solve_qp`.
+    G : array (K, v)
+        As in `solve_qp`.
+    h : array (K,)
+        As in `solve_qp`.
+    lower : array (v,)
+        As in `solve_qp`.
+    upper : array (v,)
+        As in `solve_qp`.
+    xi : array (v,)
+        ξ, near the optimum.
+
+    Returns
+    -------
+    float
+        The bound, or -inf.
     """
     from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
@@ -176,7 +223,12 @@ class Simplex:
 
     Parameters
     ----------
-    cost, lower, upper : array (variables,)
+    cost : array (variables,)
+        Linear objective.
+    lower : array (variables,)
+        Bounds of ξ; -inf for none.
+    upper : array (variables,)
+        Bounds of ξ; inf for none.
     """
 
     def __init__(self, cost: Array, lower: Array, upper: Array) -> None:
@@ -200,7 +252,15 @@ class Simplex:
             self._highs.changeColCost(self._highs.getNumCol() - 1, c)
 
     def add(self, rows: Array, h: Array) -> None:
-        """Add rows·ξ >= h; rows (K, variables), h (K,)."""
+        """Add rows·ξ >= h.
+
+        Parameters
+        ----------
+        rows : array (K, variables)
+            Rows of the constraints.
+        h : array (K,)
+            Their lower limits.
+        """
         count = len(rows)
         starts = np.arange(count, dtype=np.int32) * self._size
         index = np.tile(np.arange(self._size, dtype=np.int32), count)
@@ -209,16 +269,41 @@ class Simplex:
         )
 
     def hold(self, rows: Iterable[int], h: Iterable[float]) -> None:
-        """Ask rows·ξ >= h of these rows from now on; -inf asks nothing."""
+        """Ask rows·ξ >= h of rows that are there already.
+
+        Parameters
+        ----------
+        rows : iterable of int
+            Numbers of the rows.
+        h : iterable of float
+            Their lower limits; -inf asks nothing.
+        """
         for row, least in zip(rows, h, strict=True):
             self._highs.changeRowBounds(row, max(least, -self._infinity), self._infinity)
 
     def duals(self) -> Array:
-        """What the optimum found last would fall by, per unit of h, for each row."""
+        """What the optimum found last would rise by, per unit by which h rises.
+
+        Returns
+        -------
+        array (rows,)
+            One per row.
+        """
         return np.asarray(self._highs.getSolution().row_dual, dtype=np.float64)
 
     def solve(self) -> Array:
-        """Optimal ξ; raises FitError where there is none."""
+        """Minimise.
+
+        Returns
+        -------
+        array (variables,)
+            Optimal ξ.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
         self._highs.run()
         if self._highs.getModelStatus() != self._optimal:
             self._highs.clearSolver()  # a warm start can go astray; from scratch then

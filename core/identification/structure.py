@@ -20,13 +20,17 @@ class Structure:
 
     Parameters
     ----------
-    n, m : int
-        Numbers of states and controls.
+    n : int
+        Number of states.
+    m : int
+        Number of controls.
     fixed : mapping, optional
         From "A", "B", "c", "dA", "dB", "dc" or "v" to an array of that shape: a number fixes the element, NaN leaves
         it free.
-    lower, upper : mapping, optional
-        The same for bounds; NaN for none. A sign constraint is a bound of 0. Half-widths are never below 0.
+    lower : mapping of str to ArrayLike, optional
+        Lower bounds by the same names; NaN for none. A sign constraint is a bound of 0. Half-widths are never below 0.
+    upper : mapping of str to ArrayLike, optional
+        Upper bounds likewise.
 
     Raises
     ------
@@ -91,6 +95,22 @@ class Structure:
         `*` for every state and control), and says `nominal` and/or `half_width`: a number, or {min: a, max: b}.
         A later rule overrides an earlier one.
 
+        Parameters
+        ----------
+        rules : object
+            The list.
+        states : sequence of str
+            Names.
+        controls : sequence of str
+            Names.
+        source : str, default "structure"
+            What errors call the list.
+
+        Returns
+        -------
+        Structure
+            The structure.
+
         Raises
         ------
         FitError
@@ -135,7 +155,13 @@ class Structure:
         return cls(n, m, lower=structure.lower, upper=structure.upper)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for the model file; null for no bound."""
+        """Plain data for the model file; null for no bound.
+
+        Returns
+        -------
+        dict
+            `lower` and `upper`, each by the names of `Structure`.
+        """
 
         def plain(values: Any) -> Any:
             return [plain(v) for v in values] if isinstance(values, list) else values if math.isfinite(values) else None
@@ -147,7 +173,27 @@ class Structure:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], n: int, m: int) -> Structure:
-        """From `to_dict`; raises FitError."""
+        """From what `to_dict` returned.
+
+        Parameters
+        ----------
+        data : mapping of str to object
+            Of a model file.
+        n : int
+            Number of states.
+        m : int
+            Number of controls.
+
+        Returns
+        -------
+        Structure
+            The structure.
+
+        Raises
+        ------
+        FitError
+            It is not of that form.
+        """
 
         def arrays(side: str) -> dict[str, Array]:
             try:
@@ -159,7 +205,27 @@ class Structure:
         return cls(n, m, lower=shaped["lower"], upper=shaped["upper"])
 
     def stacked(self, drift: bool, disturbance: bool, noise: bool) -> tuple[Array, Array, Array, Array]:
-        """Bounds in the order of the unknowns: theta lower, upper (r, n); d lower, upper (q, n).
+        """Bounds in the order of the unknowns.
+
+        Parameters
+        ----------
+        drift : bool
+            The fit has c.
+        disturbance : bool
+            The fit has dc.
+        noise : bool
+            The fit has v.
+
+        Returns
+        -------
+        array (r, n)
+            Lower bounds of theta.
+        array (r, n)
+            Upper bounds of theta.
+        array (q, n)
+            Lower bounds of d.
+        array (q, n)
+            Upper bounds of d.
 
         Raises
         ------

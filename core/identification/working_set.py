@@ -43,11 +43,28 @@ _JOIN = 48  # samples that join a working set per round, at least; more where th
 
 @dataclass
 class Solution:
-    """theta (r, n) and d (q, n), one column per row of the model, and how they were found.
+    """Elements, one column per row of the model, and how they were found.
 
-    violation (n,): largest violation left, in scaled units; delta (n,): optimum of (11) on the working set, a lower
-    bound of the optimum over all samples; None for (10). gap: how far (10) is above a lower bound of its optimum at
-    most, relative, by the dual objective; None for (11).
+    Parameters
+    ----------
+    theta : array (r, n)
+        Nominal elements, 1/s.
+    d : array (q, n)
+        Half-widths.
+    violation : array (n,)
+        Largest violation left, in scaled units.
+    delta : array (n,) or None, optional
+        Optimum of (11) on the working set, a lower bound of the optimum over all samples; None for (10).
+    rounds : int, default 0
+        Programmes solved on the working set.
+    passes : int, default 1
+        Passes over all transitions.
+    working : list of int, optional
+        Size of the working set of each row.
+    solvers : set of str, optional
+        Names of those that found it.
+    gap : float or None, optional
+        How far (10) is above a lower bound of its optimum at most, relative, by the dual objective; None for (11).
     """
 
     theta: Array
@@ -65,6 +82,15 @@ class Row:
     """One row of the model in scaled unknowns ξ = [θ d], with the samples held for it and the working set among them.
 
     Elements that the structure fixes, and columns that are 0 in every sample, are no unknowns.
+
+    Parameters
+    ----------
+    i : int
+        Which row of the model.
+    sums : Moments
+        Of all data.
+    bounds : four arrays
+        Of `Structure.stacked`.
     """
 
     def __init__(self, i: int, sums: Moments, bounds: tuple[Array, Array, Array, Array]) -> None:
@@ -119,18 +145,36 @@ class Row:
         return self.r + self.q > 0
 
     def start(self) -> None:
-        """Least squares, and no half-width."""
+        """Start from least squares, with no half-width."""
         answer = np.linalg.lstsq(self.centre + 1e-12 * np.eye(self.r), self.target, rcond=None)[0].astype(np.float64)
         self.store(np.concatenate([np.clip(answer, self.lower[: self.r], self.upper[: self.r]), np.zeros(self.q)]))
 
     def store(self, answer: Array) -> None:
-        """Take scaled unknowns as the row's elements."""
+        """Take scaled unknowns as the row's elements.
+
+        Parameters
+        ----------
+        answer : array (r + q,)
+            Scaled unknowns ξ.
+        """
         self.theta[self.free_phi] = answer[: self.r] * self.unit_phi * self.scale
         d = np.maximum(answer[self.r :], np.maximum(self.lower[self.r :], 0.0))
         self.d[self.free_psi] = d * self.unit_psi * self.scale
 
     def hold(self, samples: Samples, columns_drift: bool, disturbance: bool, noise: bool) -> None:
-        """Hold these samples, beside the working set so far."""
+        """Hold these samples, and the working set so far.
+
+        Parameters
+        ----------
+        samples : Samples
+            Of the last pass.
+        columns_drift : bool
+            The fit has c.
+        disturbance : bool
+            The fit has dc.
+        noise : bool
+            The fit has v.
+        """
         p = len(samples.z)
         kept = self.samples[self.pool]
         self.samples = samples = Samples.join([samples, kept], p)
@@ -149,7 +193,15 @@ class Row:
         self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
 
     def slacks(self) -> tuple[Array, Array | None]:
-        """Slack of every held sample from leaving the bounds, and from being wider than (11) allows, (K,) each."""
+        """Slack of every held sample.
+
+        Returns
+        -------
+        array (K,)
+            From leaving the bounds.
+        array (K,) or None
+            From being wider than (11) allows; None without a limit.
+        """
         theta = self.theta[self.free_phi] / (self.unit_phi * self.scale)
         d = self.d[self.free_psi] / (self.unit_psi * self.scale)
         half = self.psi @ d + self.half
@@ -157,7 +209,13 @@ class Row:
         return inside, None if self.limit is None else self.limit / self.width - half
 
     def slack(self) -> Array:
-        """Slack of every held sample, (K,); see `passes.scan`."""
+        """Slack of every held sample, the lesser of both; see `passes.scan`.
+
+        Returns
+        -------
+        array (K,)
+            Negative where the sample is violated.
+        """
         inside, room = self.slacks()
         return inside if room is None else np.minimum(inside, room)
 
@@ -166,6 +224,18 @@ class Row:
 
         Where the widths of many samples are the largest one, which is so where noise alone makes them, only those
         that are too wide matter.
+
+        Parameters
+        ----------
+        share : float
+            Of all samples.
+
+        Returns
+        -------
+        float
+            Slack from leaving the bounds.
+        float
+            Slack from being too wide.
         """
         inside, room = self.slacks()
         least = 10 * TOLERANCE
@@ -174,7 +244,20 @@ class Row:
         return wanted, min(width, wanted) if width > 1e-6 else 0.0
 
     def widen_pool(self, tolerance: float = TOLERANCE, most: int | None = None) -> bool:
-        """Let the most violated held samples join the working set; False where there is none to join."""
+        """Let the most violated held samples join the working set.
+
+        Parameters
+        ----------
+        tolerance : float, optional
+            Violation that is accepted, in scaled units; default TOLERANCE.
+        most : int, optional
+            Samples at most; default twice the unknowns, or a fixed number if that is more.
+
+        Returns
+        -------
+        bool
+            False where there is none to join.
+        """
         slack = self.slack()
         slack[self.pool] = np.inf
         outside = np.flatnonzero(slack < -tolerance)
@@ -185,13 +268,45 @@ class Row:
         return len(outside) > 0
 
     def containment(self, pool: Index) -> tuple[Array, Array]:
-        """G ξ >= h: (8) and (9) for samples of the pool."""
+        """Containment (8)(9) of some samples as G ξ >= h.
+
+        Parameters
+        ----------
+        pool : array of int
+            Positions among the held samples.
+
+        Returns
+        -------
+        array (2 K, r + q)
+            G.
+        array (2 K,)
+            h.
+        """
         phi, psi = self.phi[pool], self.psi[pool]
         y, half = self.y[pool], self.half[pool]
         return np.vstack([np.hstack([phi, psi]), np.hstack([-phi, psi])]), np.concatenate([y - half, -y - half])
 
     def hessian(self, gram: Array, linear: Array, tie_break: float, ridge: float = 1e-10) -> tuple[Array, Array]:
-        """Squared widths, plus the tie-break on the centre, with a ridge for what moves together in every sample."""
+        """Objective of squared widths, plus the tie-break on the centre.
+
+        Parameters
+        ----------
+        gram : array (q, q)
+            Quadratic term of the half-widths.
+        linear : array (q,)
+            Their linear term.
+        tie_break : float
+            Weight of the centre, relative to the least diagonal element of `gram`.
+        ridge : float, default 1e-10
+            Added to the centre's diagonal, for what moves together in every sample.
+
+        Returns
+        -------
+        array (r + q, r + q)
+            H.
+        array (r + q,)
+            f.
+        """
         H = np.zeros((self.r + self.q, self.r + self.q))
         diagonal = np.diagonal(gram)
         weight = tie_break * float(diagonal.min(initial=1.0))
@@ -239,7 +354,18 @@ class Row:
         return answer.xi, answer.solver
 
     def solve_quadratic(self) -> str:
-        """(10)."""
+        """Solve (10) on the working set.
+
+        Returns
+        -------
+        str
+            Who found it.
+
+        Raises
+        ------
+        FitError
+            No solver found an answer.
+        """
         answer, solver = self._solve(
             "quadratic",
             lambda factor, ridge: self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge),
@@ -252,7 +378,18 @@ class Row:
         return solver
 
     def solve_regularised(self) -> str:
-        """(11) with a little of the squared widths."""
+        """Solve (11) with a little of the squared widths on the working set.
+
+        Returns
+        -------
+        str
+            Who found it.
+
+        Raises
+        ------
+        FitError
+            No solver found an answer.
+        """
         size = self.r + self.q
 
         def objective(factor: float, ridge: float) -> tuple[Array, Array]:
@@ -274,7 +411,18 @@ class Row:
         return solver
 
     def solve_linear(self) -> str:
-        """(11)."""
+        """Solve (11) on the working set, by the simplex method.
+
+        Returns
+        -------
+        str
+            Who found it.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
         if self._simplex is None:
             self._simplex = self._minimax()
         index = self.samples.index[self.pool]
@@ -288,7 +436,18 @@ class Row:
         return "HiGHS simplex"
 
     def least_width(self) -> float:
-        """A lower bound of δ, in units of scale: the optimum of (11) on the samples that decide it, then on more."""
+        """A lower bound of δ, in units of scale: the optimum of (11) on the samples that decide it, then on more.
+
+        Returns
+        -------
+        float
+            In units of scale.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
         assert self.limit is not None
         inside, room = self.slacks()
         assert room is not None
@@ -314,6 +473,11 @@ class Row:
         """How far the squared widths of this row are above the optimum at most, relative to it.
 
         The tie-break adds at most TIE_BREAK / 4 of them to the optimum of the programme that is solved.
+
+        Returns
+        -------
+        float
+            Relative.
         """
         theta = self.theta[self.free_phi] / (self.unit_phi * self.scale)
         d = self.d[self.free_psi] / (self.unit_psi * self.scale)
@@ -336,7 +500,18 @@ class Row:
         )
 
     def solve_bounded(self) -> str:
-        """Least squared widths, then the centre, among the optima of (11)."""
+        """Least squared widths, then the centre, among the optima of (11).
+
+        Returns
+        -------
+        str
+            Who found it.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
         assert self.limit is not None
         G, h = self.containment(self.pool)
         width, limit = self.width[self.pool], self.limit
@@ -367,7 +542,7 @@ class Row:
             return solver
 
     def polish(self) -> None:
-        """The centre anew, with the half-widths as they are: the tie-break on its own.
+        """Solve for the centre again, with the half-widths as they are: the tie-break on its own.
 
         Beside the squared widths it weighs so little that their rounding shows in the elements.
         """
@@ -391,7 +566,18 @@ class Row:
         self.theta[self.free_phi] = answer.xi * self.unit_phi * self.scale
 
     def contradiction(self) -> tuple[int, float] | None:
-        """(index of a sample, distance) that no elements within the structure can contain; None where there is none."""
+        """A sample that no elements within the structure can contain.
+
+        Returns
+        -------
+        (int, float) or None
+            Index of the sample, and its distance from the bounds, normalised; None where there is none.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
         simplex = self._minimax()
         G, h = self.containment(self.pool)
         simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
@@ -410,7 +596,17 @@ def _relative_gap(above: float, value: float, factor: float = 1.0) -> float:
 
 
 class InfeasibleError(FitError):
-    """Row `row` cannot contain transition `index`, which stays `distance` outside at best."""
+    """A row cannot contain a transition, whatever its elements within the structure.
+
+    Parameters
+    ----------
+    row : int
+        The row of the model.
+    index : int
+        Position of the transition.
+    distance : float
+        How far it stays outside at best, normalised.
+    """
 
     def __init__(self, row: int, index: int, distance: float) -> None:
         super().__init__(f"row {row} cannot contain transition {index}")
@@ -427,7 +623,9 @@ class WorkingSet:
     Parameters
     ----------
     fleet : Fleet
+        The data.
     structure : Structure, optional
+        As in `fit`.
     excluded : array of int, optional
         Transitions that need not be contained.
     progress : callable, optional
@@ -458,7 +656,18 @@ class WorkingSet:
         self._coupled_gap = 0.0
 
     def quadratic(self) -> Solution:
-        """Criterion (10)."""
+        """Solve (10).
+
+        Returns
+        -------
+        Solution
+            With its duality gap.
+
+        Raises
+        ------
+        FitError
+            No solver found an answer; `InfeasibleError` where the structure contradicts a transition.
+        """
         coupled = self.sums.coupled is not None
         self._run(
             self._settle_coupled if coupled else lambda rows: self._settle(rows, Row.solve_quadratic, polish=True)
@@ -467,7 +676,18 @@ class WorkingSet:
         return replace(self._solution(), gap=gap)
 
     def linear(self) -> Solution:
-        """Criterion (11), then least sum of squared widths among its optima, then the centre."""
+        """Solve (11), then least sum of squared widths among its optima, then the centre.
+
+        Returns
+        -------
+        Solution
+            With the optimum of every row.
+
+        Raises
+        ------
+        FitError
+            No solver found an answer; `InfeasibleError` where the structure contradicts a transition.
+        """
         deltas = np.zeros(self.fleet.n)
 
         def settle(rows: list[Row]) -> None:
@@ -515,7 +735,20 @@ class WorkingSet:
         return self.fleet.weights
 
     def violation(self, theta: Array, d: Array) -> Array:
-        """Largest violation of given elements over all transitions, in scaled units, (n,): one pass."""
+        """Largest violation of given elements over all transitions: one pass.
+
+        Parameters
+        ----------
+        theta : array (r, n)
+            Nominal elements, 1/s.
+        d : array (q, n)
+            Half-widths.
+
+        Returns
+        -------
+        array (n,)
+            In scaled units; 0 where none is violated.
+        """
         for row in self.rows:
             row.theta, row.d, row.limit = theta[:, row.i], d[:, row.i], None
         everything = np.full(self.fleet.n, np.inf)
