@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli.main import main
-from uncertain_lti.proposal.init import LONGEST_ARRAY, _role, propose
+from uncertain_lti.proposal.init import propose
+from uncertain_lti.proposal.reading import LONGEST_ARRAY
+from uncertain_lti.proposal.roles import role_by_name
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
 MS = 10**6
@@ -155,7 +157,7 @@ def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
 
 def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
     """The command and the first of two states fit the limit."""
-    import uncertain_lti.proposal.init as module
+    import uncertain_lti.proposal.reading as module
 
     monkeypatch.setattr(module, "MOST_VALUES", 900)
 
@@ -205,7 +207,7 @@ def test_every_odd_recording_gets_a_file_or_a_sentence(recordings, tmp_path, cap
     ],
 )
 def test_roles_by_name_and_type(topic, kind, role):
-    assert _role(topic, kind) == role
+    assert role_by_name(topic, kind) == role
 
 
 def test_a_command_is_found_by_its_effect_where_names_say_nothing(tmp_path):

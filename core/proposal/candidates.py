@@ -1,0 +1,90 @@
+"""Candidates: the topics of recordings, and their numbers that could be signals."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+
+FEWEST = 20
+"""Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""
+
+
+@dataclass
+class Candidate:
+    """One number of a topic that could be a signal.
+
+    values, one array (messages,) per recording, NaN where there is none; reason says why it is not proposed ("" where
+    it is, or nothing speaks against it); ready is "state" or "control" for one that a person may well want back; delay
+    is by how many samples the states follow a control later.
+    """
+
+    topic: str
+    path: str
+    values: list[Array] = field(default_factory=list, repr=False)
+    name: str = ""
+    unit: str = ""
+    reason: str = ""
+    ready: str = ""
+    steady: float = 0.0
+    scale: float = 1.0
+    delay: int = 0
+
+    @property
+    def element(self) -> str:
+        """Name of the entry it is (`j0` of `position[j0]`), or ""."""
+        match = re.search(r'\["?([^\[\]"]+)"?\]$', self.path)
+        return match[1] if match and not match[1].isdigit() else ""
+
+    @property
+    def kind(self) -> str:
+        """Path without the entry: `position` of `position[j0]`."""
+        return self.path.partition("[")[0]
+
+
+@dataclass
+class Source:
+    """One topic: times of arrival and stamps in ns per recording, what it seems to be, and its numbers.
+
+    role is "control", "wish" (a reference of some controller), "state", "" (unknown) or "apart" (neither). halting: its
+    header stamps mostly stand still.
+    """
+
+    topic: str
+    type: str
+    role: str
+    stamped: bool
+    offset: float | None
+    arrival: list[NDArray[np.int64]] = field(default_factory=list, repr=False)
+    stamp: list[NDArray[np.int64]] = field(default_factory=list, repr=False)
+    candidates: list[Candidate] = field(default_factory=list)
+    reason: str = ""
+    halting: bool = False
+
+    @property
+    def count(self) -> int:
+        """Messages of all recordings."""
+        return sum(len(a) for a in self.arrival)
+
+    @property
+    def rate(self) -> float:
+        """Messages per second while there are any, 1/s."""
+        span = sum(float(a[-1] - a[0]) for a in self.arrival if len(a) > 1) * 1e-9
+        return sum(len(a) - 1 for a in self.arrival if len(a) > 1) / span if span > 0 else 0.0
+
+    def instants(self, clock: Source, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Times of this topic's messages and another one's by one clock: stamps where both have them, else arrival."""
+        if self.stamped and clock.stamped and abs((self.offset or 0.0) - (clock.offset or 0.0)) <= 1.0:
+            mine, theirs = self.stamp[number], clock.stamp[number]
+            if all(len(s) and s[0] >= 0 and (np.diff(s) >= 0).all() for s in (mine, theirs)):
+                return mine, theirs
+        return self.arrival[number], clock.arrival[number]
+
+    @property
+    def free(self) -> list[Candidate]:
+        """Candidates that nothing speaks against."""
+        return [c for c in self.candidates if not c.reason]

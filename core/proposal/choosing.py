@@ -1,0 +1,181 @@
+"""Choosing: the states and controls of the model, as many as the recordings carry."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
+from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
+from uncertain_lti.proposal.effects import FAINT, SHOWS, Steps, explained, steps_of
+from uncertain_lti.proposal.redundancy import drop_copies, drop_functions, drop_idle_controls, drop_noise, prefer_rates
+
+PER_UNKNOWN = 20
+"""Transitions per signal below which further signals are only listed."""
+
+
+MOST_STATES, MOST_CONTROLS = 8, 6
+
+
+def choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[Candidate], str]:
+    """States of the model, and a sentence where they look like none; reasons go to what is left out."""
+    every = {s.topic: s for s in [*states, *controls]}
+    for source in states:
+        prefer_rates(source)
+    shown = [s for s in states if not controls or explained(s, controls) > SHOWS] or list(states)
+    main = max(shown, key=lambda s: (s.rate, s.count))
+    pool = list(main.free)
+    for source in states:
+        if source is main:
+            continue
+        if source in shown and 0.8 * main.rate <= source.rate <= 1.25 * main.rate:
+            pool += source.free
+        else:
+            source.reason = (
+                f"{source.rate:.3g} messages a second beside {main.rate:.3g} of {main.topic}"
+                if source in shown
+                else "the controls do not show in it"
+            )
+    drop_copies(pool)
+    pool = [c for c in pool if not c.reason]
+    used = [c for s in controls for c in s.free]
+    pool, used = _one_element(pool, used, every)
+    drop_copies(used)
+    used = [c for c in used if not c.reason]
+    steps = steps_of(pool, every, used)
+    pool = drop_functions(steps, pool)
+    pool, doubt = drop_noise(pool, every, used)
+    steps = steps_of(pool, every, used)
+    N = len(steps.X)
+    room = max(2, N // PER_UNKNOWN)
+    used = _strongest(steps, used, max(1, min(MOST_CONTROLS, room // 2)))
+    steps = steps_of(pool, every, used)
+    most = max(1, min(MOST_STATES, room - len(used)))
+    driven = _driven(pool, every, used)
+    keep = _coupled(steps, pool, most, _is_pose(pool), driven) if N >= FEWEST else pool[:MOST_STATES]
+    drop_idle_controls(steps_of(keep, every, used), used)
+    used = [c for c in used if not c.reason]
+    _delay(keep, every, used)
+    return keep, doubt
+
+
+def _driven(pool: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> Array:
+    """How clearly the controls show in the next step of each candidate (n,), at the delay at which they show most."""
+    found = np.zeros(len(pool))
+    for lag in range(LONGEST_DELAY + 1):
+        steps = steps_of(pool, every, used, [lag] * len(used))
+        if used and len(steps.X) >= FEWEST:
+            found = np.maximum(found, steps.effect(range(len(pool))))
+    return found
+
+
+def _is_pose(pool: Sequence[Candidate]) -> bool:
+    """Place and attitude of a body, all of which move together somehow."""
+    return all(re.search(r"position\.[xyz]$|(roll|pitch|yaw)\(", c.path) for c in pool)
+
+
+def _one_element(
+    pool: list[Candidate], used: list[Candidate], every: dict[str, Source]
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Where state and command name the same joints, those of the joint whose command shows most."""
+    shared = [e for e in dict.fromkeys(c.element for c in used) if e and any(s.element == e for s in pool)]
+    if len(shared) < 2:
+        return pool, used
+
+    def effect(element: str) -> float:
+        mine = [c for c in pool if c.element == element]
+        steps = steps_of(mine, every, [c for c in used if c.element == element])
+        return float(np.max(steps.effect(range(len(mine))), initial=0.0)) if len(steps.X) >= FEWEST else 0.0
+
+    best = max(shared, key=effect)
+    for candidate in [*pool, *used]:
+        if candidate.element != best:
+            candidate.reason = f"another joint than {best}; one model per joint holds better than one for all"
+    return [c for c in pool if not c.reason], [c for c in used if not c.reason]
+
+
+def _strongest(steps: Steps, used: list[Candidate], most: int) -> list[Candidate]:
+    """At most so many controls, those that show most."""
+    if len(used) <= most or len(steps.X) < FEWEST:
+        for candidate in used[most:]:
+            candidate.reason = "the recording is too short for so many controls"
+        return used[:most]
+    n = steps.X.shape[1]
+    strength = []
+    for j in range(len(used)):
+        alone = replace(steps, X=np.hstack([steps.X, np.delete(steps.U, j, axis=1)]), U=steps.U[:, [j]])
+        strength.append(float(np.max(alone.effect(range(n)), initial=0.0)))
+    order = np.argsort(strength)[::-1][:most]
+    for j, candidate in enumerate(used):
+        if j not in order:
+            candidate.reason = "others show more, and the recording is too short for all"
+    return [c for j, c in enumerate(used) if j in order]
+
+
+def _coupled(steps: Steps, pool: list[Candidate], most: int, pose: bool, driven: Array) -> list[Candidate]:
+    """States in whose next step the controls show, those that help to predict them, and those that follow them.
+
+    Of a body's pose only those in which the controls show most: all of its numbers are coupled by geometry, and a
+    place adds up what the attitude did, so that the attitude goes before where the controls show in it at all.
+    """
+    n = len(pool)
+    order = [int(i) for i in np.argsort(-driven, kind="stable")]
+    angles = [i for i in order if "(" in pool[i].path and driven[i] > FAINT] if pose else []
+    among = angles or order
+    least = SHOWS if not pose else max(FAINT if angles else SHOWS, 0.5 * float(driven[among].max(initial=0.0)))
+    kept = [i for i in among if driven[i] > least][:most]
+    if not kept:
+        for candidate in pool[most:]:
+            candidate.reason = "the recording is too short for so many states"
+        return pool[:most]
+    while len(kept) < most and not pose:
+        rest = [j for j in range(n) if j not in kept]
+        strength = [
+            max(
+                float(steps.effect(kept, of=[j], given=kept).max()),
+                float(steps.effect([j], of=kept, given=[j]).max()),
+            )
+            for j in rest
+        ]
+        if not rest or max(strength) <= SHOWS:
+            break
+        kept.append(rest[int(np.argmax(strength))])
+    for j, candidate in enumerate(pool):
+        if j not in kept:
+            candidate.ready = "state"
+            candidate.reason = (
+                "the recording is too short for more"
+                if len(kept) == most
+                else "a place moves with the attitude by geometry, or the controls show less in it"
+                if pose
+                else "the controls do not show in it, and nothing couples it to the states above"
+            )
+    return [pool[j] for j in sorted(kept)]
+
+
+def _delay(states: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> None:
+    """Samples by which each control must be taken earlier to explain clearly more of the next step: as the fit says."""
+    if not used or not states:
+        return
+    for _ in range(2 * len(used)):
+        late = [*used] * (LONGEST_DELAY + 1)
+        by = [c.delay + lag for lag in range(LONGEST_DELAY + 1) for c in used]
+        steps = steps_of(states, every, late, by)
+        N = len(steps.X)
+        if N < PER_UNKNOWN * (len(states) + len(used)):
+            return
+        u = steps.U.T.reshape(LONGEST_DELAY + 1, len(used), N)
+        found = lags(steps.X.T / _spread(steps.X), u / _spread(u[0].T)[None], steps.dX.T, np.ones(N))
+        if not found:
+            return
+        first = max(found, key=lambda j: found[j][1])
+        used[first].delay += found[first][0]
+
+
+def _spread(values: Array) -> Array:
+    """Size of each column, (k, 1), to divide by."""
+    return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300)[:, None])

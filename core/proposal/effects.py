@@ -1,0 +1,117 @@
+"""Effects: how clearly controls and states show in the next step of states, by F statistics of least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
+
+SHOWS = 20.0
+"""F statistic from which on something is said to show in the next step."""
+
+
+FAINT = 5.0
+"""F statistic below which a control is said to show nowhere."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Transitions of some states X (N, n) with the controls U (N, m) in force, and what changed, dX (N, n)."""
+
+    X: Array
+    U: Array
+    dX: Array
+
+    def effect(self, on: Sequence[int], of: Sequence[int] | None = None, given: Sequence[int] | None = None) -> Array:
+        """F statistic (len(on),) in the next step of states `on`: of the controls, or of states `of`.
+
+        Beside states `given` (default all), and beside the controls where these are not what is asked for.
+        """
+        n, m = self.X.shape[1], self.U.shape[1]
+        tested = list(range(n, n + m)) if of is None else list(of)
+        beside = [j for j in (range(n) if given is None else given) if j not in tested]
+        if of is not None:
+            beside += range(n, n + m)
+        Z, Y = np.hstack([self.X, self.U]), self.dX[:, list(on)]
+        freedom = len(Z) - len(beside) - len(tested) - 1
+        if freedom < 5 or not tested:
+            return np.zeros(len(on))
+        without, full = residual(Z[:, beside], Y), residual(Z[:, [*beside, *tested]], Y)
+        floor = 1e-12 * (Y**2).sum(axis=0) + 1e-300
+        gain = np.maximum(without - full, 0.0) / len(tested)
+        return np.asarray(gain / ((full + floor) / freedom))
+
+
+def residual(Z: Array, Y: Array) -> Array:
+    """Sum of squares (k,) that a least-squares fit of Y (N, k) on [1, Z] leaves."""
+    size = np.maximum(np.abs(Z).max(axis=0, initial=0.0), 1e-300)
+    design = np.hstack([np.ones((len(Z), 1)), Z / size])
+    Q, _ = np.linalg.qr(design)
+    rest = Y - Q @ (Q.T @ Y)
+    return np.asarray((rest**2).sum(axis=0))
+
+
+def steps_of(
+    state: Sequence[Candidate], of: dict[str, Source], controls: Sequence[Candidate], lags: Sequence[int] = ()
+) -> Steps:
+    """Samples on the messages of the slowest of the states' topics; of the others, the latest message before.
+
+    lags: by how many samples each control is taken earlier; none by default.
+    """
+    lags = lags or [0] * len(controls)
+    longest = max(lags, default=0)
+    topics = list(dict.fromkeys(c.topic for c in state))
+    clock = min(topics, key=lambda t: of[t].rate)
+    X, U, dX = [], [], []
+    for number, arrival in enumerate(of[clock].arrival):
+        x = np.column_stack([held(c, of[c.topic], number, of[clock]) for c in state])
+        u = (
+            np.column_stack([held(c, of[c.topic], number, of[clock]) for c in controls])
+            if controls
+            else np.empty((len(arrival), 0))
+        )
+        step = np.diff(arrival)
+        if len(step) < 2 + longest:
+            continue
+        positive = step[step > 0]
+        limit = 2.5 * float(np.median(positive)) if len(positive) else 0.0
+        for j, lag in enumerate(lags):
+            u[:, j] = np.concatenate([np.full(lag, np.nan), u[: len(u) - lag, j]])
+        good = (step > 0) & (step <= limit)
+        good &= np.isfinite(x[:-1]).all(axis=1) & np.isfinite(x[1:]).all(axis=1) & np.isfinite(u[:-1]).all(axis=1)
+        if len(good) > 200_000:  # enough to tell
+            good[200_000:] = False
+        X.append(x[:-1][good])
+        U.append(u[:-1][good])
+        dX.append(np.diff(x, axis=0)[good])
+    n, m = len(state), len(controls)
+    return Steps(
+        np.concatenate([np.empty((0, n)), *X]),
+        np.concatenate([np.empty((0, m)), *U]),
+        np.concatenate([np.empty((0, n)), *dX]),
+    )
+
+
+def held(candidate: Candidate, source: Source, number: int, clock: Source, oldest: float | None = None) -> Array:
+    """Latest value at each message of the clock; NaN before the first, and where it is older than `oldest` s."""
+    if number >= len(source.arrival) or not len(source.arrival[number]) or number >= len(candidate.values):
+        return np.full(len(clock.arrival[number]), np.nan)
+    mine, at = source.instants(clock, number)
+    position = np.searchsorted(mine, at, side="right") - 1
+    values = candidate.values[number][np.maximum(position, 0)]
+    age = (at - mine[np.maximum(position, 0)]) * 1e-9
+    gone = position < 0 if oldest is None else (position < 0) | (age > oldest)
+    return np.where(gone, np.nan, values)
+
+
+def explained(state: Source, controls: Sequence[Source]) -> float:
+    """How clearly these topics show in the next step of the best of a topic's numbers."""
+    every = {s.topic: s for s in [state, *controls]}
+    steps = steps_of(state.free, every, [c for s in controls for c in s.free])
+    if len(steps.X) < FEWEST:
+        return 0.0
+    return float(np.max(steps.effect(range(len(state.free))), initial=0.0))

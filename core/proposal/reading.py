@@ -1,0 +1,215 @@
+"""Reading: every topic of some recordings with its numbers, and which of these move."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
+from uncertain_lti.proposal.effects import residual
+from uncertain_lti.proposal.roles import role_by_name
+from uncertain_lti.recordings.bag import Bag, TopicFacts, describe
+from uncertain_lti.recordings.bag_arrays import read_columns
+from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
+from uncertain_lti.signals.signal_map import FieldPath
+
+Iterate = Callable[[Iterable[object], int], Iterable[object]]
+
+
+LONGEST_ARRAY = 24
+"""Entries of an array that are looked at one by one; a longer one is a picture, a scan or a map."""
+
+
+MOST_VALUES = 50_000_000
+"""Numbers read at most; fields beyond are listed and not looked at."""
+
+
+_SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
+
+
+def read_sources(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
+    """Every topic of the recordings with its numbers."""
+    facts: dict[str, TopicFacts] = {}
+    for bag in bags:
+        for fact in describe(bag, progress):
+            known = facts.get(fact.info.topic)
+            if known is None or (not known.fields and fact.fields):
+                facts[fact.info.topic] = fact
+    sources = []
+    for topic, fact in facts.items():
+        stamped = fact.stamps in ("usable", "mixed")
+        source = Source(topic, fact.info.type, role_by_name(topic, fact.info.type), stamped, fact.stamp_offset)
+        sources.append(source)
+        total = sum(bag.topics[topic].count for bag in bags if topic in bag.topics)
+        if not fact.info.readable:
+            source.reason = fact.info.reason
+        elif source.role == "apart":
+            source.reason = "no signal of a machine by its name or type"
+        elif total < (3 if source.role == "control" else FEWEST):
+            source.reason = f"{plural(total, 'message')} only"
+        elif any(topic not in b.topics or not b.topics[topic].count for b in bags):
+            source.reason = "not in every recording"
+        elif any(b.topics[topic].type != fact.info.type for b in bags):
+            source.reason = "of different types in these recordings"
+        else:
+            source.candidates = _candidates(topic, fact.fields)
+            if not source.candidates:
+                source.reason = "no number in it"
+        if source.reason:
+            source.candidates = []
+    _limit(bags, sources)
+    for bag in bags:
+        _read(bag, [s for s in sources if s.candidates], progress)
+    for source in sources:
+        if source.candidates and not source.rate > 0:
+            source.reason, source.candidates = "no time passes between its messages", []
+        _sift(source)
+    return sources
+
+
+def _limit(bags: Sequence[Bag], sources: Sequence[Source]) -> None:
+    """Look at no more numbers than memory holds: commands first, then states, from the first field on."""
+    order = ("control", "state", "wish", "")
+    left = MOST_VALUES
+    for source in sorted((s for s in sources if s.candidates), key=lambda s: order.index(s.role)):
+        count = max(1, sum(bag.topics[source.topic].count for bag in bags))
+        for candidate in source.candidates:
+            if candidate.reason:
+                continue
+            left -= count
+            if left < 0:
+                candidate.reason = "not looked at, the recordings are too large: propose from a shorter one"
+
+
+def _candidates(topic: str, fields: Sequence[str]) -> list[Candidate]:
+    """Paths as they would stand in a file; arrays entry by entry, long ones once with the reason."""
+    found: list[Candidate] = []
+    for path in fields:
+        size = math.prod(int(b) - int(a) + 1 for a, b in _SPREAD.findall(path))
+        if re.search(r"(covariance|variance)", path):
+            continue
+        if size > LONGEST_ARRAY:
+            found.append(Candidate(topic, path, reason=f"an array of {size} numbers"))
+            continue
+        every = [path]
+        while any(_SPREAD.search(p) for p in every):
+            every = [
+                p[: match.start()] + f"[{i}]" + p[match.end() :]
+                for p in every
+                if (match := _SPREAD.search(p))
+                for i in range(int(match[1]), int(match[2]) + 1)
+            ]
+        found += [Candidate(topic, p) for p in every]
+    return found
+
+
+def _read(bag: Bag, sources: Sequence[Source], progress: Iterate | None) -> None:
+    """Values of every candidate in one recording."""
+    for source in sources:
+        readable = [c for c in source.candidates if not c.reason]
+        paths = [FieldPath(c.path) for c in readable]
+        try:
+            columns = read_columns(bag, [source.topic], [paths], progress)
+            arrival, stamp, values = columns.arrival, columns.stamp, columns.values[0]
+            stamps = columns.stamp[columns.stamp >= 0]
+            if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(arrival) - 1):
+                source.halting = True
+        except (RepeatedNamesError, SignalError):
+            read = [(t, [path.read(message) for path in paths]) for _, t, message in bag.messages([source.topic])]
+            arrival = np.array([t for t, _ in read], dtype=np.int64)
+            values = np.array([row for _, row in read], dtype=np.float64).reshape(len(read), len(paths))
+            stamp = np.full(len(arrival), -1, dtype=np.int64)
+        source.arrival.append(arrival)
+        source.stamp.append(stamp)
+        for column, candidate in zip(values.T, readable, strict=True):
+            candidate.values.append(column)
+
+
+def _sift(source: Source) -> None:
+    """Say of each number whether it moves; angles in place of the quaternions that are some."""
+    if not source.candidates:
+        return
+    bases = {m[2] for c in source.candidates if (m := re.fullmatch(r"(roll|pitch|yaw)\((.+)\)", c.path))}
+    parts = {c.path: c for c in source.candidates}
+    for base in bases:
+        raw = [parts.get(f"{base}.{axis}") for axis in "xyzw"]
+        read = [r for r in raw if r is not None and r.values]
+        norm = np.sqrt(sum(np.concatenate(r.values) ** 2 for r in read)) if len(read) == 4 else np.zeros(1)
+        unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
+        is_rotation = len(unit) > 0 and unit.mean() > 0.9
+        for candidate in source.candidates:
+            of_base = candidate.path.startswith(f"{base}.") or candidate.path.endswith(f"({base})")
+            if of_base and candidate.path.endswith(f"({base})") != is_rotation:
+                candidate.reason = "|"  # said by the other form of the same numbers; not worth a line
+    source.candidates = [c for c in source.candidates if c.reason != "|"]
+    for candidate in source.candidates:
+        if not candidate.reason:
+            _judge(candidate, source)
+    _wrapped(source)
+    if all(c.reason for c in source.candidates):
+        source.reason = "; ".join(f"{c.path} {c.reason}" for c in source.candidates[:3])
+        source.reason += f" and {len(source.candidates) - 3} more" * (len(source.candidates) > 3)
+
+
+def _judge(candidate: Candidate, source: Source) -> None:
+    if not candidate.values:
+        candidate.reason = "not read"
+        return
+    values = np.concatenate(candidate.values)
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        candidate.reason = "never a number"
+    elif finite.min() == finite.max():
+        candidate.reason = f"always {finite[0] + 0.0:.6g}"
+    elif len(finite) < 0.5 * len(values):
+        candidate.reason = f"a number in {len(finite)} of {len(values)} messages only"
+    elif (moved := len(finite) - int(np.unique(finite, return_counts=True)[1].max())) < max(3, len(finite) // 500):
+        candidate.reason = f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
+    elif source.role == "state" and len(np.unique(finite)) < 3:
+        candidate.reason = "takes two values only"
+    elif source.role != "control" and _counts(values, np.concatenate(source.arrival)):
+        candidate.reason = "grows as a clock or a counter does"
+    elif max(abs(float(finite.min())), abs(float(finite.max()))) > 1e15:
+        candidate.reason = "holds numbers beyond 1e15"
+
+
+def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
+    """Never falls, and is a whole number or goes by the time of arrival."""
+    good = np.isfinite(values)
+    finite, t = values[good], (arrival[good] - arrival[0]) * 1e-9
+    if len(finite) < 3 or (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):
+        return False
+    if (finite == np.rint(finite)).all():
+        return True
+    rest = residual(t[:, None], finite[:, None])[0]
+    return bool(rest < (0.002 * np.ptp(finite)) ** 2 * len(finite))
+
+
+def _wrapped(source: Source) -> None:
+    """Angles that jump by a turn are unwrapped, those of a quaternion always."""
+    for candidate in source.candidates:
+        if candidate.reason:
+            continue
+        angle = re.match(r"(roll|yaw)\(", candidate.path) is not None
+        jumps = 0
+        for values in candidate.values:
+            finite = values[np.isfinite(values)]
+            if len(finite) and np.ptp(finite) <= 2.2 * np.pi:
+                jumps += int((np.abs(np.diff(finite)) > 1.6 * np.pi).sum())
+        if angle or (jumps and re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path)):
+            candidate.path = f"unwrap({candidate.path})"
+            candidate.values = [_unwrapped(v) for v in candidate.values]
+
+
+def _unwrapped(values: Array) -> Array:
+    finite = np.isfinite(values)
+    out = values.copy()
+    out[finite] = np.unwrap(values[finite])
+    return out

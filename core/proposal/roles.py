@@ -1,0 +1,95 @@
+"""Roles: which topics are controls and which the state, by name and type, else by effect."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from uncertain_lti.proposal.candidates import Source
+from uncertain_lti.proposal.effects import SHOWS, explained
+
+# Words in the name of a topic or of its type; the last word of a name counts most.
+_COMMAND = re.compile(r"(cmd|command|contr|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory)")
+
+
+_WISH = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$)")
+
+
+_STATE = re.compile(
+    r"(state|odom|pose|twist|imu|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
+    r"depth|pressure|temperature|power|attitude|estimat|log|response|data$)"
+)
+
+
+_ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|measur|estimat")
+
+
+_APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
+
+
+_PHYSICAL = re.compile(
+    r"^(imu|jointstate|odometry|twist|pose|wrench|accel|vector3|quaternion|transformstamped|ackermann)"
+)
+
+
+_APART_TYPES = {
+    "rcl_interfaces/msg/Log", "rcl_interfaces/msg/ParameterEvent", "tf2_msgs/msg/TFMessage", "rosgraph_msgs/msg/Clock",
+    "diagnostic_msgs/msg/DiagnosticArray", "diagnostic_msgs/msg/DiagnosticStatus", "sensor_msgs/msg/BatteryState",
+    "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Image", "sensor_msgs/msg/LaserScan",
+    "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/OccupancyGrid", "nav_msgs/msg/Path",
+    "visualization_msgs/msg/Marker", "visualization_msgs/msg/MarkerArray",
+}  # fmt: skip
+
+
+def role_by_name(topic: str, type_name: str) -> str:
+    """What a topic seems to be by its name, the last word first, else by its type."""
+    if type_name in _APART_TYPES:
+        return "apart"
+    name = topic.strip("/").lower()
+    last = name.rpartition("/")[2]
+    kind = type_name.rpartition("/")[2].lower()
+    if not _PHYSICAL.search(kind) and any(_APART.search(text) for text in (last, name)):
+        return "apart"
+    for text in (last, name, kind):
+        if _ANSWER.search(text):
+            return "state"
+        if _WISH.search(text):
+            return "wish"
+        if _COMMAND.search(text):
+            return "control"
+        if text == last and kind == "twist" and text.endswith("vel"):
+            return "control"  # a bare Twist is what drives a base
+        if _STATE.search(text):
+            return "state"
+    return ""
+
+
+def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
+    """Topics of the controls, and those that may be the state."""
+    moving = [s for s in sources if s.free]
+    controls = [s for s in moving if s.role == "control"]
+    wishes = [s for s in moving if s.role == "wish"]
+    if not controls:
+        controls, wishes = wishes, []
+    for source in wishes:
+        source.reason = "a reference for some controller, and there is a command"
+    states = [s for s in moving if s.role == "state"]
+    unknown = [s for s in moving if s.role == ""]
+    if not states:
+        states, unknown = unknown, []
+    if not states and len(controls) > 1:  # commands everywhere by their names: the one that the others explain best
+        best = max(controls, key=lambda s: explained(s, [c for c in controls if c is not s]))
+        controls, states = [c for c in controls if c is not best], [best]
+    if not controls and len(states) + len(unknown) > 1:
+        by_effect = max(
+            (s for s in [*unknown, *states] if len(states) > 1 or s not in states),
+            key=lambda s: max((explained(o, [s]) for o in states if o is not s), default=0.0),
+            default=None,
+        )
+        if by_effect is not None and max(explained(o, [by_effect]) for o in states if o is not by_effect) > SHOWS:
+            by_effect.role = "guess"
+            controls, states = [by_effect], [s for s in states if s is not by_effect]
+            unknown = [s for s in unknown if s is not by_effect]
+    for source in unknown:
+        source.reason = "neither state nor control by its name or type"
+    return controls, states

@@ -1,0 +1,126 @@
+"""The proposed signals file: YAML with the reasons as comments."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from uncertain_lti.base.english import shortlist
+from uncertain_lti.proposal.candidates import Candidate, Source
+from uncertain_lti.proposal.quantities import longest_hold
+from uncertain_lti.recordings.bag import Bag
+
+
+def signals_file(
+    bags: Sequence[Bag], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
+    doubt: str,
+) -> str:  # fmt: skip
+    """Write the text of the file."""
+    every = {s.topic: s for s in sources}
+    topics = list(dict.fromkeys(c.topic for c in [*states, *controls]))
+    clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
+    lines = [
+        "# Proposed by `uncertain-lti init`; read it, and edit it. From:",
+        *(f"#   {bag.path.name}" for bag in bags),
+        "# States are what the machine remembers from one sample to the next; controls are what is done to it, as",
+        "# it is commanded. Then: uncertain-lti fit BAG... --signals THIS_FILE --output machine.model.json",
+        "",
+        "# The further term that measured data needs: none, disturbance, noise or both; compare the widths they give.",
+        "additive: noise",
+        "",
+        f"# Its messages define the sample instants: {clock.rate:.4g} a second.",
+        f"clock: {_quoted(clock.topic)}",
+    ]
+    offsets = [every[t].offset for t in topics]
+    stamped = [o for o in offsets if o is not None]
+    differ = any(every[t].halting for t in topics)
+    differ |= len(stamped) > 0 and (
+        max(stamped) - min(stamped) > 1.0 or (len(stamped) < len(offsets) and _far(stamped))
+    )
+    if differ:
+        lines += [
+            "",
+            "# Their header stamps stand still, or not all go by one clock: times of arrival serve for all.",
+            "topics:",
+        ]
+        lines += [f"  {_quoted(t)}: {{time: log}}" for t in topics]
+    lines += ["", "# steady: median over the longest stretch in which everything stands still; scale: the largest such"]
+    lines.append("# magnitude, or the range where that is small. Both in recorded units.")
+    lines += [f"# Beware: {doubt}."] if doubt else []
+    lines.append("states:")
+    lines += [_entry(c) for c in states]
+    lines += [_entry(c, comment=c.reason, out=True) for s in sources for c in s.candidates if c.ready == "state"]
+    if controls:
+        lines += ["", "controls:"]
+        if any(every[c.topic].role == "guess" for c in controls):
+            lines.append("  # by correlation alone: nothing is called a command here")
+        if any(c.delay for c in controls):
+            lines.append("  # delay: by so many samples the states follow later")
+        for candidate in controls:
+            lines.append(_entry(candidate, *longest_hold(every[candidate.topic], clock)))
+        for candidate in (c for s in sources for c in s.candidates if c.ready == "control"):
+            limit, _ = longest_hold(every[candidate.topic], clock)
+            lines.append(_entry(candidate, limit, candidate.reason, out=True))
+    else:
+        lines += [
+            "",
+            "# No topic looks like a command. Without controls the envelope must cover what they do.",
+            "controls: []",
+        ]
+    left_out = _left_out(sources, {id(c) for c in [*states, *controls]})
+    if left_out:
+        lines += ["", "# Not proposed, and why:", *left_out]
+    return "\n".join(lines) + "\n"
+
+
+def _far(offsets: Sequence[float]) -> bool:
+    return max(abs(o) for o in offsets) > 1.0
+
+
+def _quoted(text: str) -> str:
+    """As YAML takes it: plain where it may stand so, and is not read as a number or a truth value."""
+    plain = not re.fullmatch(r"(?i)(y|n|yes|no|on|off|true|false|null|nan|\\.inf)", text)
+    return (
+        text
+        if plain and re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_./-]*", text)
+        else '"' + re.sub(r'(["\\])', r"\\\1", text) + '"'
+    )
+
+
+def _entry(candidate: Candidate, max_hold: float | None = None, comment: str = "", out: bool = False) -> str:
+    """Line of a signal; `out`: in a comment, ready to be taken in."""
+    parts = [f"name: {_quoted(candidate.name)}", f"topic: {_quoted(candidate.topic)}"]
+    parts.append('field: "' + re.sub(r'(["\\])', r"\\\1", candidate.path) + '"')
+    parts += [f"steady: {_number(candidate.steady)}", f"scale: {_number(candidate.scale)}"]
+    if candidate.unit:
+        parts.append(f"unit: {candidate.unit}")
+    if max_hold is not None:
+        parts.append(f"max_hold: {_number(max_hold)}")
+    if candidate.delay:
+        parts.append(f"delay: {candidate.delay}")
+    return f"  {'# ' * out}- {{{', '.join(parts)}}}" + (f" # {comment}" if comment else "")
+
+
+def _number(value: float) -> str:
+    """Six digits, as YAML reads a number (1e-05 would be a text)."""
+    text = f"{value:.6g}"
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
+
+
+def _left_out(sources: Sequence[Source], chosen: set[int]) -> list[str]:
+    lines = []
+    for source in sources:
+        groups: dict[str, list[str]] = {}
+        for candidate in source.candidates:
+            if id(candidate) not in chosen and not candidate.ready:
+                groups.setdefault(candidate.reason or source.reason, []).append(candidate.path)
+        if source.reason and (not groups or set(groups) == {source.reason}):
+            lines.append(f"#   {source.topic}: {_one_line(source.reason)}")
+            continue
+        for reason, paths in groups.items():
+            lines.append(f"#   {source.topic} {shortlist(paths, 6)}: {_one_line(reason)}")
+    return lines
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
