@@ -36,9 +36,26 @@ __all__ = [
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """What a recording holds of one topic: messages that count, first and last log time (ns; None without any).
+    """What a recording holds of one topic.
 
-    reason says why a topic is not readable, or which of its messages are left out.
+    Parameters
+    ----------
+    topic : str
+        Its name.
+    type : str
+        Message type, `pkg/msg/Type`.
+    count : int
+        Messages that count.
+    encoding : str
+        Of its messages; `cdr` is what can be decoded.
+    readable : bool
+        Whether its messages can be decoded.
+    reason : str
+        Why not, or which of its messages are left out; empty otherwise.
+    first : int or None
+        First log time, ns; None without a message.
+    last : int or None
+        Last log time, ns; None without a message.
     """
 
     topic: str
@@ -55,7 +72,22 @@ class TopicInfo:
 class RecordedChannel:
     """A channel as the file describes it: everything needed to write its messages again.
 
-    counted says whether its messages are those of its topic (see `Bag` on topics with several types).
+    Parameters
+    ----------
+    topic : str
+        Name of its topic.
+    type : str
+        Message type, `pkg/msg/Type`.
+    encoding : str
+        Of its messages.
+    schema : Schema or None
+        Its record in the file; None without one.
+    metadata : mapping of str to str
+        What the recorder stored of the channel, QoS for example.
+    definition : Definition
+        How its messages are decoded.
+    counted : bool, default False
+        Whether its messages are those of its topic (see `Bag` on topics with several types).
     """
 
     topic: str
@@ -68,7 +100,19 @@ class RecordedChannel:
 
 
 class RawMessage(NamedTuple):
-    """One message as recorded; times in ns."""
+    """One message as recorded.
+
+    Parameters
+    ----------
+    log_time_ns : int
+        Log time, ns.
+    publish_time_ns : int
+        Publish time, ns.
+    data : bytes
+        Serialised message.
+    channel : RecordedChannel
+        What it was recorded on.
+    """
 
     log_time_ns: int
     publish_time_ns: int
@@ -92,19 +136,26 @@ class RawMessage(NamedTuple):
 
 
 class Bag:
-    """One recording: an MCAP file, a folder, or the parts of a split bag given as `parts`.
+    """One recording: an MCAP file, a folder, or the parts of a split bag.
 
-    A folder's metadata.yaml says which files in which order; without one its files must be the parts
-    `<stem>_<i>.mcap` of one split bag (see `group_recordings`), taken in natural order. The file is walked once
-    on opening; messages are read and decoded while they are iterated. Of messages that are out of order only
-    what overlaps is held, as raw bytes.
+    A folder's metadata.yaml says which files in which order; without one its files must be the parts `<stem>_<i>.mcap`
+    of one split bag (see `group_recordings`), taken in natural order. The file is walked once on opening; messages are
+    read and decoded while they are iterated. Of messages that are out of order only what overlaps is held, as raw
+    bytes.
 
-    indexed: where a file has an index, go by what that states until messages are read; `described` gives what is
-    needed to read them in blocks, and everything else walks the file first. Damage to what is never read is then
-    not told, and first and last log times of topics are those of the chunks they are in.
+    Messages of one topic that has several types: the type with the most messages counts, the others are left out with a
+    warning. Messages that do not fit their definition are left out with a warning as they are met.
 
-    Messages of one topic that has several types: the type with the most messages counts, the others are left
-    out with a warning. Messages that do not fit their definition are left out with a warning as they are met.
+    Parameters
+    ----------
+    path : path
+        File or folder; with parts, the name of the recording.
+    parts : sequence of path or Contents, optional
+        Files in order, or what is known of them.
+    indexed : bool, default False
+        Where a file has an index, use what that states until messages are read; `described` gives what is needed to
+        read them in blocks, and everything else walks the file first. Damage to what is never read is then not
+        reported, and first and last log times of topics are those of the chunks they are in.
 
     Raises
     ------
@@ -137,14 +188,36 @@ class Bag:
         self.topics: Mapping[str, TopicInfo] = self._topics()
 
     def walk(self) -> None:
-        """Walk every file of which only the index was read; raises BagError as opening the bag does."""
+        """Walk every file of which only the index was read.
+
+        Raises
+        ------
+        BagError
+            As opening the bag does.
+        """
         if any(part.indexed for part in self._contents):
             self._warnings = self._folder_warnings
             self._undecoded = {}
             self._take([scan(part.path) if part.indexed else part for part in self._contents])
 
     def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
-        """Each file, and its channels that count for these topics; raises BagError as `messages` does."""
+        """Each file, and its channels that count for some topics.
+
+        Parameters
+        ----------
+        topics : iterable of str
+            Names.
+
+        Returns
+        -------
+        list of (Contents, dict of int to RecordedChannel)
+            Files in order; channels by their number in the file.
+
+        Raises
+        ------
+        BagError
+            As `messages`.
+        """
         wanted = self._required(topics)
         return [
             (contents, _of(channels, wanted, counted=True))
@@ -152,11 +225,34 @@ class Bag:
         ]
 
     def tell(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
-        """Take over what was said where the same recording was read; undecoded by topic."""
+        """Take over the warnings of another process that read the same recording.
+
+        Parameters
+        ----------
+        warnings : sequence of str
+            As of `said`.
+        undecoded : mapping of str to str
+            As of `said`, by topic.
+        """
         self._warnings, self._undecoded = list(warnings), dict(undecoded)
 
     def left_out(self, topic: str, number: int, why: str) -> str:
-        """Sentence about messages that cannot be decoded."""
+        """Sentence about messages that cannot be decoded.
+
+        Parameters
+        ----------
+        topic : str
+            Name of the topic.
+        number : int
+            Messages left out.
+        why : str
+            The reason.
+
+        Returns
+        -------
+        str
+            The sentence.
+        """
         return f"{self.path}: {topic}: {count(number, 'message')} left out that cannot be decoded ({why})"
 
     @property
@@ -180,20 +276,62 @@ class Bag:
         return [*self._warnings, *self._undecoded.values()]
 
     def fields(self, type_name: str) -> Mapping[str, FieldType]:
-        """Field name -> FieldType of a type that a readable topic has or uses; raises SignalError for others."""
+        """Fields of a type that a readable topic has or uses.
+
+        Parameters
+        ----------
+        type_name : str
+            As package/msg/Name.
+
+        Returns
+        -------
+        mapping of str to FieldType
+            Field name -> FieldType.
+
+        Raises
+        ------
+        SignalError
+            The type is not defined in the recording.
+        """
         for channel in self._every_channel():
             if channel.counted and type_name in channel.definition.types:
                 return channel.definition.fields(type_name)
         raise SignalError(f"{type_name}: not defined in {self.path}; check the type")
 
     def type_fields(self, topic: str) -> TypeFields:
-        """`fields` as one topic's own schema defines them; raises BagError as `messages` does."""
+        """`fields` as one topic's own schema defines them.
+
+        Parameters
+        ----------
+        topic : str
+            Name of the topic.
+
+        Returns
+        -------
+        callable
+            Type name -> {field name: FieldType}.
+
+        Raises
+        ------
+        BagError
+            As `messages`.
+        """
         self._require(topic)
         channels = (channel for channel in self._every_channel() if channel.topic == topic and channel.counted)
         return next(channels).definition.fields
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
-        """(topic, log time in ns, message) in order of log time, ties in file order, over all parts.
+        """Decoded messages in order of log time, ties in file order, over all parts.
+
+        Parameters
+        ----------
+        topics : iterable of str
+            Names.
+
+        Returns
+        -------
+        iterator of (str, int, object)
+            Topic, log time in ns, message.
 
         Raises
         ------
@@ -206,6 +344,16 @@ class Bag:
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """Messages as recorded, of these topics or of all, also those that cannot be decoded; same order.
+
+        Parameters
+        ----------
+        topics : iterable of str, optional
+            Names; default all.
+
+        Returns
+        -------
+        iterator of RawMessage
+            In the order of `messages`.
 
         Raises
         ------
@@ -373,7 +521,7 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
 
 
 def group_recordings(paths: Iterable[str | os.PathLike[str]], indexed: bool = False) -> list[Bag]:
-    """Recordings that these paths name, in the order of their first mention; indexed as in `Bag`.
+    """Recordings that some paths name, in the order of their first mention.
 
     A folder is one recording. Files are one recording each, except the parts of a split bag: files
     `<stem>_<i>.mcap` of one stem in one folder that either
@@ -384,6 +532,18 @@ def group_recordings(paths: Iterable[str | os.PathLike[str]], indexed: bool = Fa
       before ends, and overlaps it by no more than 10 % of the shorter (messages at a seam may be out of order).
 
     In doubt files stay apart: that loses the one transition at a seam, while joining two runs would invent one.
+
+    Parameters
+    ----------
+    paths : iterable of path
+        Files and folders.
+    indexed : bool, default False
+        As in `Bag`.
+
+    Returns
+    -------
+    list of Bag
+        One per recording.
 
     Raises
     ------
@@ -472,9 +632,20 @@ def _longest_pause(contents: Contents) -> int:
 class TopicFacts:
     """One topic as `uncertain-lti topics` shows it.
 
-    rate (1/s) is that of the median log-time step, None where there is none or it is 0; largest_gap in s;
-    fields are the paths that can be signals, where `data[0..99]` stands for `data[0]` to `data[99]`; stamps
-    says whether header stamps can be used; stamp_offset (s) is the median of log time - header stamp.
+    Parameters
+    ----------
+    info : TopicInfo
+        What the recording holds of it.
+    rate : float or None
+        That of the median log-time step, 1/s; None where there is no step or it is 0.
+    largest_gap : float or None
+        Longest log-time step, s; None where there is no step.
+    fields : tuple of str
+        Paths that can be signals; `data[0..99]` stands for `data[0]` to `data[99]`.
+    stamps : {"none", "usable", "zero", "mixed"}
+        Whether header stamps can be used.
+    stamp_offset : float or None
+        Median of log time less header stamp, s; None without a stamp.
     """
 
     info: TopicInfo
@@ -488,8 +659,24 @@ class TopicFacts:
 def describe(bag: Bag, progress: Callable[[Iterable[Any], int], Iterable[Any]] | None = None) -> list[TopicFacts]:
     """Facts about every topic of a recording; reads it once, and decodes one message of each topic.
 
-    progress wraps the messages, given their number, as in `read_transients`. Field paths are taken from the longest
-    message of a topic, so that its arrays have their lengths.
+    Field paths are taken from the longest message of a topic, so that its arrays have their lengths.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording.
+    progress : callable, optional
+        Wraps the messages, given their number, as in `read_transients`.
+
+    Returns
+    -------
+    list of TopicFacts
+        One per topic.
+
+    Raises
+    ------
+    BagError
+        The recording cannot be read any more.
     """
     times: dict[str, array[int]] = {topic: array("Q") for topic in bag.topics}
     offsets: dict[str, array[float]] = {topic: array("d") for topic in bag.topics}

@@ -25,8 +25,18 @@ LATEST = 2**63 - 1  # ns; log times are kept with a sign
 class Columns:
     """Messages of some topics in order of arrival.
 
-    topic (messages,) positions in the topics asked for; arrival, stamp (messages,) ns, with -1 for no stamp; values,
-    one array (messages of the topic, paths) per topic; alone is how many messages had to be decoded one by one.
+    Parameters
+    ----------
+    topic : array (messages,) of int
+        Positions in the topics asked for.
+    arrival : array (messages,) of int
+        Log time, ns.
+    stamp : array (messages,) of int
+        Header stamp, ns; -1 for no stamp.
+    values : list of array (messages of the topic, paths)
+        One array per topic.
+    alone : int, default 0
+        Messages that had to be decoded one by one.
     """
 
     topic: NDArray[np.int64]
@@ -55,7 +65,23 @@ class _Undecoded:
 def read_columns(
     bag: Bag, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
 ) -> Columns:
-    """Read the paths of each topic; messages that cannot be decoded are left out and told by the bag.
+    """Read some paths of each topic; messages that cannot be decoded are left out, and the bag warns of them.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording.
+    topics : sequence of str
+        Names.
+    paths : sequence of sequence of FieldPath
+        Per topic the paths to read.
+    progress : Progress, optional
+        Wraps what goes through the messages, given their number.
+
+    Returns
+    -------
+    Columns
+        In order of arrival.
 
     Raises
     ------
@@ -75,7 +101,25 @@ def read_columns(
 
 
 def in_reach(bag: Bag, log_time: int) -> int:
-    """The same log time; raises BagError where it cannot be kept."""
+    """Check that a log time can be kept as a 64-bit integer.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording, for the error.
+    log_time : int
+        Log time, ns.
+
+    Returns
+    -------
+    int
+        The same log time.
+
+    Raises
+    ------
+    BagError
+        It is past the year 2262.
+    """
     if log_time > LATEST:
         raise BagError(
             f"{bag.path}: a message has a log time of {log_time} ns, which is past the year 2262; "

@@ -17,18 +17,50 @@ _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.mcap")
 
 
 def stem_and_index(path: Path) -> tuple[str, int] | None:
-    """(`name`, 3) of `name_3.mcap`; None for other names."""
+    """(`name`, 3) of `name_3.mcap`; None for other names.
+
+    Parameters
+    ----------
+    path : Path
+        A file.
+
+    Returns
+    -------
+    (str, int) or None
+        (`name`, 3) for `name_3.mcap`; None for other names.
+    """
     match = _PART.fullmatch(path.name)
     return (match["stem"], int(match["index"])) if match else None
 
 
 def natural(path: Path) -> tuple[Any, ...]:
-    """Sort key that puts `bag_2` before `bag_10`."""
+    """Sort key that puts `bag_2` before `bag_10`.
+
+    Parameters
+    ----------
+    path : Path
+        A file.
+
+    Returns
+    -------
+    tuple of object
+        To be compared with that of another file.
+    """
     return tuple((int(text), "") if text.isdigit() else (-1, text) for text in re.split(r"(\d+)", path.name))
 
 
 def listed_parts(folder: Path) -> list[Path] | None:
     """Parts in the order of the folder's metadata.yaml, there or not; None without a usable one.
+
+    Parameters
+    ----------
+    folder : Path
+        The recording.
+
+    Returns
+    -------
+    list of Path or None
+        None without a usable metadata.yaml.
 
     Raises
     ------
@@ -56,9 +88,23 @@ def listed_parts(folder: Path) -> list[Path] | None:
 
 
 def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
-    """(parts, whether metadata.yaml lists them, warnings) of a folder that is one recording.
+    """Files of a folder that is one recording.
 
     Without metadata.yaml the parts are the folder's `<stem>_<i>.mcap` of one stem in natural order.
+
+    Parameters
+    ----------
+    folder : Path
+        The recording.
+
+    Returns
+    -------
+    list of Path
+        Parts in order.
+    bool
+        Whether metadata.yaml lists them.
+    list of str
+        Warnings.
 
     Raises
     ------
@@ -93,7 +139,20 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
 
 
 def not_mcap(path: Path, head: bytes) -> BagError:
-    """The error that says what a file is whose first bytes are not those of MCAP."""
+    """The error that says what a file is whose first bytes are not those of MCAP.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    head : bytes
+        Its first bytes.
+
+    Returns
+    -------
+    BagError
+        To be raised.
+    """
     if not head:
         return BagError(f"{path}: the file is empty; record or copy it anew")
     if MAGIC.startswith(head):
@@ -124,7 +183,18 @@ def not_mcap(path: Path, head: bytes) -> BagError:
 
 
 def missing(path: Path) -> BagError:
-    """The error for a path that is not there; names the recordings beside it."""
+    """The error for a path that is not there; names the recordings beside it.
+
+    Parameters
+    ----------
+    path : Path
+        The path.
+
+    Returns
+    -------
+    BagError
+        To be raised.
+    """
     beside: list[Path] = []
     if path.parent.is_dir():
         beside = sorted((p for p in path.parent.iterdir() if p.suffix == ".mcap"), key=natural)
@@ -133,7 +203,20 @@ def missing(path: Path) -> BagError:
 
 
 def os_error(path: Path, error: OSError) -> BagError:
-    """One sentence for a file that the operating system does not hand out."""
+    """One sentence for a file that the operating system does not hand out.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    error : OSError
+        What the operating system raised.
+
+    Returns
+    -------
+    BagError
+        To be raised.
+    """
     if isinstance(error, PermissionError):
         return BagError(f"{path}: no permission to read it; let its owner allow it with chmod +r")
     if isinstance(error, FileNotFoundError):
@@ -145,6 +228,20 @@ def sqlite_advice(path: Path, sources: list[Path], parts: Iterable[Path]) -> Bag
     """The error for sqlite3 storage, with the command that converts `sources`, whose database files are `parts`.
 
     Types that neither the file nor ROS 2 Jazzy defines would stop that command, so it leaves them out.
+
+    Parameters
+    ----------
+    path : Path
+        The recording as the user named it.
+    sources : list of Path
+        What the command converts.
+    parts : iterable of Path
+        Their database files.
+
+    Returns
+    -------
+    BagError
+        To be raised.
     """
     types: set[str] = set()
     defined: set[str] = set()

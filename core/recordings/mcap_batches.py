@@ -53,8 +53,20 @@ class IndexMismatchError(Exception):
 class Batch:
     """Messages of wanted channels in file order.
 
-    data[begin:end] is the encoded message of `channel`, log_time in ns; (messages,) each. SLACK bytes before and
-    after every message can be read as well. data is used again for the next batch.
+    data[begin:end] is an encoded message. SLACK bytes before and after every message can be read as well.
+
+    Parameters
+    ----------
+    data : bytearray
+        A buffer that is used again for the next batch.
+    channel : array (messages,) of uint16
+        Number of the channel in the file.
+    log_time : array (messages,) of uint64
+        Log time, ns.
+    begin : array (messages,) of int
+        Where each message begins.
+    end : array (messages,) of int
+        Where it ends.
     """
 
     data: bytearray
@@ -66,6 +78,18 @@ class Batch:
 
 def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
     """Messages of these channels, some MiB at a time, in file order; only blocks that hold one are read.
+
+    Parameters
+    ----------
+    contents : Contents
+        The file.
+    channels : collection of int
+        Numbers of the channels in the file.
+
+    Yields
+    ------
+    Batch
+        Some MiB of messages.
 
     Raises
     ------

@@ -73,7 +73,23 @@ class _Source:
 
 
 def profile_of(path: Path) -> str:
-    """The profile that a file states in its first record; "" where it states none."""
+    """The profile that a file states in its first record; "" where it states none.
+
+    Parameters
+    ----------
+    path : Path
+        An MCAP file.
+
+    Returns
+    -------
+    str
+        The profile, or an empty text.
+
+    Raises
+    ------
+    BagError
+        The file cannot be read.
+    """
     with _Source(path) as source:
         head = source.at(len(MAGIC), RECORD.size)
         if len(head) < RECORD.size:
@@ -90,6 +106,7 @@ class Copier:
     Parameters
     ----------
     writer : McapWriter
+        Gets the copies.
 
     Attributes
     ----------
@@ -104,7 +121,22 @@ class Copier:
         self.notes: list[str] = []
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Number of this schema in the copy, which has it or gets it."""
+        """Number of a schema in the copy, which has it or gets it.
+
+        Parameters
+        ----------
+        name : str
+            As package/msg/Name.
+        encoding : str
+            `ros2msg`, for example.
+        data : bytes
+            Its text.
+
+        Returns
+        -------
+        int
+            The number.
+        """
         for number, there in self._schemas.items():
             if there == (name, encoding, data):
                 return number
@@ -117,16 +149,45 @@ class Copier:
         return number
 
     def channel(self, schema: int, topic: str, encoding: str, metadata: Mapping[str, str], wish: int = 1) -> int:
-        """Number of a channel, new in the copy: as wished where that is free."""
+        """Declare a new channel in the copy.
+
+        Parameters
+        ----------
+        schema : int
+            Number of its schema in the copy; 0 for none.
+        topic : str
+            Name of its topic.
+        encoding : str
+            Of its messages.
+        metadata : mapping of str to str
+            To be stored with it.
+        wish : int, default 1
+            The number to take where it is free.
+
+        Returns
+        -------
+        int
+            The number.
+        """
         number = _free(self._channels, wish)
         self._channels[number] = (schema, topic, encoding, dict(metadata))
         self._writer.declare_channel(number, *self._channels[number])
         return number
 
     def declare(self, contents: Contents) -> dict[int, int]:
-        """Declare what a file declares; number in the file -> number in the copy, of its channels.
+        """Declare what a file declares.
 
         A channel that the copy has already, of another part of the recording, is the same one.
+
+        Parameters
+        ----------
+        contents : Contents
+            The file.
+
+        Returns
+        -------
+        dict of int to int
+            Number in the file -> number in the copy, of its channels.
         """
         known: dict[_Schema, list[int]] = {}
         for number, schema in self._schemas.items():
@@ -146,9 +207,19 @@ class Copier:
         return channels
 
     def copy(self, contents: Contents, channels: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-        """Copy a file; yields, after each block, its messages and its greatest log time.
+        """Copy a file.
 
-        channels is what `declare` gave for it.
+        Parameters
+        ----------
+        contents : Contents
+            The file.
+        channels : mapping of int to int
+            What `declare` returned for it.
+
+        Yields
+        ------
+        (int, int)
+            After each block, its messages and its greatest log time, ns.
 
         Raises
         ------

@@ -45,6 +45,16 @@ class _NoIndexError(Exception):
 def outline(path: Path) -> Contents | None:
     """Contents of a file by its summary; None where the file has to be walked (`scan`).
 
+    Parameters
+    ----------
+    path : Path
+        An MCAP file.
+
+    Returns
+    -------
+    Contents or None
+        The contents, or None.
+
     Raises
     ------
     BagError

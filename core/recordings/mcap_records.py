@@ -55,11 +55,27 @@ _FIRST_CHUNK_WARNINGS = 3
 class Block(NamedTuple):
     """A stretch of a file that is read at once: bytes `offset` to `offset + size`.
 
-    compression is "" where the bytes are records as they stand; length is the size of the records; start and
-    end are the smallest and largest log time (ns); channels those that have a message here. Of a chunk that was
-    found in an index (`mcap_index.outline`), unchecked is the size of what stands before its records: that has yet
-    to be held against the block, and the records against their checksum. indexed is the size of what follows it:
-    where its messages are.
+    Parameters
+    ----------
+    offset : int
+        First byte.
+    size : int
+        Bytes in the file.
+    compression : str
+        Empty where the bytes are records as they are.
+    length : int
+        Bytes of the records.
+    start : int
+        Smallest log time, ns.
+    end : int
+        Largest log time, ns.
+    channels : frozenset of int
+        Those that have a message here.
+    unchecked : int, default 0
+        Of a chunk that was found in an index (`mcap_index.outline`), bytes in front of its records, which are still to
+        be compared with the block, and the records with their checksum; 0 otherwise.
+    indexed : int, default 0
+        Of such a chunk, bytes behind its records, which say where its messages are; 0 otherwise.
     """
 
     offset: int
@@ -75,7 +91,17 @@ class Block(NamedTuple):
 
 @dataclass(slots=True)
 class Tally:
-    """Messages of one channel: how many, and their first and last log time (ns)."""
+    """Messages of one channel.
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    first : int
+        First log time, ns.
+    last : int
+        Last log time, ns.
+    """
 
     count: int
     first: int
@@ -84,11 +110,29 @@ class Tally:
 
 @dataclass(slots=True)
 class Contents:
-    """What `scan` found in a file. Blocks are in file order; warnings are sentences that begin with the path.
+    """What `scan` found in a file.
 
-    indexed says that it was not walked, and is only what its index states (`mcap_index.outline`): first and last
-    of a tally are then those of the chunks that hold the channel, and summed says whether the file has a checksum
-    over everything, which was not checked.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    size : int
+        Its bytes.
+    blocks : list of Block, optional
+        In file order.
+    channels : dict of int to Channel, optional
+        By number.
+    schemas : dict of int to Schema, optional
+        By number.
+    tally : dict of int to Tally, optional
+        By number of the channel.
+    warnings : list of str, optional
+        Sentences that begin with the path.
+    indexed : bool, default False
+        The file was not walked, and this is only what its index states (`mcap_index.outline`): first and last of a
+        tally are those of the chunks that hold the channel.
+    summed : bool, default False
+        The file has a checksum over everything, which was not checked.
     """
 
     path: Path
@@ -110,6 +154,16 @@ class Contents:
 def scan(path: Path) -> Contents:
     """Walk a file once and note where its messages are.
 
+    Parameters
+    ----------
+    path : Path
+        An MCAP file, whole or cut.
+
+    Returns
+    -------
+    Contents
+        Where its messages are.
+
     Raises
     ------
     BagError
@@ -128,7 +182,25 @@ def scan(path: Path) -> Contents:
 
 
 def read_block(path: Path, block: Block) -> bytes:
-    """Records of a block that `scan` found; raises BagError where the file is not what it was."""
+    """Records of a block that `scan` found.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    block : Block
+        Of the file.
+
+    Returns
+    -------
+    bytes
+        The records, not compressed.
+
+    Raises
+    ------
+    BagError
+        The file changed, or cannot be read any more.
+    """
     assert not block.unchecked
     try:
         with open(path, "rb", buffering=0) as stream:
@@ -143,7 +215,18 @@ def read_block(path: Path, block: Block) -> bytes:
 
 
 def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:
-    """(channel, log time, publish time, begin, end) of each message; its data is `records[begin:end]`."""
+    """Messages among some records; the data of each is `records[begin:end]`.
+
+    Parameters
+    ----------
+    records : bytes
+        Of `read_block`.
+
+    Yields
+    ------
+    (int, int, int, int, int)
+        Channel, log time and publish time in ns, begin, end.
+    """
     for opcode, begin, end in walk(records):
         if opcode == Opcode.MESSAGE and end - begin >= MESSAGE.size:
             channel, _, log_time, publish_time = MESSAGE.unpack_from(records, begin)
@@ -151,7 +234,18 @@ def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:
 
 
 def walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
-    """(opcode, begin, end) of each whole record."""
+    """Whole records, until the first one that is cut.
+
+    Parameters
+    ----------
+    records : bytes or memoryview
+        As they are in a file or a chunk.
+
+    Yields
+    ------
+    (int, int, int)
+        Opcode, begin and end of the content.
+    """
     position, size, header, unpack = 0, len(records), RECORD.size, RECORD.unpack_from
     while position + header <= size:
         opcode, length = unpack(records, position)
@@ -163,7 +257,24 @@ def walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
 
 
 def inflate(compression: str, data: memoryview, limit: int) -> tuple[bytes | memoryview, str]:
-    """Decompress at most `limit` + 1 bytes; returns them, and what went wrong on the way (or "")."""
+    """Decompress with a limit, whatever the data claims of itself.
+
+    Parameters
+    ----------
+    compression : str
+        `zstd`, `lz4`, or empty for none.
+    data : memoryview
+        What was compressed.
+    limit : int
+        Bytes to give at most, and one more.
+
+    Returns
+    -------
+    bytes or memoryview
+        As far as it went.
+    str
+        What went wrong; empty where nothing did.
+    """
     if not compression:
         return data[: limit + 1], ""
     if compression == "zstd":
@@ -200,7 +311,20 @@ class _Exact(ReadDataStream):
 
 
 def parse(kind: type[Any], content: bytes | memoryview) -> Any:
-    """The content of one record, or None where it contradicts itself."""
+    """Content of one record.
+
+    Parameters
+    ----------
+    kind : type
+        Record class of the mcap package.
+    content : bytes or memoryview
+        Its bytes.
+
+    Returns
+    -------
+    object
+        The record, or None where it contradicts itself.
+    """
     try:
         return kind.read(_Exact(BytesIO(content)))
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
@@ -473,10 +597,34 @@ class _Scanner:
 
 
 def count(number: int, what: str) -> str:
-    """`1 message`, `61 340 messages`."""
+    """A count for a sentence: `1 message`, `61 340 messages`.
+
+    Parameters
+    ----------
+    number : int
+        How many.
+    what : str
+        The noun in the singular.
+
+    Returns
+    -------
+    str
+        Thousands apart.
+    """
     return f"{number:,}".replace(",", " ") + f" {what}{'' if number == 1 else 's'}"
 
 
 def seconds(time_ns: int) -> str:
-    """Nanoseconds written as seconds, exact to the millisecond."""
+    """Nanoseconds written as seconds, exact to the millisecond.
+
+    Parameters
+    ----------
+    time_ns : int
+        A time of zero or more, ns.
+
+    Returns
+    -------
+    str
+        Cut after the millisecond.
+    """
     return f"{time_ns // 10**9}.{time_ns % 10**9 // 10**6:03d}"

@@ -56,10 +56,12 @@ class McapWriter:
 
     Parameters
     ----------
-    stream : binary file
+    stream : binary stream
+        Open for writing; it stays open.
     library : str
         Who writes.
-    profile : str
+    profile : str, default "ros2"
+        MCAP profile of the file.
     compression : str, optional
         Of the chunks made here: zstd, lz4 or "" for none; default zstd where it is installed.
     """
@@ -82,30 +84,89 @@ class McapWriter:
         self._write(MAGIC + _record(_HEADER, _text(profile) + _text(library)))
 
     def metadata(self, name: str, pairs: Mapping[str, str]) -> None:
-        """Add named texts."""
+        """Add named texts.
+
+        Parameters
+        ----------
+        name : str
+            Of the metadata record.
+        pairs : mapping of str to str
+            Its texts.
+        """
         self.copied_metadata(_text(name) + _map(pairs), name)
 
     def channel(self, topic: str, type_name: str, definition: str) -> int:
-        """Declare a topic with CDR messages of a type that is defined as in .msg files; returns its number."""
+        """Declare a topic with CDR messages of a type that is defined as in .msg files.
+
+        Parameters
+        ----------
+        topic : str
+            Its name.
+        type_name : str
+            As package/msg/Name.
+        definition : str
+            Text of the type and of all it uses.
+
+        Returns
+        -------
+        int
+            Number of the channel.
+        """
         schema, number = max(self._schemas, default=0) + 1, max(self._channels, default=0) + 1
         self.declare_schema(schema, type_name, "ros2msg", definition.encode())
         self.declare_channel(number, schema, topic, "cdr", {})
         return number
 
     def declare_schema(self, number: int, name: str, encoding: str, data: bytes) -> None:
-        """A schema of this number, which none has yet."""
+        """Declare a schema.
+
+        Parameters
+        ----------
+        number : int
+            One that no schema has yet.
+        name : str
+            Of the type.
+        encoding : str
+            Of the text.
+        data : bytes
+            The text.
+        """
         body = struct.pack("<H", number) + _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
         self._schemas[number] = _record(_SCHEMA, body)
         self._write(self._schemas[number])
 
     def declare_channel(self, number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> None:
-        """A channel of this number, which none has yet; schema 0 for none."""
+        """Declare a channel.
+
+        Parameters
+        ----------
+        number : int
+            One that no channel has yet.
+        schema : int
+            Number of its schema; 0 for none.
+        topic : str
+            Name of its topic.
+        encoding : str
+            Of its messages.
+        metadata : mapping of str to str
+            To be stored with it.
+        """
         body = struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + _map(metadata)
         self._channels[number] = _record(_CHANNEL, body)
         self._write(self._channels[number])
 
     def message(self, channel: int, log_time: int, data: bytes) -> None:
-        """Add one message; log_time in ns, not less than the one before."""
+        """Add one message.
+
+        Parameters
+        ----------
+        channel : int
+            Its number.
+        log_time : int
+            Log time, ns, not less than the one before; also the publish time.
+        data : bytes
+            Serialised message.
+        """
         if not self._parts:
             self._begin_of_chunk = log_time
         self._end_of_chunk = log_time
@@ -130,7 +191,8 @@ class McapWriter:
         Parameters
         ----------
         records : bytes
-        index : mapping
+            As they are in the chunk, not compressed.
+        index : mapping of int to bytes
             Per channel the log time and the place of each of its messages in the records, as `INDEX_ENTRY`.
         span : (int, int)
             Smallest and largest log time, ns.
@@ -141,16 +203,31 @@ class McapWriter:
         self._write_chunk(records, index, span, packed)
 
     def copied_metadata(self, body: bytes, name: str) -> None:
-        """A metadata record of this content."""
+        """Add a metadata record.
+
+        Parameters
+        ----------
+        body : bytes
+            Its content.
+        name : str
+            Its name, which is part of the content.
+        """
         self._end_chunk()
         record = _record(_METADATA, body)
         self._metadata.append(_record(_METADATA_INDEX, struct.pack("<QQ", self._at, len(record)) + _text(name)))
         self._write(record)
 
     def copied_attachment(self, pieces: Iterable[bytes], length: int, head: tuple[int, int, int, str, str]) -> None:
-        """An attachment whose content is these pieces, in all `length` bytes.
+        """Add an attachment.
 
-        head: its log time and time of creation, ns, the size of its data, its name and its media type.
+        Parameters
+        ----------
+        pieces : iterable of bytes
+            Its content, piece by piece.
+        length : int
+            Bytes of all pieces.
+        head : (int, int, int, str, str)
+            Log time and time of creation, ns, size of its data, its name and its media type.
         """
         self._end_chunk()
         start = self._at
@@ -162,7 +239,15 @@ class McapWriter:
         self._attachments.append(_record(_ATTACHMENT_INDEX, body + _text(name) + _text(media_type)))
 
     def copied_record(self, opcode: int, body: bytes) -> None:
-        """A record that no index knows, for example a private one."""
+        """Add a record that no index knows, for example a private one.
+
+        Parameters
+        ----------
+        opcode : int
+            Its kind.
+        body : bytes
+            Its content.
+        """
         self._end_chunk()
         self._write(_record(opcode, body))
 

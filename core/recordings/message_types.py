@@ -40,7 +40,18 @@ _KINDS: Mapping[str, Any] = dict.fromkeys(CODES, "number") | {"bool": "bool", "s
 class Definition:
     """How messages of one schema are decoded.
 
-    reason says why they cannot be ("" where they can); note what the reader had to add.
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name.
+    types : mapping of str to object
+        Parsed definitions of the type and of all it uses.
+    store : Typestore
+        Where they are registered.
+    reason : str, default ""
+        Why messages cannot be decoded; empty where they can.
+    note : str, default ""
+        What the reader had to add.
     """
 
     type_name: str
@@ -50,9 +61,24 @@ class Definition:
     note: str = ""
 
     def decode(self, data: bytes) -> Any:
-        """Decode one CDR message; raises BagError where it does not fit the definition.
+        """Decode one CDR message.
 
         Text that is no UTF-8, has no closing zero, or has not even the length of one, is read as the middleware does.
+
+        Parameters
+        ----------
+        data : bytes
+            Serialised message.
+
+        Returns
+        -------
+        object
+            The message.
+
+        Raises
+        ------
+        BagError
+            It does not fit the definition.
         """
         try:
             return self.decode_strictly(data)
@@ -67,7 +93,23 @@ class Definition:
             raise
 
     def decode_strictly(self, data: bytes) -> Any:
-        """As `decode`; raises BagError also where text is not as it should be."""
+        """Decode one CDR message whose text is as it should be.
+
+        Parameters
+        ----------
+        data : bytes
+            Serialised message.
+
+        Returns
+        -------
+        object
+            The message.
+
+        Raises
+        ------
+        BagError
+            It does not fit the definition.
+        """
         try:
             data = _plain(data)
             return self.store.deserialize_cdr(data, self.type_name)
@@ -116,7 +158,18 @@ class Definition:
         return fields if "stamp" in fields and fields["stamp"].type_name == "builtin_interfaces/msg/Time" else {}
 
     def stamp_ns(self, data: bytes) -> int | None:
-        """`header_stamp_ns` of an encoded message, read from its first bytes where the header stands there."""
+        """`header_stamp_ns` of an encoded message, read from its first bytes where the header stands there.
+
+        Parameters
+        ----------
+        data : bytes
+            Serialised message.
+
+        Returns
+        -------
+        int or None
+            None where there is no header, the stamp is zero, or the message cannot be decoded.
+        """
         if not self.has_header:
             return None
         if not self._header_first:
@@ -134,7 +187,23 @@ class Definition:
         return sec * 1_000_000_000 + nanosec or None
 
     def fields(self, type_name: str) -> Mapping[str, FieldType]:
-        """Field name -> FieldType of a type in this schema; raises SignalError for one that is not in it."""
+        """Fields of a type in this schema.
+
+        Parameters
+        ----------
+        type_name : str
+            As package/msg/Name.
+
+        Returns
+        -------
+        mapping of str to FieldType
+            Field name -> FieldType.
+
+        Raises
+        ------
+        SignalError
+            The type is not in the schema.
+        """
         if type_name not in self.types:
             raise SignalError(f"{type_name}: not defined with {self.type_name}; check the type")
         return {
@@ -202,7 +271,18 @@ def _plain(data: bytes) -> bytes:
 
 
 def header_stamp_ns(message: Any) -> int | None:
-    """Header stamp of a message (rosbags or rclpy) in ns; None where it has no header or the stamp is zero."""
+    """Header stamp of a message (rosbags or rclpy) in ns; None where it has no header or the stamp is zero.
+
+    Parameters
+    ----------
+    message : object
+        Decoded message (rosbags or rclpy).
+
+    Returns
+    -------
+    int or None
+        Stamp, or None.
+    """
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is None:
         return None
@@ -211,17 +291,42 @@ def header_stamp_ns(message: Any) -> int | None:
 
 
 def normal_name(name: str) -> str:
-    """`pkg/msg/Type` also for `pkg/Type`."""
+    """`pkg/msg/Type` also for `pkg/Type`.
+
+    Parameters
+    ----------
+    name : str
+        Name of a type.
+
+    Returns
+    -------
+    str
+        As package/msg/Name.
+    """
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 @functools.lru_cache(maxsize=1024)
 def define(name: str, encoding: str, text: bytes) -> Definition:
-    """Definition from a schema's name, encoding (`ros2msg`, `ros2idl`) and text; its reason says what failed.
+    """Definition from a schema; its reason says what failed.
 
-    Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it; likewise
-    for types that a text uses and does not define.
+    Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it; likewise for
+    types that a text uses and does not define.
+
+    Parameters
+    ----------
+    name : str
+        Of the type.
+    encoding : str
+        `ros2msg` or `ros2idl`.
+    text : bytes
+        Of the schema.
+
+    Returns
+    -------
+    Definition
+        Whether it can be used or not.
     """
     type_name = normal_name(name)
     types: dict[str, Any] = {}
@@ -249,12 +354,36 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
 
 
 def jazzy_text(type_name: str) -> str:
-    """Definition of a type of ROS 2 Jazzy and of all it uses, as in .msg files."""
+    """Definition of a type of ROS 2 Jazzy and of all it uses, as in .msg files.
+
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name.
+
+    Returns
+    -------
+    str
+        The text.
+    """
     return str(_jazzy().generate_msgdef(type_name, ros_version=2)[0])
 
 
 def undefined(type_name: str, reason: str) -> Definition:
-    """Definition of something that is not decoded, for the reason given."""
+    """Definition of something that is not decoded, for the reason given.
+
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name.
+    reason : str
+        Why messages are not decoded.
+
+    Returns
+    -------
+    Definition
+        With that reason.
+    """
     return Definition(type_name, {}, get_typestore(Stores.EMPTY), reason)
 
 
