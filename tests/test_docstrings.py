@@ -232,7 +232,7 @@ def _wanting(module: Module, name: str, node: Function | ast.ClassDef, said: dic
 
 
 PENDING = (
-    "core/cli", "core/model", "core/monitor", "core/proposal", "core/recordings/cdr_arrays", "core/recordings/message_reader",
+    "core/model", "core/monitor", "core/recordings/cdr_arrays", "core/recordings/message_reader",
     "core/sampling/sampler", "uncertain_lti_ros",
 )  # fmt: skip
 """Beginnings of the paths whose docstrings do not have every section yet."""

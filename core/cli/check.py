@@ -10,7 +10,13 @@ from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti check`."""
+    """Declare the arguments of `uncertain-lti check`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders")
     parser.add_argument("--violations", type=int, help="alarm: so many violations (default: the model's)")
@@ -26,7 +32,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check each recording and return whether the alarm was raised."""
+    """Check each recording and return whether the alarm was raised.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 1 if the alarm was raised, else 0.
+
+    Raises
+    ------
+    UncertainLTIError
+        The model or a recording cannot be read, or a copy cannot be written.
+    """
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.base.english import plural
     from uncertain_lti.recordings.bag import group_recordings

@@ -31,14 +31,18 @@ class Command:
 
     Parameters
     ----------
-    name, help : str
-        The word on the command line, and what it does, for the list of commands.
+    name : str
+        The word on the command line.
+    help : str
+        What the command does, for the list of commands.
     add_arguments : callable
         Declares the arguments on a parser.
     run : callable
         Runs the command with the parsed options and returns the exit status. `options.progress` is a `Progress`.
-    quiet, verbose : str
-        What `--quiet` and `--verbose` do, for the help; "" if the command has no such option.
+    quiet : str, default ""
+        What `--quiet` does, for the help; empty if the command has no such option.
+    verbose : str, default ""
+        What `--verbose` does, likewise.
     deferred : bool
         `add_arguments` imports what not every installation has: it is called for the chosen command alone.
     """
@@ -53,25 +57,57 @@ class Command:
 
 
 def print_summary(options: argparse.Namespace, text: str) -> None:
-    """Print part of the summary for a person, unless JSON is asked for or nothing at all."""
+    """Print part of the summary for a person, unless JSON is asked for or nothing at all.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `json` and `progress`.
+    text : str
+        Lines of the summary.
+    """
     if not options.json:
         options.progress.say(text)
 
 
 def print_json(data: Any) -> None:
-    """Print data for a program."""
+    """Print data for a program.
+
+    Parameters
+    ----------
+    data : object
+        Plain data without NaN.
+    """
     json.dump(data, sys.stdout, allow_nan=False, indent=1)
     sys.stdout.write("\n")
 
 
 def print_notes(options: argparse.Namespace, notes: Iterable[str]) -> None:
-    """Print remarks on standard error, unless quiet."""
+    """Print remarks on standard error, unless quiet.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+    notes : iterable of str
+        A sentence each.
+    """
     for note in notes:
         options.progress.note(note)
 
 
 def load_model(name: str) -> UncertainLTI:
     """Load the model of a file, or the published one by its name.
+
+    Parameters
+    ----------
+    name : str
+        Path of a model file, or `leibov2006`.
+
+    Returns
+    -------
+    UncertainLTI
+        The model.
 
     Raises
     ------
@@ -91,7 +127,23 @@ def load_model(name: str) -> UncertainLTI:
 
 
 def model_target(path: str) -> Path:
-    """Where a model file goes; raises as `files.target`."""
+    """Where a model file goes; an older one is replaced, and nothing else.
+
+    Parameters
+    ----------
+    path : str
+        What the user named.
+
+    Returns
+    -------
+    Path
+        The path.
+
+    Raises
+    ------
+    BagError
+        As `files.target`.
+    """
     from uncertain_lti.base.files import target
 
     return target(path, holds=b'"uncertain-lti/', kind="model file", example="machine.model.json")

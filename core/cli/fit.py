@@ -15,7 +15,13 @@ from uncertain_lti.cli.command import DONE, SILENT, Command, model_target, print
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti fit`."""
+    """Declare the arguments of `uncertain-lti fit`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument(
         "bags", metavar="BAG", nargs="+", help="MCAP files and folders; parts of a split bag are one recording"
     )
@@ -49,7 +55,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit a model and write it."""
+    """Fit a model and write it.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    FitError
+        A number of workers is below 1, or no model can be fitted.
+    UncertainLTIError
+        A recording or the signals file cannot be read.
+    """
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
     from uncertain_lti.reports.text import fit_text, left_out_text, next_text, recording_text

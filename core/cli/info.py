@@ -8,13 +8,35 @@ from uncertain_lti.cli.command import DONE, Command, load_model, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti info`."""
+    """Declare the arguments of `uncertain-lti info`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     parser.add_argument("--json", action="store_true", help="print the file as JSON")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the model."""
+    """Print the model.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    ModelError
+        The model cannot be read.
+    """
     from uncertain_lti.reports.text import model_text
 
     model = load_model(options.model)

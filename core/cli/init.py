@@ -11,7 +11,13 @@ from uncertain_lti.cli.command import DONE, Command, print_notes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti init`."""
+    """Declare the arguments of `uncertain-lti init`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders of the same machine")
     parser.add_argument(
         "--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)"
@@ -19,7 +25,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write or print the proposed signals file."""
+    """Write or print the proposed signals file.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    SignalError
+        The output is there already, or cannot be written.
+    BagError
+        A recording cannot be read, or holds no state.
+    """
     from uncertain_lti.base.files import whole_file
     from uncertain_lti.proposal.init import propose
 

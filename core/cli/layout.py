@@ -8,7 +8,13 @@ from uncertain_lti.cli.command import DONE, Command, load_model
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti layout`."""
+    """Declare the arguments of `uncertain-lti layout`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     parser.add_argument("--foxglove", metavar="FILE.json", help="for Foxglove and Lichtblick")
     parser.add_argument("--plotjuggler", metavar="FILE.xml", help="for PlotJuggler")
@@ -16,7 +22,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the layouts that are asked for."""
+    """Write the layouts that are asked for.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    ModelError
+        The model cannot be read, or a layout cannot be written.
+    """
     from uncertain_lti.reports.layouts import write_layouts
 
     for path in write_layouts(load_model(options.model), options.foxglove, options.plotjuggler, options.topics):

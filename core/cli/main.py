@@ -42,7 +42,18 @@ _EXTRAS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; exit status 0 done, 1 the alarm was raised, 2 bad usage or input, 130 interrupted."""
+    """Run one command.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Words of the command line; default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 130 interrupted.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     command = next((a for a in given if not a.startswith("-")), "")
     try:
@@ -70,7 +81,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def build_parser(chosen: str = "") -> argparse.ArgumentParser:
-    """Declare the arguments of every command; those that need rclpy, only of the chosen one."""
+    """Declare the arguments of every command; those that need rclpy, only of the chosen one.
+
+    Parameters
+    ----------
+    chosen : str, default ""
+        Name of the command that will run, or empty.
+
+    Returns
+    -------
+    argparse.ArgumentParser
+        Of the whole program.
+    """
     parser = _Parser(
         prog="uncertain-lti",
         description="Fit an uncertain linear model to recorded transients, and tell when a machine leaves it.",

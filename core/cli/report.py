@@ -8,7 +8,13 @@ from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti report`."""
+    """Declare the arguments of `uncertain-lti report`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders to check against it")
     parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
@@ -16,7 +22,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the page or print its facts, and return whether the alarm was raised."""
+    """Write the page or print its facts, and return whether the alarm was raised.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 1 if the alarm was raised, else 0.
+
+    Raises
+    ------
+    UncertainLTIError
+        The model or a recording cannot be read, or the page cannot be written.
+    """
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.reports.findings import findings, page_target

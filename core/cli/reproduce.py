@@ -9,14 +9,36 @@ from uncertain_lti.cli.command import DONE, Command
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti reproduce`."""
+    """Declare the arguments of `uncertain-lti reproduce`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument(
         "--output", default="reproduce-output", metavar="FOLDER", help="for figures, models and numbers"
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the experiment into a folder."""
+    """Run the experiment into a folder.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    BagError
+        The folder cannot be written.
+    """
     from uncertain_lti.plants.reproduce import reproduce
 
     try:

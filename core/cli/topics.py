@@ -8,13 +8,35 @@ from uncertain_lti.cli.command import DONE, Command, print_json, print_notes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti topics`."""
+    """Declare the arguments of `uncertain-lti topics`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("bag", metavar="BAG", help="MCAP file, or folder of a recording")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the topics of a recording and what each holds."""
+    """Print the topics of a recording and what each holds.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    BagError
+        The recording cannot be read.
+    """
     from uncertain_lti.recordings.bag import Bag, describe
     from uncertain_lti.reports.text import number, table
 

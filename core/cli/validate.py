@@ -9,7 +9,13 @@ from uncertain_lti.cli.command import DONE, SILENT, Command, model_target, print
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti validate`."""
+    """Declare the arguments of `uncertain-lti validate`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("model", metavar="MODEL", help="model file")
     parser.add_argument(
         "bags", metavar="BAG", nargs="*", help="MCAP files and folders (default: those the model was fitted to)"
@@ -30,7 +36,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Validate the model and write it with the result, if an output is named."""
+    """Validate the model and write it with the result, if an output is named.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    BagError
+        The model does not name its recordings, or one cannot be read.
+    FitError
+        The recordings do not give the model again, or no alarm rule keeps to the wish.
+    """
     from uncertain_lti import UncertainLTI
     from uncertain_lti.recordings.bag import group_recordings
     from uncertain_lti.reports.text import validation_text

@@ -18,9 +18,28 @@ FEWEST = 20
 class Candidate:
     """One number of a topic that could be a signal.
 
-    values, one array (messages,) per recording, NaN where there is none; reason says why it is not proposed ("" where
-    it is, or nothing speaks against it); ready is "state" or "control" for one that a person may well want back; delay
-    is by how many samples the states follow a control later.
+    Parameters
+    ----------
+    topic : str
+        Its topic.
+    path : str
+        Of the number in the message, as `FieldPath` reads it.
+    values : list of array (messages,), optional
+        One array per recording; NaN where there is none.
+    name : str, default ""
+        Of the signal, once it is chosen.
+    unit : str, default ""
+        Of the signal; empty where it is unknown.
+    reason : str, default ""
+        Why it is not proposed; empty where it is, or nothing speaks against it.
+    ready : str, default ""
+        `state` or `control` for one that a person may well want back; empty for others.
+    steady : float, default 0.0
+        Steady state, recorded units.
+    scale : float, default 1.0
+        Scale, recorded units.
+    delay : int, default 0
+        Samples by which the states follow a control later.
     """
 
     topic: str
@@ -48,10 +67,31 @@ class Candidate:
 
 @dataclass
 class Source:
-    """One topic: times of arrival and stamps in ns per recording, what it seems to be, and its numbers.
+    """One topic: its times per recording, what it seems to be, and its numbers.
 
-    role is "control", "wish" (a reference of some controller), "state", "" (unknown) or "apart" (neither). halting: its
-    header stamps mostly stand still.
+    Parameters
+    ----------
+    topic : str
+        Its name.
+    type : str
+        Message type, `pkg/msg/Type`.
+    role : str
+        `control`, `wish` (a reference of some controller), `state`, empty (unknown), `apart` (neither) or `guess` (a
+        control by its effect).
+    stamped : bool
+        Whether header stamps can be used.
+    offset : float or None
+        Median of log time less header stamp, s; None without a stamp.
+    arrival : list of array (messages,) of int, optional
+        Log times per recording, ns.
+    stamp : list of array (messages,) of int, optional
+        Header stamps per recording, ns; negative for none.
+    candidates : list of Candidate, optional
+        Its numbers.
+    reason : str, default ""
+        Why none of them is proposed; empty otherwise.
+    halting : bool, default False
+        Its header stamps mostly repeat the one before.
     """
 
     topic: str
@@ -77,7 +117,22 @@ class Source:
         return sum(len(a) - 1 for a in self.arrival if len(a) > 1) / span if span > 0 else 0.0
 
     def instants(self, clock: Source, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Times of this topic's messages and another one's by one clock: stamps where both have them, else arrival."""
+        """Times of this topic's messages and another one's by one clock: stamps where both have them, else arrival.
+
+        Parameters
+        ----------
+        clock : Source
+            The other topic.
+        number : int
+            Which recording.
+
+        Returns
+        -------
+        array (messages,) of int
+            Of this topic, ns.
+        array (messages,) of int
+            Of the other one, ns.
+        """
         if self.stamped and clock.stamped and abs((self.offset or 0.0) - (clock.offset or 0.0)) <= 1.0:
             mine, theirs = self.stamp[number], clock.stamp[number]
             if all(len(s) and s[0] >= 0 and (np.diff(s) >= 0).all() for s in (mine, theirs)):

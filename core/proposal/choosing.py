@@ -22,7 +22,22 @@ MOST_STATES, MOST_CONTROLS = 8, 6
 
 
 def choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[Candidate], str]:
-    """States of the model, and a sentence where they look like none; reasons go to what is left out."""
+    """States of the model, and a sentence where they look like none; reasons go to what is left out.
+
+    Parameters
+    ----------
+    states : sequence of Source
+        Topics that may be the state; those left out get a reason.
+    controls : sequence of Source
+        Topics of the controls; numbers left out get a reason.
+
+    Returns
+    -------
+    list of Candidate
+        States of the model.
+    str
+        A sentence where they look like none; else empty.
+    """
     every = {s.topic: s for s in [*states, *controls]}
     for source in states:
         prefer_rates(source)

@@ -20,16 +20,40 @@ FAINT = 5.0
 
 @dataclass(frozen=True)
 class Steps:
-    """Transitions of some states X (N, n) with the controls U (N, m) in force, and what changed, dX (N, n)."""
+    """Transitions of some states, with the controls in force.
+
+    Parameters
+    ----------
+    X : array (N, n)
+        States, recorded units.
+    U : array (N, m)
+        Controls, recorded units.
+    dX : array (N, n)
+        What the states change by.
+    """
 
     X: Array
     U: Array
     dX: Array
 
     def effect(self, on: Sequence[int], of: Sequence[int] | None = None, given: Sequence[int] | None = None) -> Array:
-        """F statistic (len(on),) in the next step of states `on`: of the controls, or of states `of`.
+        """F statistic in the next step of some states: of the controls, or of other states.
 
         Beside states `given` (default all), and beside the controls where these are not what is asked for.
+
+        Parameters
+        ----------
+        on : sequence of int
+            Positions of the states that are explained.
+        of : sequence of int, optional
+            Positions of the states that explain; default the controls.
+        given : sequence of int, optional
+            Positions of the states that are known anyway; default all.
+
+        Returns
+        -------
+        array (len(on),)
+            0 where too few transitions are there.
         """
         n, m = self.X.shape[1], self.U.shape[1]
         tested = list(range(n, n + m)) if of is None else list(of)
@@ -47,7 +71,20 @@ class Steps:
 
 
 def residual(Z: Array, Y: Array) -> Array:
-    """Sum of squares (k,) that a least-squares fit of Y (N, k) on [1, Z] leaves."""
+    """Sum of squares that a least-squares fit on [1, Z] leaves.
+
+    Parameters
+    ----------
+    Z : array (N, j)
+        Regressors.
+    Y : array (N, k)
+        Targets.
+
+    Returns
+    -------
+    array (k,)
+        Units of Y squared.
+    """
     size = np.maximum(np.abs(Z).max(axis=0, initial=0.0), 1e-300)
     design = np.hstack([np.ones((len(Z), 1)), Z / size])
     Q, _ = np.linalg.qr(design)
@@ -60,7 +97,21 @@ def steps_of(
 ) -> Steps:
     """Samples on the messages of the slowest of the states' topics; of the others, the latest message before.
 
-    lags: by how many samples each control is taken earlier; none by default.
+    Parameters
+    ----------
+    state : sequence of Candidate
+        Candidates for states.
+    of : dict of str to Source
+        Topic -> source.
+    controls : sequence of Candidate
+        Candidates for controls.
+    lags : sequence of int, optional
+        Samples by which each control is taken earlier; none by default.
+
+    Returns
+    -------
+    Steps
+        At most 200 000 steps per recording.
     """
     lags = lags or [0] * len(controls)
     longest = max(lags, default=0)
@@ -97,7 +148,26 @@ def steps_of(
 
 
 def held(candidate: Candidate, source: Source, number: int, clock: Source, oldest: float | None = None) -> Array:
-    """Latest value at each message of the clock; NaN before the first, and where it is older than `oldest` s."""
+    """Latest value at each message of the clock.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        What is read.
+    source : Source
+        Its topic.
+    number : int
+        Which recording.
+    clock : Source
+        Topic whose messages give the instants.
+    oldest : float, optional
+        Greatest age, s; default no limit.
+
+    Returns
+    -------
+    array (messages of the clock,)
+        NaN before the first value, and where it is too old.
+    """
     if number >= len(source.arrival) or not len(source.arrival[number]) or number >= len(candidate.values):
         return np.full(len(clock.arrival[number]), np.nan)
     mine, at = source.instants(clock, number)
@@ -109,7 +179,20 @@ def held(candidate: Candidate, source: Source, number: int, clock: Source, oldes
 
 
 def explained(state: Source, controls: Sequence[Source]) -> float:
-    """How clearly these topics show in the next step of the best of a topic's numbers."""
+    """How clearly some topics show in the next step of the best of a topic's numbers.
+
+    Parameters
+    ----------
+    state : Source
+        The topic that is explained.
+    controls : sequence of Source
+        The topics that explain.
+
+    Returns
+    -------
+    float
+        Largest F statistic; 0 with too few transitions.
+    """
     every = {s.topic: s for s in [state, *controls]}
     steps = steps_of(state.free, every, [c for s in controls for c in s.free])
     if len(steps.X) < FEWEST:

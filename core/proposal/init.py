@@ -20,7 +20,19 @@ from uncertain_lti.recordings.bag import group_recordings
 
 @dataclass(frozen=True)
 class Proposal:
-    """States and controls of a machine, as far as a recording tells; `text` is the signals file, with its reasons."""
+    """States and controls of a machine, as far as a recording tells.
+
+    Parameters
+    ----------
+    states : tuple of Candidate
+        Proposed states.
+    controls : tuple of Candidate
+        Proposed controls.
+    text : str
+        The signals file, with its reasons.
+    warnings : tuple of str, optional
+        What the reader should know, a sentence each.
+    """
 
     states: tuple[Candidate, ...]
     controls: tuple[Candidate, ...]
@@ -41,6 +53,11 @@ def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = 
         As for `read_transients`.
     progress : callable, optional
         As for `read_transients`.
+
+    Returns
+    -------
+    Proposal
+        With the text of the file.
 
     Raises
     ------

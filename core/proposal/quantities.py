@@ -14,7 +14,17 @@ from uncertain_lti.signals.signal_map import Signal
 
 
 def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> None:
-    """Steady states and scales by the rule for `auto`; the range where the magnitude is small beside it."""
+    """Steady states and scales by the rule for `auto`; the range where the magnitude is small beside it.
+
+    Parameters
+    ----------
+    states : sequence of Candidate
+        Get `steady` and `scale`.
+    controls : sequence of Candidate
+        Likewise.
+    sources : sequence of Source
+        All topics.
+    """
     every = {s.topic: s for s in sources}
     clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
     group = [*states, *controls]
@@ -35,14 +45,35 @@ def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidat
 
 
 def set_own_scale(candidate: Candidate) -> None:
-    """Median and range, for one that stands in a comment."""
+    """Median and range, for one that stands in a comment.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Gets `steady` and `scale`.
+    """
     finite = np.concatenate(candidate.values)
     finite = finite[np.isfinite(finite)]
     candidate.steady, candidate.scale = float(np.median(finite)), float(np.ptp(finite))
 
 
 def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
-    """Greatest age of a command that comes at a steady rate and ends, or pauses, before the states do."""
+    """Greatest age of a command that comes at a steady rate and ends, or pauses, before the states do.
+
+    Parameters
+    ----------
+    source : Source
+        Topic of the command.
+    clock : Source
+        Topic of the states.
+
+    Returns
+    -------
+    float or None
+        Greatest age, s; None for no limit.
+    str
+        The reason, for a comment.
+    """
     steps = np.concatenate([np.diff(a) for a in source.arrival if len(a) > 1] or [np.empty(0)]) * 1e-9
     steps = steps[steps > 0]
     if not len(steps):

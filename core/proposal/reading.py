@@ -35,7 +35,20 @@ _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 
 
 def read_sources(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
-    """Every topic of the recordings with its numbers."""
+    """Every topic of the recordings with its numbers.
+
+    Parameters
+    ----------
+    bags : sequence of Bag
+        The recordings.
+    progress : callable or None
+        As for `read_transients`.
+
+    Returns
+    -------
+    list of Source
+        One per topic; those that cannot be used have a reason and no candidates.
+    """
     facts: dict[str, TopicFacts] = {}
     for bag in bags:
         for fact in describe(bag, progress):

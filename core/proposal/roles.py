@@ -42,7 +42,20 @@ _APART_TYPES = {
 
 
 def role_by_name(topic: str, type_name: str) -> str:
-    """What a topic seems to be by its name, the last word first, else by its type."""
+    """What a topic seems to be by its name, the last word first, else by its type.
+
+    Parameters
+    ----------
+    topic : str
+        Its name.
+    type_name : str
+        Its message type, `pkg/msg/Type`.
+
+    Returns
+    -------
+    str
+        As `Source.role`.
+    """
     if type_name in _APART_TYPES:
         return "apart"
     name = topic.strip("/").lower()
@@ -65,7 +78,20 @@ def role_by_name(topic: str, type_name: str) -> str:
 
 
 def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
-    """Topics of the controls, and those that may be the state."""
+    """Which topics are controls, and which may be the state.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+        All topics; those that are neither get a reason.
+
+    Returns
+    -------
+    list of Source
+        Topics of the controls.
+    list of Source
+        Topics that may be the state.
+    """
     moving = [s for s in sources if s.free]
     controls = [s for s in moving if s.role == "control"]
     wishes = [s for s in moving if s.role == "wish"]

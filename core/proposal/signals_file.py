@@ -15,7 +15,26 @@ def signals_file(
     bags: Sequence[Bag], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
     doubt: str,
 ) -> str:  # fmt: skip
-    """Write the text of the file."""
+    """Write the text of the file.
+
+    Parameters
+    ----------
+    bags : sequence of Bag
+        The recordings.
+    sources : sequence of Source
+        All topics, with the reasons of those left out.
+    states : sequence of Candidate
+        Proposed states.
+    controls : sequence of Candidate
+        Proposed controls.
+    doubt : str
+        A sentence about the states, or an empty text.
+
+    Returns
+    -------
+    str
+        YAML with comments.
+    """
     every = {s.topic: s for s in sources}
     topics = list(dict.fromkeys(c.topic for c in [*states, *controls]))
     clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
