@@ -1,6 +1,7 @@
 """The house: rooms that import in one direction, modules without circles, a sentence at every door."""
 
 import ast
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -98,3 +99,13 @@ def test_help_imports_nothing_heavy():
     code = "import sys; from uncertain_lti.cli.main import build_parser; build_parser(); print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not {"numpy", "cvxpy", "osqp", "scipy", "matplotlib", "rclpy", "yaml", "mcap", "tqdm"} & set(loaded)
+
+
+def test_nothing_cites_a_document_that_is_not_here():
+    folders = ("core", "uncertain_lti_ros", "tests", "benchmarks", "docs", "config", "launch", "examples")
+    files = [*ROOT.glob("*.*"), *(p for folder in folders for p in (ROOT / folder).rglob("*.*"))]
+    known = {p.name for p in files if p.suffix == ".md"}
+    for path in files:
+        if path.suffix in (".py", ".md", ".yaml", ".toml", ".cfg") and "_build" not in path.parts:
+            cited = set(re.findall(r"\b[A-Z]{4,}\.md\b", path.read_text(encoding="utf-8")))
+            assert cited <= known, f"{path} cites {cited - known}"

@@ -165,7 +165,7 @@ def test_wrong_shapes_are_said(x: tuple[int, ...], u: tuple[int, ...]) -> None:
 
 
 def naive_discrepancy(model: UncertainLTI, transient: Transient, W: np.ndarray) -> tuple[float, list[float]]:
-    """(4)(5) as METHOD section 3 writes them, sample after sample."""
+    """(4)(5) as docs/theory.md writes them, sample after sample."""
     point, n = model.operating_point, model.n
     total, largest = 0.0, [0.0] * n
     free: np.ndarray | None = None

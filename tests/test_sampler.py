@@ -1,4 +1,4 @@
-"""The Sampler against the rules of DESIGN.md, worked out naively with every message in hand."""
+"""The Sampler against its rules, worked out naively with every message in hand."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Sent(NamedTuple):
     values: tuple[float, ...]
 
 
-# --- the reference: the rules of DESIGN.md, one after the other, over the whole list of messages -------------
+# --- the reference: the rules of `sampler`, one after the other, over the whole list of messages -------------
 
 
 @dataclass
@@ -486,7 +486,7 @@ def test_arrival_times_that_loop_do_as_stamps_that_loop(case: tuple[SignalMap, l
     assert unstamped.counters == stamped.counters
 
 
-# --- the rules one by one, as DESIGN.md states them ----------------------------------------------------------
+# --- the rules one by one ----------------------------------------------------------------------------------------
 
 
 def two_topics(**options: object) -> SignalMap:

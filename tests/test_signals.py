@@ -364,7 +364,7 @@ def test_a_path_that_does_not_fit_names_what_is_there(type_name: str, field: str
 
 # --- signals files ------------------------------------------------------------------------------------------
 
-DESIGN = """
+WHOLE = """
 clock: /engine/state
 max_gap: 0.05
 min_step: 0
@@ -384,7 +384,7 @@ def saved(folder: Path, text: str | bytes) -> Path:
 
 
 def test_the_file_of_the_design_says_what_it_says(tmp_path: Path) -> None:
-    signals = SignalMap.load(saved(tmp_path, DESIGN))
+    signals = SignalMap.load(saved(tmp_path, WHOLE))
     assert signals == SignalMap(
         (Signal("fan_speed", "/engine/state", "position[fan]", 1.0, 1.0, "rpm"),),
         (Signal("fuel_flow", "/engine/control", "data[0]", max_hold=0.2, delay=0),),
@@ -520,7 +520,7 @@ anything = st.recursive(
 @st.composite
 def damaged(draw: st.DrawFn) -> Any:
     """The structure of a whole signals file with one to three things replaced, added or taken away."""
-    data = yaml.safe_load(DESIGN)
+    data = yaml.safe_load(WHOLE)
     data |= {"max_skew": 0.1, "topics": {"/engine/state": {"time": "header"}, "/engine/control": {"time": "log"}}}
     for _ in range(draw(st.integers(1, 3))):
         place: Any = data
