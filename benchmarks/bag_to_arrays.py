@@ -49,7 +49,8 @@ from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.recordings.mcap_records import crc32
 from uncertain_lti.sampling.reading import read_transients, sample, sample_by_message
 from uncertain_lti.sampling.streams import read_stream
-from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 PATHS = {
     "/joint_states": [f"{part}[{i}]" for part in ("position", "velocity") for i in range(12)],

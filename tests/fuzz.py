@@ -236,7 +236,7 @@ def middleware() -> tuple[Any, Any, Any]:
 def read_messages(rng: random.Random, _: Path) -> str:
     """One damaged message after a few whole ones, by the layouts of the live node and by the middleware alone."""
     from uncertain_lti.recordings.message_reader import UnreadableError
-    from uncertain_lti.signals.signal_map import FieldPath
+    from uncertain_lti.signals.field_path import FieldPath
 
     make_reader, fields, decoder = middleware()
     kind, paths, make = rng.choice(

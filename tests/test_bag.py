@@ -54,7 +54,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.bag import Bag, RawMessage, describe, group_recordings, header_stamp_ns
-from uncertain_lti.signals.signal_map import FieldPath, FieldType
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.field_types import FieldType
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real recordings (../shared/data) are not here")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import struct
 import tempfile
@@ -11,12 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import zstandard
 from bag_writer import (
     COMPRESSIONS,
     Layout,
     Message,
     Topic,
+    cdr,
+    message,
     metadata_yaml,
     write,
     write_folder,
@@ -25,11 +29,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.base.errors import SignalError, UncertainLTIError
+from uncertain_lti.recordings.bag import Bag, describe
 from uncertain_lti.recordings.message_types import Definition, define
 from uncertain_lti.sampling.streams import Stream, read_stream, read_stream_by_message
-from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap, numeric_paths
+from uncertain_lti.signals import functions
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.functions import FUNCTIONS, FieldFunction
+from uncertain_lti.signals.paths import numeric_paths
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 SECOND = 10**9
 STEPS = "=" * 80
@@ -220,7 +228,7 @@ def paths(top: Type, definition: Definition, dice: random.Random) -> list[str]:
     for path in list(found):
         stem, _, last = path.rpartition(".")
         if last in "xyzw" and stem:
-            found += [f"{dice.choice(['roll', 'pitch', 'yaw', 'norm'])}({stem})"]
+            found += [f"{dice.choice(list(FUNCTIONS))}({stem})"]
         if path.endswith("]"):
             found += [f"norm({path[: path.rindex('[')]})", f'{path[: path.rindex("[")]}["{dice.choice(NAMES[:3])}"]']
     good = []
@@ -307,3 +315,30 @@ def test_the_same_as_message_by_message(
     files = {n: write(topics, written[a:b], layout) for n, a, b in zip(names, edges, edges[1:], strict=False)}
     folder = write_folder(Path(tempfile.mkdtemp(dir=tmp_path)), files, metadata_yaml(names))
     assert_same(folder, signal_map(wanted))
+
+
+def test_a_function_added_to_the_table_is_read_and_offered(tmp_path, monkeypatch):
+    """One entry in the table is all that a further function of a quaternion takes."""
+
+    def terms(x, y, z, w):
+        norm2 = x * x + y * y + z * z + w * w
+        return (norm2 - 2.0 * (x * x + y * y), norm2), norm2
+
+    tilt = FieldFunction(functions.QUATERNION, terms, lambda up, norm2: math.acos(up / norm2), unit="rad")
+    monkeypatch.setitem(FUNCTIONS, "tilt", tilt)
+    turns = [0.0, 0.5, 1.0, -2.0]
+    quaternions = [(math.sin(a / 2), 0.0, 0.0, math.cos(a / 2)) for a in turns] + [(0.0,) * 4]
+    quaternions = [message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q, strict=True))) for q in quaternions]
+    kind, place = "geometry_msgs/msg/Pose", message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
+    sent = [
+        Message("/pose", i * SECOND, cdr(kind, position=place, orientation=q)) for i, q in enumerate(quaternions, 1)
+    ]
+    path = write([Topic("/pose", kind)], sent).save(tmp_path / "a.mcap")
+
+    signals = SignalMap((Signal("tilt", "/pose", "tilt(orientation)"), Signal("x", "/pose", "position.x")))
+    assert_same(path, signals)
+    np.testing.assert_allclose(read_stream(Bag(path), signals).values[0][:, 0], [*map(abs, turns), math.nan])
+    (facts,) = describe(Bag(path))
+    assert "tilt(orientation)" in facts.fields
+    with pytest.raises(SignalError, match=r"wants a quaternion"):
+        read_stream(Bag(path), SignalMap((Signal("tilt", "/pose", "tilt(position)"),)))

@@ -50,7 +50,7 @@ REFUSED = {
 def test_odd_messages_read_alike_live_and_from_recordings() -> None:
     pytest.importorskip("rclpy", reason="rclpy is not installed")
     from uncertain_lti.recordings.message_reader import UnreadableError
-    from uncertain_lti.signals.signal_map import FieldPath
+    from uncertain_lti.signals.field_path import FieldPath
 
     make_reader, fields, decoder = fuzz.middleware()
     paths = [FieldPath("position[a]")]

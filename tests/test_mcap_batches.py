@@ -20,7 +20,8 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.sampling.streams import Stream, read_stream, read_stream_by_message
-from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),))
 

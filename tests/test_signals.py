@@ -18,7 +18,10 @@ from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.recordings.message_types import define
-from uncertain_lti.signals.signal_map import FieldPath, FieldType, Signal, SignalMap, TypeFields, numeric_paths
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.field_types import FieldType, TypeFields
+from uncertain_lti.signals.paths import numeric_paths
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 NAN, INF = math.nan, math.inf
 

@@ -39,7 +39,7 @@ from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Watc
 from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti.recordings.message_reader import MessageReader
-from uncertain_lti.signals.signal_map import FieldPath
+from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.course import Course, why_not
 from uncertain_lti_ros.messages import definition, live_fields, message_class

@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
 from uncertain_lti.recordings.bag import Bag, RawMessage
-from uncertain_lti.signals.signal_map import TypeFields
+from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.process import Life, living
 from uncertain_lti_ros.terminal import Progress, hush, say, seconds, speed, tell

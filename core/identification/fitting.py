@@ -28,7 +28,8 @@ from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.signal_map import FieldPath, Signal, SignalMap
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 
 def fit(

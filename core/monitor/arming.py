@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from uncertain_lti.base.errors import ModelError, SignalError
-from uncertain_lti.signals.signal_map import FieldPath
+from uncertain_lti.signals.field_path import FieldPath
 
 _OPERATORS: Mapping[str, Callable[[float, float], bool]] = {
     "==": operator.eq, "!=": operator.ne, "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,

@@ -14,7 +14,8 @@ from uncertain_lti.monitor.arming import Arming, Condition
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.recordings.message_reader import MessageReader, Plan, UnreadableError
 from uncertain_lti.sampling.sampler import Sampler, Status, all_finite, to_ns
-from uncertain_lti.signals.signal_map import FieldPath, TypeFields
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.field_types import TypeFields
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of diagnostic_msgs/DiagnosticStatus."""

@@ -9,9 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.signals.functions import FUNCTIONS, QUATERNION
 
 FEWEST = 20
 """Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""
+
+OF_QUATERNION = "|".join(name for name, function in FUNCTIONS.items() if function.takes is QUATERNION)
+"""Functions of a quaternion, as part of a regular expression."""
+WRAPPING = "|".join(name for name, function in FUNCTIONS.items() if function.wraps)
+"""Functions that give an angle which jumps by a turn, likewise."""
 
 
 @dataclass

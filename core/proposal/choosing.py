@@ -10,7 +10,7 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
-from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
+from uncertain_lti.proposal.candidates import FEWEST, OF_QUATERNION, Candidate, Source
 from uncertain_lti.proposal.effects import FAINT, SHOWS, Steps, explained, steps_of
 from uncertain_lti.proposal.redundancy import drop_copies, drop_functions, drop_idle_controls, drop_noise, prefer_rates
 
@@ -90,7 +90,7 @@ def _driven(pool: Sequence[Candidate], every: dict[str, Source], used: Sequence[
 
 def _is_pose(pool: Sequence[Candidate]) -> bool:
     """Place and attitude of a body, all of which move together somehow."""
-    return all(re.search(r"position\.[xyz]$|(roll|pitch|yaw)\(", c.path) for c in pool)
+    return all(re.search(rf"position\.[xyz]$|({OF_QUATERNION})\(", c.path) for c in pool)
 
 
 def _one_element(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from uncertain_lti.proposal.candidates import Candidate
+from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate
+from uncertain_lti.signals.functions import FUNCTIONS
 
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
@@ -14,7 +15,7 @@ _DULL = {"pose", "twist", "vector", "data", "point", "transform", "msg", "value"
 
 
 _UNITS = (
-    (re.compile(r"(roll|pitch|yaw)\("), "rad"),
+    *((re.compile(rf"{name}\("), function.unit) for name, function in FUNCTIONS.items() if function.unit),
     (re.compile(r"angular_velocity\.|twist\.angular\.|(^|\.)angular\.[xyz]$"), "rad/s"),
     (re.compile(r"linear_acceleration\."), "m/s^2"),
     (re.compile(r"(^|\.)linear\.[xyz]$"), "m/s"),
@@ -57,8 +58,8 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     if candidate.element:
         words = [re.sub(r"\W+", "_", candidate.element).strip("_") or "entry"]
         return [*words, *_split(candidate.kind)] if several_kinds else words
-    inner = re.sub(r"^(unwrap\()?(roll|pitch|yaw)\(.*", r"\2", candidate.path)
-    inner = re.sub(r"^(unwrap|norm)\(|\)+$", "", inner)
+    inner = re.sub(rf"^(unwrap\()?({OF_QUATERNION})\(.*", r"\2", candidate.path)
+    inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|\)+$", "", inner)
     words = [w for w in _split(inner) if w not in _DULL]
     if not words or all(len(w) == 1 or w.isdigit() for w in words):
         words = [*_split(candidate.topic.rstrip("/").rpartition("/")[2]), *words]

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
+from uncertain_lti.proposal.candidates import FEWEST, OF_QUATERNION, WRAPPING, Candidate, Source
 from uncertain_lti.proposal.effects import residual
 from uncertain_lti.proposal.roles import role_by_name
 from uncertain_lti.recordings.bag import Bag, TopicFacts, describe
 from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
-from uncertain_lti.signals.signal_map import FieldPath
+from uncertain_lti.signals.field_path import FieldPath
 
 Iterate = Callable[[Iterable[object], int], Iterable[object]]
 
@@ -149,7 +149,7 @@ def _sift(source: Source) -> None:
     """Say of each number whether it moves; angles in place of the quaternions that are some."""
     if not source.candidates:
         return
-    bases = {m[2] for c in source.candidates if (m := re.fullmatch(r"(roll|pitch|yaw)\((.+)\)", c.path))}
+    bases = {m[2] for c in source.candidates if (m := re.fullmatch(rf"({OF_QUATERNION})\((.+)\)", c.path))}
     parts = {c.path: c for c in source.candidates}
     for base in bases:
         raw = [parts.get(f"{base}.{axis}") for axis in "xyzw"]
@@ -210,7 +210,7 @@ def _wrapped(source: Source) -> None:
     for candidate in source.candidates:
         if candidate.reason:
             continue
-        angle = re.match(r"(roll|yaw)\(", candidate.path) is not None
+        angle = re.match(rf"({WRAPPING})\(", candidate.path) is not None
         jumps = 0
         for values in candidate.values:
             finite = values[np.isfinite(values)]

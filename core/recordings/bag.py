@@ -19,8 +19,8 @@ from uncertain_lti.recordings.bag_files import listed_parts, natural, os_error, 
 from uncertain_lti.recordings.mcap_index import outline
 from uncertain_lti.recordings.mcap_records import Block, Contents, count, messages, read_block, scan
 from uncertain_lti.recordings.message_types import Definition, define, header_stamp_ns, normal_name, undefined
+from uncertain_lti.signals.field_types import FieldType, TypeFields
 from uncertain_lti.signals.paths import signal_paths
-from uncertain_lti.signals.signal_map import FieldType, TypeFields
 
 __all__ = [
     "Bag",

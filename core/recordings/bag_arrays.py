@@ -15,7 +15,7 @@ from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.cdr_arrays import FieldReader, Messages
 from uncertain_lti.recordings.mcap_batches import Batch, IndexMismatchError, batches
 from uncertain_lti.recordings.message_types import Definition
-from uncertain_lti.signals.signal_map import FieldPath
+from uncertain_lti.signals.field_path import FieldPath
 
 Progress = Callable[[Iterable[object], int], Iterable[object]]
 LATEST = 2**63 - 1  # ns; log times are kept with a sign

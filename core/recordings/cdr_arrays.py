@@ -25,7 +25,8 @@ from rosbags.typesys.base import normalize_fieldname
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.message_types import CODES, Definition, header_stamp_ns
-from uncertain_lti.signals.signal_map import NORM, Derived, FieldPath
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.functions import FieldFunction
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -104,15 +105,15 @@ def _wanted(definition: Definition, paths: Sequence[FieldPath]) -> _Wanted:
                 is_array = False
                 table: dict[Any, _Wanted] = here.elements if kind == "index" else here.named
                 here = table.setdefault(key, _Wanted())
-        if path.derived is None:
+        if path.function is None:
             if is_array or is_message:
                 raise _UnfitError
             here.goals.append((number, 0))
         elif is_message and not is_array:
-            parts = _parts(definition, type_name, path.derived)
+            parts = _parts(definition, type_name, path.function)
             for part, name in enumerate(parts):
                 here.fields.setdefault(name, _Wanted()).goals.append((number, part))
-        elif is_array and not is_message and path.derived is NORM:
+        elif is_array and not is_message and path.function.takes.array:
             here.every.append(number)
         else:
             raise _UnfitError
@@ -120,15 +121,13 @@ def _wanted(definition: Definition, paths: Sequence[FieldPath]) -> _Wanted:
     return top
 
 
-def _parts(definition: Definition, type_name: str, derived: Derived) -> list[str]:
-    """Fields of a message that a derived number is worked out from."""
+def _parts(definition: Definition, type_name: str, function: FieldFunction) -> tuple[str, ...]:
+    """Fields of a message that a function takes."""
     fields = _fields(definition, type_name)
     if any(hasattr(definition.store.types[type_name], c) for c in "xyzw"):
         raise _UnfitError  # a constant of that name
-    parts = [c for c in "xyzw" if c in fields]
-    if "x" not in parts or (derived is not NORM and len(parts) < 4):
-        raise _UnfitError
-    if any(fields[c][0] != Nodetype.BASE or fields[c][1][0] == "string" for c in parts):
+    parts = function.takes.parts(fields)
+    if not parts or any(fields[c][0] != Nodetype.BASE or fields[c][1][0] == "string" for c in parts):
         raise _UnfitError
     return parts
 
@@ -418,8 +417,8 @@ class _Layout:
             parts[path] = max(parts.get(path, 0), part + 1)
         self.stamped = _STAMP in parts
         self.absent = [i for i in range(len(paths)) if i not in parts]
-        self.derived = [(i, p.derived, parts[i]) for i, p in enumerate(paths) if p.derived and i in parts]
-        plain = {i for i, path in enumerate(paths) if not path.derived}
+        self.computed = [(i, p.function, parts[i]) for i, p in enumerate(paths) if p.function and i in parts]
+        plain = {i for i, path in enumerate(paths) if not path.function}
         around = bytes(8 - _ENCAPSULATION) + data + bytes(16)  # byte 8 is the first behind the encapsulation
         self.segments = [(segment, _spans(segment, around, plain)) for segment in walk.segments]
         if sum(len(what) for _, spans in self.segments for span in spans for _, what, _ in span.compared) > _MOST_WORDS:
@@ -451,8 +450,8 @@ class _Layout:
         where = slice(None) if some.rows is None else some.rows
         for path in self.absent:
             values[where, path] = math.nan
-        for path, derived, count in self.derived:
-            values[where, path] = _derive(derived, [some.parts[path, part] for part in range(count)], len(some.end))
+        for path, function, count in self.computed:
+            values[where, path] = _compute(function, [some.parts[path, part] for part in range(count)], len(some.end))
         stamps[where] = NO_STAMP
         if self.stamped:
             time = some.parts[_STAMP, 0].astype(np.int64) * 1_000_000_000 + some.parts[_STAMP, 1]
@@ -540,17 +539,17 @@ def _taken(content: NDArray[np.uint8], at: int, kind: str, count: int) -> NDArra
     return content[:, at : at + size].view(kind)
 
 
-def _derive(derived: Derived, parts: Sequence[NDArray[Any]], count: int) -> Values:
-    """The derived number of each message, as `Derived.of` gives it."""
+def _compute(function: FieldFunction, parts: Sequence[NDArray[Any]], count: int) -> Values:
+    """The number that a function gives for each message, as `FieldFunction.of` does."""
     if not parts:  # the norm of an empty array
-        return np.full(count, derived.of_parts())
-    if derived is not NORM and any(part.dtype.kind != "f" for part in parts):  # of whole numbers: without rounding
+        return np.full(count, function.of_parts())
+    if any(part.dtype.kind != "f" for part in parts):  # of whole numbers: without rounding
         rows = zip(*(part.tolist() for part in parts), strict=True)
-        return np.array([derived.of_parts(*row) for row in rows], dtype=np.float64)
-    arguments, size = derived.terms(*(part.astype(np.float64) for part in parts))
+        return np.array([function.of_parts(*row) for row in rows], dtype=np.float64)
+    arguments, size = function.terms(*(part.astype(np.float64) for part in parts))
     there = np.broadcast_to(np.asarray(size > 0.0), count)
     result = np.full(count, math.nan)
-    result[there] = list(map(derived.number, *(argument[there].tolist() for argument in arguments)))
+    result[there] = list(map(function.number, *(argument[there].tolist() for argument in arguments)))
     return result
 
 

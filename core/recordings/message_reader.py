@@ -16,7 +16,9 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
-from uncertain_lti.signals.signal_map import NORM, Derived, FieldPath, FieldType, TypeFields
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.field_types import FieldType, TypeFields
+from uncertain_lti.signals.functions import FieldFunction
 
 _CODES = {
     "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
@@ -174,8 +176,8 @@ class _Parts:
         self.__dict__.update(zip(names, values, strict=True))
 
 
-def _derive(derived: Derived, names: Sequence[str] | None, parts: Sequence[float]) -> float:
-    return float(derived.of(parts if names is None else _Parts(names, parts)))
+def _compute(function: FieldFunction, names: Sequence[str] | None, parts: Sequence[float]) -> float:
+    return float(function.of(parts if names is None else _Parts(names, parts)))
 
 
 class _Want:
@@ -184,7 +186,7 @@ class _Want:
     def __init__(self, path: FieldPath) -> None:
         self.path = path
         self.places: list[tuple[int, str]] = []  # (offset, code of struct)
-        self.names: list[str] | None = None  # of the parts of a derived number
+        self.names: list[str] | None = None  # of the parts of a computed number
 
 
 class _Layout:
@@ -209,22 +211,22 @@ class _Layout:
         self._unpack = _struct(order).unpack_from
         where = {place: i for i, place in enumerate(order)}
         self._picks = [where[place] for place in places]
-        self._plain = self._picks == list(range(len(every))) and all(w.path.derived is None for w in every)
+        self._plain = self._picks == list(range(len(every))) and all(w.path.function is None for w in every)
         self._plain = self._plain and all(code in "fd" for want in wants for _, code in want.places)
         self._first = 2 if self._stamped else 0
-        self._derived: list[tuple[Derived | None, list[str] | None, int]] = [
-            (want.path.derived, want.names, len(want.places)) for want in wants
+        self._computed: list[tuple[FieldFunction | None, list[str] | None, int]] = [
+            (want.path.function, want.names, len(want.places)) for want in wants
         ]
 
     @cached_property
     def plan(self) -> Plan | None:
         """None where a value has no place, or a computed one is made of whole numbers."""
         values, stamp = [], -1
-        for places, (derived, names, _) in zip(self._places[self._first :], self._derived, strict=True):
-            plain = len(places) == 1 if derived is None else all(code in "fd" for _, code in places)
+        for places, (function, names, _) in zip(self._places[self._first :], self._computed, strict=True):
+            plain = len(places) == 1 if function is None else all(code in "fd" for _, code in places)
             if not plain:
                 return None
-            values.append((tuple(places), None if derived is None else partial(_derive, derived, names)))
+            values.append((tuple(places), None if function is None else partial(_compute, function, names)))
         if self._stamped:
             (stamp, seconds), nanoseconds = self._places[0][0], self._places[1][0]
             if seconds != "i" or nanoseconds != (stamp + 4, "I"):
@@ -253,11 +255,11 @@ class _Layout:
         if first:
             stamp = picked[0] * 1_000_000_000 + picked[1] or None
         values = []
-        for derived, names, count in self._derived:
-            if derived is None:
+        for function, names, count in self._computed:
+            if function is None:
                 values.append(float(picked[first]) if count else math.nan)
             else:
-                values.append(_derive(derived, names, picked[first : first + count]))
+                values.append(_compute(function, names, picked[first : first + count]))
             first += count
         return stamp, values
 
@@ -339,10 +341,11 @@ class _Walk:
                 if steps:
                     deeper.append((want, steps))
                     continue
-                if want.path.derived is None:
+                if want.path.function is None:
                     raise _UnfitError
-                want.names = [c for c in ("xyzw" if "w" in inner or want.path.derived is not NORM else "xyz")]
-                want.names = [c for c in want.names if c in inner]
+                want.names = list(want.path.function.takes.parts(inner))
+                if not want.names:
+                    raise _UnfitError
                 deeper += [(_Part(want, i), (("attribute", c),)) for i, c in enumerate(want.names)]
                 want.places = [(-1, "")] * len(want.names)
             self.message(kind.type_name, deeper)
@@ -387,7 +390,7 @@ class _Walk:
 
 
 class _Part(_Want):
-    """One part of a derived number."""
+    """One part of a computed number."""
 
     def __init__(self, whole: _Want, index: int) -> None:
         self._whole, self._index = whole, index

@@ -21,7 +21,7 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.signals.signal_map import FieldType
+from uncertain_lti.signals.field_types import FieldType
 
 _LARGEST_SCHEMA = 1 << 20  # bytes
 _LARGEST_MESSAGE = 1 << 26  # bytes, decompressed

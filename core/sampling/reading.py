@@ -21,7 +21,8 @@ from uncertain_lti.sampling.sampler import Sampler, Status, resolve
 from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, sample_arrays
 from uncertain_lti.sampling.streams import Stream, check_paths, read_stream
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.signal_map import FieldPath, SignalMap, UncarriedTopicError
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 

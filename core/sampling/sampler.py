@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.signals.signal_map import FieldPath, SignalMap
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.signal_map import SignalMap
 
 _TWO_PI = 2.0 * math.pi
 BUFFERED_MESSAGES = 10_000

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES, Status, to_ns
-from uncertain_lti.signals.signal_map import FieldPath, SignalMap
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.signal_map import SignalMap
 
 Integers = NDArray[np.int64]
 Values = NDArray[np.float64]

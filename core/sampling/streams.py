@@ -15,7 +15,8 @@ from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import Progress, in_reach, read_columns
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.message_types import header_stamp_ns
-from uncertain_lti.signals.signal_map import FieldPath, SignalMap
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.signal_map import SignalMap
 
 
 @dataclass

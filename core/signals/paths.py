@@ -1,15 +1,42 @@
-"""Paths of the numbers in a message, as they are written in a signals file."""
+"""Paths of the numbers in a message or its type, as they are written in a signals file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from uncertain_lti.signals.signal_map import FieldType, TypeFields
+from uncertain_lti.signals.field_types import FieldType, TypeFields
+from uncertain_lti.signals.functions import FUNCTIONS, QUATERNION
 
 _NO_SIGNALS = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _DEPTH = 8
 _MOST_NAMES = 100
+
+
+def numeric_paths(type_name: str, type_fields: TypeFields, depth: int = 6) -> Iterator[str]:
+    """Field paths of a type that can be signals; arrays end in `[]` (sequence) or `[n]` (fixed length).
+
+    Parameters
+    ----------
+    type_name : str
+        Type of the message, as package/msg/Name.
+    type_fields : callable
+        Type name -> {field name: FieldType}.
+    depth : int, default 6
+        Levels of nested messages that are opened.
+
+    Yields
+    ------
+    str
+        A path that leads to numbers or booleans.
+    """
+    for name, kind in type_fields(type_name).items():
+        suffix = "" if kind.array is None else "[]" if kind.array == 0 else f"[{kind.array}]"
+        if kind.kind in ("number", "bool"):
+            yield name + suffix
+        elif kind.kind == "message" and depth > 1:
+            for inner in numeric_paths(kind.type_name, type_fields, depth - 1):
+                yield f"{name}{suffix}.{inner}"
 
 
 def signal_paths(
@@ -18,7 +45,7 @@ def signal_paths(
     """Paths in a decoded message that can be signals, as `FieldPath` reads them; header stamps are left out.
 
     The entries of an array stand as one path, `data[0..99]` for `data[0]` to `data[99]`, or as
-    `position[fan]` each where the message names them; a quaternion is also offered as roll, pitch and yaw.
+    `position[fan]` each where the message names them; a quaternion is also offered as roll(...) and the like.
 
     Parameters
     ----------
@@ -61,7 +88,7 @@ def signal_paths(
 def _inside(type_fields: TypeFields, field: FieldType, value: Any, path: str, depth: int) -> Iterator[str]:
     inner = type_fields(field.type_name)
     if set(inner) == set("xyzw") and all(part.kind == "number" for part in inner.values()):
-        yield from (f"{angle}({path})" for angle in ("roll", "pitch", "yaw"))
+        yield from (f"{name}({path})" for name, function in FUNCTIONS.items() if function.takes is QUATERNION)
     yield from signal_paths(type_fields, field.type_name, value, f"{path}.", depth - 1)
 
 

@@ -1,0 +1,239 @@
+"""FieldPath: one number of a message, as it is written in a signals file."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from uncertain_lti.base.english import meant, plural
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.signals.field_types import FieldType, TypeFields
+from uncertain_lti.signals.functions import FUNCTIONS, FieldFunction
+from uncertain_lti.signals.paths import numeric_paths
+
+_STEP = re.compile(
+    r"""\.?([A-Za-z_]\w*)|\[\s*(\d{1,18})\s*\]|\[\s*"([^"]+)"\s*\]|\[\s*([^\[\]"\s](?:[^\[\]"]*[^\[\]"\s])?)\s*\]"""
+)
+
+
+class FieldPath:
+    """One scalar of a message: `a.b[3]`, `position[fan]`, `yaw(pose.orientation)`, `unwrap(...)`.
+
+    Dotted attributes; `[3]` is an index, `[fan]` the position of `fan` in the `name` array of the message that
+    holds the array (as in sensor_msgs/JointState), `["3"]` a name that looks like an index. Derived: roll,
+    pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle
+    in rad (the sampler does the unwrapping, as it knows where a stream starts anew).
+
+    Parameters
+    ----------
+    text : str
+        The path as a signals file writes it.
+
+    Raises
+    ------
+    SignalError
+        The text is not a field path.
+    """
+
+    __slots__ = ("text", "unwrap", "function", "steps", "_name_index")
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.unwrap = False
+        self.function: FieldFunction | None = None
+        self._name_index = 0
+        inner = text.strip()
+        functions: list[str] = []
+        known = (*FUNCTIONS, "unwrap")
+        while match := re.fullmatch(r"([A-Za-z_]\w*)\s*\((.*)\)", inner, re.DOTALL):
+            if match[1] not in known:
+                raise SignalError(
+                    f"field '{text}': there is no function '{match[1]}'{meant(match[1], known)}; "
+                    f"there are {', '.join(known)}"
+                )
+            functions.append(match[1])
+            inner = match[2].strip()
+        if functions[:1] == ["unwrap"]:
+            self.unwrap = True
+            functions = functions[1:]
+        if len(functions) > 1 or "unwrap" in functions:
+            raise SignalError(f"field '{text}': functions nest only as unwrap(roll|pitch|yaw(...))")
+        if functions:
+            self.function = FUNCTIONS[functions[0]]
+        self.steps = self._parse(inner)
+
+    def _parse(self, inner: str) -> tuple[tuple[str, str | int], ...]:
+        steps: list[tuple[str, str | int]] = []
+        position = 0
+        while position < len(inner):
+            match = _STEP.match(inner, position)
+            dotted = inner[position] == "."
+            if not match or (match[1] is not None and dotted != bool(steps)) or (match[1] is None and not steps):
+                raise SignalError(
+                    f"field '{self.text}' is not a field path; write for example twist.linear.x, data[0], "
+                    f"position[fan] or yaw(pose.orientation)"
+                )
+            if match[1] is not None:
+                steps.append(("attribute", match[1]))
+            elif match[2] is not None:
+                steps.append(("index", int(match[2])))
+            else:
+                steps.append(("name", match[3] or match[4]))
+            position = match.end()
+        if not steps:
+            raise SignalError(f"field '{self.text}' is empty; name a field of the message")
+        return tuple(steps)
+
+    def __repr__(self) -> str:
+        return f"FieldPath({self.text!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FieldPath) and other.text == self.text
+
+    def __hash__(self) -> int:
+        return hash(self.text)
+
+    def read(self, message: Any) -> float:
+        """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero.
+
+        Parameters
+        ----------
+        message : object
+            A decoded message of the type that the path was checked against.
+
+        Returns
+        -------
+        float
+            The number as recorded, in rad for an angle of a quaternion; not unwrapped.
+        """
+        value, parent = message, message
+        for kind, key in self.steps:
+            if kind == "attribute":
+                parent, value = value, getattr(value, key)  # type: ignore[arg-type]
+            elif kind == "index":
+                if key >= len(value):  # type: ignore[operator]
+                    return math.nan
+                value = value[key]
+            else:
+                index = self._find_name(parent.name, key)  # type: ignore[arg-type]
+                if index < 0 or index >= len(value):
+                    return math.nan
+                value = value[index]
+        return self.function.of(value) if self.function else float(value)
+
+    def _find_name(self, names: Sequence[str], wanted: str) -> int:
+        index = self._name_index  # names seldom move between messages
+        if index < len(names) and names[index] == wanted:
+            return index
+        for index, name in enumerate(names):
+            if name == wanted:
+                self._name_index = index
+                return index
+        return -1
+
+    def absent(self, message: Any) -> str:
+        """What this path looks up and the message has not, in words, with what is there; empty where it has.
+
+        Parameters
+        ----------
+        message : object
+            A decoded message of the type that the path was checked against.
+
+        Returns
+        -------
+        str
+            A sentence, or an empty text where the message has the value.
+        """
+        value, parent, name = message, message, ""
+        for kind, key in self.steps:
+            if kind == "attribute":
+                parent, value, name = value, getattr(value, key), str(key)  # type: ignore[arg-type]
+                continue
+            names = [str(one) for one in parent.name] if kind == "name" else []
+            if kind == "name" and key not in names:
+                there = ", ".join(names) or "none"
+                return f"there is no '{key}' in the message's names{meant(key, names)}; names there: {there}"
+            index = names.index(str(key)) if kind == "name" else int(key)
+            if index >= len(value):
+                if not len(value):
+                    return f"'{name}' has no element in the message; choose a field that is filled"
+                there = f"elements there: 0 to {len(value) - 1}"
+                return f"'{name}' has {plural(len(value), 'element')} in the message; {there}"
+            value = value[index]
+        return ""
+
+    def check(self, topic: str, type_name: str, type_fields: TypeFields) -> None:
+        """Check the path against a message type.
+
+        Parameters
+        ----------
+        topic : str
+            Topic that carries the type, for the error.
+        type_name : str
+            Type of the message, as package/msg/Name.
+        type_fields : callable
+            Type name -> {field name: FieldType}.
+
+        Raises
+        ------
+        SignalError
+            The path is not in the type, or is not one number; the sentence names what is there.
+        """
+        here = f"field '{self.text}' of {topic} ({type_name})"
+        current: FieldType = FieldType("message", type_name)
+        parent: Mapping[str, FieldType] = {}
+        for kind, key in self.steps:
+            if kind == "attribute":
+                if current.array is not None:
+                    raise SignalError(f"{here}: give an index before '.{key}', for example [0]")
+                if current.kind != "message":
+                    raise SignalError(f"{here}: a {current.type_name} has no fields, so no '{key}'")
+                parent = type_fields(current.type_name)
+                if key not in parent:
+                    raise SignalError(
+                        f"{here}: there is no '{key}' in {current.type_name}{meant(key, parent)}; fields there: "
+                        f"{', '.join(parent) or 'none'}; numeric field paths of {topic}: "
+                        f"{_some(numeric_paths(type_name, type_fields))}"
+                    )
+                current = parent[str(key)]
+                continue
+            if current.array is None:
+                raise SignalError(f"{here}: '[{key}]' follows something that is not an array; leave it out")
+            if kind == "index" and current.array and int(key) >= current.array:
+                raise SignalError(f"{here}: index {key} is past the end of an array of {current.array}")
+            if kind == "name":
+                names = parent.get("name")
+                if names is None or names.kind != "string" or names.array is None:
+                    raise SignalError(
+                        f"{here}: '[{key}]' needs an array of strings called 'name' beside it; "
+                        f"give an index instead, for example [0]"
+                    )
+            current = replace(current, array=None)
+        self._check_leaf(here, current, type_name, topic, type_fields)
+
+    def _check_leaf(self, here: str, leaf: FieldType, type_name: str, topic: str, type_fields: TypeFields) -> None:
+        if self.function is not None:
+            takes = self.function.takes
+            inner = type_fields(leaf.type_name) if leaf.kind == "message" and leaf.array is None else {}
+            if leaf.array is not None:
+                fits = takes.array and leaf.kind == "number"
+            else:
+                parts = takes.parts(inner)
+                fits = bool(parts) and all(inner[name].kind == "number" for name in parts)
+            if not fits:
+                raise SignalError(f"{here}: wants {takes.words}, and {leaf.type_name} is none")
+        elif leaf.kind not in ("number", "bool") or leaf.array is not None:
+            what = "an array; give an index, for example [0]" if leaf.array is not None else f"a {leaf.type_name}"
+            raise SignalError(
+                f"{here} is not one number but {what}; numeric field paths of {topic}: "
+                f"{_some(numeric_paths(type_name, type_fields))}"
+            )
+
+
+def _some(paths: Iterator[str], limit: int = 24) -> str:
+    found = list(paths)
+    more = f", and {len(found) - limit} more" if len(found) > limit else ""
+    return (", ".join(found[:limit]) or "none") + more

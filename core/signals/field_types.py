@@ -1,0 +1,30 @@
+"""Types of message fields, described the same way offline (definitions in bags) and live (rclpy classes)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class FieldType:
+    """Type of one message field.
+
+    Parameters
+    ----------
+    kind : {"number", "bool", "string", "message", "other"}
+        What one element is.
+    type_name : str
+        Type of one element, as the message definition writes it.
+    array : int or None, optional
+        None for a single value, 0 for a sequence of any length, n for n elements.
+    """
+
+    kind: Literal["number", "bool", "string", "message", "other"]
+    type_name: str
+    array: int | None = None
+
+
+TypeFields = Callable[[str], Mapping[str, FieldType]]
+"""Type name -> {field name: FieldType}; raises SignalError for an unknown type."""

@@ -1,0 +1,171 @@
+"""Values in a YAML file, checked, with errors that name them."""
+
+from __future__ import annotations
+
+import math
+import os
+import reprlib
+from typing import Any
+
+from uncertain_lti.base.english import meant
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.files import kind_of
+
+
+def load_yaml(path: str | os.PathLike[str]) -> Any:
+    """Read the structure of a signals file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Returns
+    -------
+    object
+        Mappings, lists, numbers and text.
+
+    Raises
+    ------
+    SignalError
+        The file is missing, is not YAML, repeats a key, or holds nothing.
+    """
+    import yaml  # the live node reads signals from the model file and needs no YAML
+
+    if (kind := kind_of(path)) and kind != "a signals file":
+        raise SignalError(f"{path}: this is {kind}, and a signals file is wanted here; {_remedy(kind)}")
+    try:
+        with open(path, encoding="utf-8") as stream:
+            node = yaml.compose(stream, Loader=yaml.SafeLoader)
+        if repeated := _repeated_key(node):
+            raise SignalError(
+                f"{path}: key '{repeated.value}' stands twice in one mapping, again at line "
+                f"{repeated.start_mark.line + 1}; keep one"
+            )
+        data = yaml.SafeLoader("").construct_document(node) if node else None
+    except FileNotFoundError:
+        raise SignalError(f"{path}: there is no such signals file; check the path") from None
+    except OSError as error:
+        raise SignalError(f"{path}: cannot be read: {error.strerror}; check the path") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date 2001-99-99
+        mark = getattr(error, "problem_mark", None)
+        line = f" at line {mark.line + 1}" if mark else ""
+        problem = str(getattr(error, "problem", None) or error).splitlines()[0]
+        raise SignalError(f"{path}: is not YAML{line}: {problem}; mend it") from None
+    if data is None:
+        raise SignalError(
+            f"{path}: nothing is in it; list the states and controls, or let `uncertain-lti init` propose them"
+        )
+    return data
+
+
+def _repeated_key(top: Any) -> Any:
+    """The first key node that stands twice in its mapping, of which YAML readers keep the last; None without any."""
+    waiting, seen = [top], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen or not isinstance(getattr(node, "value", None), list):
+            continue  # an alias, or a scalar
+        seen.add(id(node))
+        keys = set()
+        for entry in node.value:
+            if not isinstance(entry, tuple):
+                waiting.append(entry)
+                continue
+            key, value = entry
+            waiting += [key, value]
+            if isinstance(key.value, str):
+                if key.value in keys:
+                    return key
+                keys.add(key.value)
+    return None
+
+
+def checked_mapping(data: Any, where: str, known: set[str] | None) -> dict[str, Any]:
+    """Check that a value is a mapping with known keys.
+
+    Parameters
+    ----------
+    data : object
+        Value as YAML or JSON gives it.
+    where : str
+        File and key, for the error.
+    known : set of str or None
+        Keys that it may have; None for any.
+
+    Returns
+    -------
+    dict
+        The value itself.
+
+    Raises
+    ------
+    SignalError
+        It is no mapping, or a key is unknown.
+    """
+    if not isinstance(data, dict):
+        raise SignalError(f"{where}: a mapping is wanted here, not {kind_in_yaml(data)}; see config/signals/")
+    for key in data:
+        if known is not None and key not in known:
+            raise SignalError(
+                f"{where}: unknown key {reprlib.repr(key)}{meant(key, known)}; known are {', '.join(sorted(known))}"
+            )
+    return data
+
+
+def kind_in_yaml(data: object) -> str:
+    """Name what a value is in the words of YAML.
+
+    Parameters
+    ----------
+    data : object
+        Value as YAML or JSON gives it.
+
+    Returns
+    -------
+    str
+        Words such as "a list".
+    """
+    names = {dict: "a mapping", list: "a list", str: "a text", bool: "a truth value", type(None): "nothing"}
+    return names.get(type(data), "a number" if isinstance(data, (int, float)) else type(data).__name__)
+
+
+def _remedy(kind: str) -> str:
+    """What to do about a file of another kind."""
+    return "name a file in it" if kind == "a folder" else "are the arguments swapped?"
+
+
+def checked_number(value: Any, where: str) -> float | None:
+    """Check that a value is a number.
+
+    Parameters
+    ----------
+    value : object
+        Value as YAML or JSON gives it; YAML 1.1 reads 1e-3 as text, which counts as a number here.
+    where : str
+        File and key, for the error.
+
+    Returns
+    -------
+    float or None
+        The number; None for nothing.
+
+    Raises
+    ------
+    SignalError
+        It is no number.
+    """
+    if value is None:
+        return None
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            pass
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
+    except OverflowError:
+        number = math.nan
+    if math.isnan(number):
+        raise SignalError(f"{where} is {reprlib.repr(value)}; write a number")
+    return number

@@ -1,0 +1,144 @@
+"""Functions of a message's values, such as yaw(...) and norm(...): one table for recordings and the live node."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Container, Mapping
+from typing import Any, NamedTuple
+
+
+class ValueKind(NamedTuple):
+    """What a function takes: a message with certain fields, or also an array of numbers.
+
+    Parameters
+    ----------
+    words : str
+        What it is, for errors.
+    required : str
+        Fields that a message must have, one letter each.
+    optional : str, default ""
+        Fields that count where the message has them.
+    array : bool, default False
+        Whether an array of numbers will do as well.
+    """
+
+    words: str
+    required: str
+    optional: str = ""
+    array: bool = False
+
+    def parts(self, fields: Container[str]) -> tuple[str, ...]:
+        """Fields of a message that the function takes, in its order.
+
+        Parameters
+        ----------
+        fields : container of str
+            Names of the message's fields.
+
+        Returns
+        -------
+        tuple of str
+            Names; empty if the message is not of this kind.
+        """
+        if any(name not in fields for name in self.required):
+            return ()
+        return tuple(name for name in self.required + self.optional if name in fields)
+
+
+class FieldFunction(NamedTuple):
+    """A number computed from the parts of a value, in two steps so that many messages share the first.
+
+    Parameters
+    ----------
+    takes : ValueKind
+        What it is a function of.
+    terms : callable
+        Takes the parts (x, y, z, w of a quaternion; floats, or arrays of them: the arithmetic is the same to the last
+        bit) to the arguments of `number`, and to what has to be positive for there to be one.
+    number : callable
+        Takes these arguments, floats alone, to the number: numpy's functions round otherwise than those of math.
+    unit : str, default ""
+        Unit of the number; "" if it is that of the parts.
+    wraps : bool, default False
+        Whether the number is an angle that jumps by a full turn.
+    """
+
+    takes: ValueKind
+    terms: Callable[..., tuple[tuple[Any, ...], Any]]
+    number: Callable[..., float]
+    unit: str = ""
+    wraps: bool = False
+
+    def of(self, value: Any) -> float:
+        """The number for one value of a message; NaN where there is none.
+
+        Parameters
+        ----------
+        value : object
+            A quaternion, a vector or an array in a decoded message.
+
+        Returns
+        -------
+        float
+            Angle in rad, or norm; NaN where there is none.
+        """
+        names = self.takes.required + self.takes.optional
+        if self.takes.array and not hasattr(value, names[0]):
+            return self.of_parts(*(float(v) for v in value))
+        return self.of_parts(*(getattr(value, name) for name in names if hasattr(value, name)))
+
+    def of_parts(self, *parts: Any) -> float:
+        """The same from the parts of the value.
+
+        Parameters
+        ----------
+        *parts : float
+            x, y, z, w of a quaternion, or the elements of a vector.
+
+        Returns
+        -------
+        float
+            Angle in rad, or norm; NaN where there is none.
+        """
+        arguments, size = self.terms(*parts)
+        return self.number(*arguments) if size > 0.0 else math.nan
+
+
+def _roll(x: Any, y: Any, z: Any, w: Any) -> tuple[tuple[Any, ...], Any]:
+    norm2 = x * x + y * y + z * z + w * w
+    return (2.0 * (w * x + y * z), norm2 - 2.0 * (x * x + y * y)), _finite(norm2)
+
+
+def _pitch(x: Any, y: Any, z: Any, w: Any) -> tuple[tuple[Any, ...], Any]:
+    norm2 = x * x + y * y + z * z + w * w
+    return (2.0 * (w * y - z * x), norm2), _finite(norm2)
+
+
+def _yaw(x: Any, y: Any, z: Any, w: Any) -> tuple[tuple[Any, ...], Any]:
+    norm2 = x * x + y * y + z * z + w * w
+    return (2.0 * (w * z + x * y), norm2 - 2.0 * (y * y + z * z)), _finite(norm2)
+
+
+def _finite(norm2: Any) -> Any:
+    """NaN in place of infinity: atan2 and asin would make an angle of that."""
+    return norm2 * (norm2 < math.inf)
+
+
+def _arc_sine(sine: float, norm2: float) -> float:
+    return math.asin(max(-1.0, min(1.0, sine / norm2)))
+
+
+def _unchanged(*parts: Any) -> tuple[tuple[Any, ...], Any]:
+    return parts, 1.0
+
+
+QUATERNION = ValueKind("a quaternion with x, y, z, w", "xyzw")
+VECTOR = ValueKind("a vector with x, y, z or an array of numbers", "x", "yzw", array=True)
+
+FUNCTIONS: Mapping[str, FieldFunction] = {
+    "roll": FieldFunction(QUATERNION, _roll, math.atan2, unit="rad", wraps=True),
+    "pitch": FieldFunction(QUATERNION, _pitch, _arc_sine, unit="rad"),
+    "yaw": FieldFunction(QUATERNION, _yaw, math.atan2, unit="rad", wraps=True),
+    "norm": FieldFunction(VECTOR, _unchanged, math.hypot),
+}
+"""Name in a signals file -> function. A function added here can be used in recordings, live and by `init`."""
