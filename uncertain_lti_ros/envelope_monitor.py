@@ -129,7 +129,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._published = self._looked = self._reported = time.monotonic()
         self._failures, self._failed_how, self._failures_told = 0, "", 0
         self._failure_logged: dict[str, float] = {}  # where: when
-        self._clock = self.get_clock()
+        self._clock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
         self._simulated = self._clock.ros_time_is_active
         self._largest = round(self._real("largest_message") * _MIB)
         self._course: Course | None = None
@@ -701,7 +701,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = self._reported = time.monotonic()
         if self.watch is not None and self.active:
             reports = self.watch.report(now, self._real("state_timeout"), self._problems())
-            extra = {}
+            extra: dict[str, str] = {}
             for topic, subscription in self._inputs.items():
                 extra |= {
                     f"publishers {topic}": str(subscription.publishers),
