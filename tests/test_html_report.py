@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.cli.main import main
-from uncertain_lti.reports.findings import APART, CARE, MOST_EPISODES, NO, YES, findings
+from uncertain_lti.reports.findings import APART, CARE, MOST_EPISODES, NO, UNKNOWN, YES, findings
 from uncertain_lti.reports.html import MOST_DRAWN, _first_screen, html_report
 from uncertain_lti.reports.text import beyond
 from uncertain_lti.validation.left_out import validate
@@ -74,7 +74,7 @@ def test_the_page_answers_first(engine, tmp_path, capsys):
     model = str(engine / "m.model.json")
     assert main(["report", model, str(engine / "bad.mcap"), str(engine / "other.mcap"), "--output", str(out)]) == 1
     said = capsys.readouterr().out
-    assert "may I rely on it? with care" in said and str(out) in said
+    assert "may I rely on it? unknown" in said and str(out) in said
     page = Page(out.read_text(encoding="utf-8"))
     needs_nothing_else(page)
     text = " ".join(page.text)
@@ -100,7 +100,7 @@ def test_json_has_the_facts_of_the_page(engine, tmp_path, capsys):
     assert facts["recordings"][0]["episodes"][0]["first"]["k"] == 100
     assert set(facts["recordings"][0]["episodes"][0]["states"]) >= {"fan"}
     assert len(facts["model"]["sha256"]) == 64 and facts["recordings"][0]["files"][0]["file"] == bags[0]
-    assert facts["rely"]["answer"] in (CARE, NO) and facts["validation"] is None
+    assert facts["rely"]["answer"] in (UNKNOWN, NO) and facts["validation"] is None
     out = tmp_path / "p.html"
     assert main(["report", model, *bags, "--json", "--output", str(out)]) == 1
     assert json.loads(capsys.readouterr().out) == facts and out.exists()

@@ -1,6 +1,8 @@
 """Validation: what it counts is what happens, and its intervals contain the truth as often as they say."""
 
+import copy
 import json
+import time
 from fractions import Fraction
 from math import comb
 
@@ -16,7 +18,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.validation.calibration import calibrate, detection
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
-from uncertain_lti.validation.left_out import Part, _rest, cut, judge, leave_out_cheaply, validate, validate_model
+from uncertain_lti.validation.left_out import Part, _rest, cut, judge, leave_out_with_fit, validate, validate_model
 
 # --- intervals ---
 
@@ -255,6 +257,113 @@ def test_discards_are_counted_as_recordings():
     assert data["interval"] == [0.0, discarding_bound(27, 2, 60, 0.9)] and "discarded transition" in data["words"]
 
 
+# --- groups ---
+
+
+def variant(plant, rng, spread):
+    """The same machine on another day."""
+    other = copy.copy(plant)
+    other.c = plant.c * (1 + spread * rng.uniform(-1, 1, 3))
+    return other
+
+
+@pytest.fixture(scope="module")
+def days():
+    """Three machine-days of four recordings each, and their names."""
+    rng = np.random.default_rng(2)
+    runs = [r for g in range(3) for r in variant(Tanks(), rng, 0.05).transients(4, 50 + g, noise=1e-3)]
+    return runs, [f"day {g}" for g in range(3) for _ in range(4)]
+
+
+def test_a_whole_group_is_left_out_at_a_time(days):
+    runs, names = days
+    shuffled = [7, 0, 11, 3, 5, 2, 8, 1, 9, 4, 6, 10]  # a group need not stand together
+    validation = validate([runs[i] for i in shuffled], groups=[names[i] for i in shuffled], additive="noise")
+    parts = {p.name: p for p in validation.parts}
+    model = fit([runs[i] for i in shuffled if names[i] != "day 1"], additive="noise")
+    for i in range(12):
+        assert parts[runs[i].name].group == names[i]
+        if names[i] == "day 1":
+            verdicts = EnvelopeMonitor(model).check(runs[i])
+            assert parts[runs[i].name].violated == verdicts.violated.sum()
+    data = validation.to_dict()
+    assert data["parts"] == 12 and data["groups"]["count"] == 3
+    assert sorted(data["groups"]["recordings"]["day 2"]) == sorted(
+        r.name for r, n in zip(runs, names, strict=True) if n == "day 2"
+    )
+    counts = [sum(p.violated for p in validation.parts if p.group == f"day {g}") for g in range(3)]
+    low, high = rate_interval(counts, 1200, 0.9)
+    assert data["inside_interval"] == [max(0.0, 1 - high), 1 - low]
+    assert data["groups"]["inside"] == counts.count(0)
+    json.dumps(data, allow_nan=False, default=float)
+
+
+def test_groups_of_one_recording_are_single_recordings(runs, validation):
+    alone = validate(runs, groups=range(12), criterion="qp", additive="noise", alarm_rule=AlarmRule(2, 3))
+    assert [p.violated for p in alone.parts] == [p.violated for p in validation.parts]
+    one, other = alone.to_dict(), validation.to_dict()
+    for key in ("inside_interval", "false_alarms"):
+        assert one[key] == other[key]
+    assert calibrate(alone, 600.0).alarm_rule == calibrate(validation, 600.0).alarm_rule
+
+
+def test_the_condition_stands_beside_every_interval(days):
+    from uncertain_lti.reports.text import left_out_text, validation_text
+
+    runs, names = days
+    for groups, what in ((None, "recordings"), (names, "groups")):
+        validation = validate(runs, groups=groups, additive="noise")
+        data = validation.to_dict()
+        data["calibration"] = calibrate(validation, 2000.0).to_dict()
+        text = validation_text(data)
+        beside = f"if the {what} are independent"
+        for line in text.splitlines():
+            assert "90% interval" not in line or beside in line
+        assert text.count("90% interval") == 3 and "holds if they are independent of one another" in text
+        assert beside in left_out_text(data) and beside in data["calibration"]["words"]
+
+
+def test_a_single_group_or_wrong_groups_are_refused(days):
+    runs, names = days
+    for options, words in (
+        (dict(groups=["a"] * 12), r"of one group \(a\), so nothing is left"),
+        (dict(groups=["a", "b"]), "2 groups for 12 recordings"),
+        (dict(groups=names, blocks=3), "groups leave out whole recordings"),
+        (dict(groups="weekday"), "is no key; use folder"),
+        (dict(groups="folder"), "is no file"),
+        (dict(groups="hours=0"), "positive number of hours"),
+        (dict(groups="hours=1"), "no time of day"),
+        (dict(groups="name=["), "no regular expression"),
+        (dict(groups="name=day"), "finds nothing"),
+    ):
+        with pytest.raises(FitError, match=words):
+            validate(runs, additive="noise", **options)
+
+
+def at_hour(run, hour, name="run"):
+    return Transient(run.t_ns + 1_700_000_000 * 10**9 + int(hour * 3600e9), run.x, run.u, name=name)
+
+
+@pytest.mark.parametrize(
+    ("hours", "words"),
+    [
+        ([0, 0.1, 0.2, 24, 24.1, 24.3], "of 2 sessions"),
+        ([0, 0.1, 0.2, 0.4, 0.5, 0.6], "of one session"),
+        ([0, 24, 48, 72, 96, 120], ""),  # a day each
+        ([0, 0, 0, 0, 0, 0], ""),  # simulated: all at once
+        ([-472222.2 + 0.1 * i for i in range(6)], ""),  # clocks that start at nothing
+    ],
+)
+def test_groups_that_are_likely_are_named_if_none_were_given(runs, hours, words):
+    shifted = [at_hour(r, h) for r, h in zip(runs, hours, strict=False)]
+    notes = validate(shifted, additive="noise").to_dict()["notes"]
+    assert any(words in n for n in notes) if words else not any("session" in n for n in notes)
+    if "2 sessions" in words:
+        told = validate(shifted, additive="noise", groups="hours=2")
+        assert [p.group for p in told.parts] == ["2023-11-14T22:13:20Z"] * 3 + ["2023-11-15T22:13:20Z"] * 3
+        assert not any("session" in n for n in told.to_dict()["notes"])
+
+
 # --- calibration ---
 
 
@@ -380,6 +489,36 @@ def test_blocks_of_one_recording_keep_their_promise_for_more_of_the_same():
     assert min(shares.values()) >= 0.87, shares
 
 
+@pytest.mark.slow
+def test_whole_groups_restore_what_single_recordings_promise_in_vain():
+    """12 recordings of 3 machine-days, the truth on 50 fresh ones; docs/validation.md has the shares in 200 fleets."""
+    held: dict[str, list[bool]] = {}
+    for seed in range(60):
+        rng = np.random.default_rng([seed, 5])
+        base = Tanks(seed, spread=0.2)
+        runs = [r for g in range(3) for r in variant(base, rng, 0.1).transients(4, 100 * seed + g, noise=1e-3)]
+        days = [variant(base, rng, 0.1).arrays(5, 500_000 + 100 * seed + i, noise=1e-3) for i in range(50)]
+        x, u = (np.concatenate(arrays) for arrays in zip(*days, strict=True))
+        hours, wish = len(x) * 100 * DT / 3600, rng.uniform(0.2, 1.0) / (100 * DT / 3600)
+        for name, groups in (("singly", None), ("groups", [g for g in range(3) for _ in range(4)])):
+            validation = validate(runs, criterion=("qp", "lp")[seed % 2], additive="noise", groups=groups)
+            data = validation.to_dict()
+            for entry in data["false_alarms"]:
+                alarms, left = true_alarms(validation.model, x, u, AlarmRule(entry["violations"], entry["window"]))
+                low, high = entry["interval"]
+                held.setdefault(f"{name} alarms", []).append(low <= alarms.sum() / hours <= (high or np.inf))
+            low, high = data["inside_interval"]
+            held.setdefault(f"{name} inside", []).append(low <= 1 - left.mean() <= high)
+            found = calibrate(validation, wish)
+            if found.alarm_rule is not None:
+                alarms, _ = true_alarms(validation.model, x, u, found.alarm_rule)
+                held.setdefault(f"{name} calibrated", []).append(alarms.sum() / hours <= wish)
+    shares = {what: float(np.mean(hits)) for what, hits in held.items()}
+    print(shares, {what: len(hits) for what, hits in held.items()})
+    assert all(share >= 0.87 for what, share in shares.items() if what.startswith("groups")), shares
+    assert shares["singly inside"] < 0.8 and shares["singly alarms"] < 0.8, shares  # so the warning is needed
+
+
 def test_a_bound_that_counts_samples_would_not_hold():
     """Why transients are counted: the same binomial bound per sample promises what whole transients do not keep."""
     plant = Tanks()
@@ -490,6 +629,72 @@ def test_a_rule_that_sees_little_is_warned_of(folder, capsys, monkeypatch):
     assert len(lines[1e-6]) == 1 and lines[1.0] == []
 
 
+def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
+    """Folder, metadata and name group; what the fit was told, validate goes by."""
+    from uncertain_lti.recordings.bag_metadata import metadata_pairs
+
+    bags = []
+    for seed in range(6):
+        place = folder / f"day{seed % 3}"
+        place.mkdir(exist_ok=True)
+        bags.append(place / f"run{seed}_m{seed % 2}.mcap")
+        engine_bag(bags[-1], seed=seed)
+        with open(bags[-1], "rb") as stream:
+            content = stream.read()
+        pairs = b"".join(len(w).to_bytes(4, "little") + w for w in (b"machine", f"M{seed // 2}".encode()))
+        body = (5).to_bytes(4, "little") + b"about" + len(pairs).to_bytes(4, "little") + pairs
+        record = b"\x0c" + len(body).to_bytes(8, "little") + body
+        header = 8 + 9 + int.from_bytes(content[9:17], "little")
+        # the footer's places no longer fit, so it goes: a file that was cut is read all the same
+        bags[-1].write_bytes(content[:header] + record + content[header:-37])
+        assert metadata_pairs(bags[-1]) == {"machine": f"M{seed // 2}", "about/machine": f"M{seed // 2}"}
+    model = str(folder / "grouped.json")
+    command = ["fit", *map(str, bags), "--signals", str(folder / "signals.yaml"), "--output", model]
+    capsys.readouterr()
+    assert main([*command]) == 0
+    assert "lie in 3 folders" in capsys.readouterr().out
+    for key, counted in (("folder", 3), ("metadata=machine", 3), ("name=_m(\\d)", 2)):
+        assert main([*command, "--group", key]) == 0
+        printed = capsys.readouterr().out
+        assert f"left out one group of {counted} at a time (6 recordings in {counted} groups, by {key})" in printed
+        assert "lie in 3 folders" not in printed
+        assert main(["validate", model]) == 0
+        assert f"{counted} groups, by {key}" in capsys.readouterr().out
+        assert main(["validate", model, "--group", "none"]) == 0
+        assert "groups, by" not in capsys.readouterr().out
+    assert main([*command, "--group", "metadata=pilot"]) == 2
+    said = capsys.readouterr().err
+    assert "no 'pilot' to group by; there is about/machine, machine" in said.splitlines()[-1]
+
+
+def test_what_a_fit_says_of_itself_does_not_depend_on_the_load(folder, capsys, monkeypatch):
+    """The same inputs on a machine a thousand times as slow give the same validation."""
+    before = UncertainLTI.load(folder / "m.json").validation
+    clock = [0.0]
+
+    def slow():
+        clock[0] += 1000.0
+        return clock[0]
+
+    monkeypatch.setattr(time, "perf_counter", slow)
+    monkeypatch.setattr(time, "monotonic", slow)
+    assert fitted(folder) == 0
+    assert UncertainLTI.load(folder / "m.json").validation == before and before["parts"] == 6
+
+
+def test_what_was_not_left_out_is_unknown_and_said_so(folder, capsys, monkeypatch):
+    monkeypatch.setattr("uncertain_lti.validation.left_out.leave_out_with_fit.__defaults__", (None, None, 100.0))
+    capsys.readouterr()
+    assert fitted(folder) == 0
+    assert "not validated, so how it does on other recordings is unknown: it takes 6 fits" in capsys.readouterr().out
+    engine_bag(folder / "fresh.mcap", seed=9)
+    main(["report", str(folder / "m.json"), str(folder / "fresh.mcap"), "--json"])
+    rely = json.loads(capsys.readouterr().out)["rely"]
+    assert rely["answer"] in ("unknown", "no")
+    (reason,) = [r for r in rely["reasons"] if r["about"] == "validation"]
+    assert reason["weight"] == "unknown" and "it takes 6 fits" in reason["text"]
+
+
 def test_validate_refuses_what_it_cannot_vouch_for(folder, capsys):
     model = str(folder / "m.json")
     capsys.readouterr()
@@ -503,7 +708,7 @@ def test_validate_refuses_what_it_cannot_vouch_for(folder, capsys):
     weighted = weighted.replace(fit_summary={**weighted.fit_summary, "weights": "per state"})
     with pytest.raises(FitError, match="fitted with weights"):
         validate_model(weighted, [])
-    assert leave_out_cheaply([], weighted, 0.0) is None
+    assert "weights" in leave_out_with_fit([Transient([0.0, 1.0], [[0.0]] * 2, [[0.0]] * 2)] * 2, weighted)["not_done"]
 
 
 # --- real recordings ---

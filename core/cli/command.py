@@ -20,6 +20,10 @@ DONE, ALARM, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 """Exit statuses: 1 means that the alarm was raised, and nothing else."""
 
 SILENT = "print errors only (and with --json the data): no summary, no notes, no progress"
+GROUP = (
+    "leave out whole groups of recordings that are alike: folder, hours=H (recordings that follow one another within "
+    "H hours), metadata=NAME (of the bag), name=PATTERN (of the file)"
+)
 
 
 @dataclass(frozen=True)

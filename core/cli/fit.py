@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import logging
 import shlex
-import time
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.cli.command import DONE, SILENT, Command, model_target, print_json, print_notes, print_summary
+from uncertain_lti.cli.command import DONE, GROUP, SILENT, Command, model_target, print_json, print_notes, print_summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="sample",
         help="let every sample weigh the same (default), or every recording however long it is",
     )
+    parser.add_argument("--group", metavar="KEY", help=GROUP)
     parser.add_argument("--cache", metavar="FOLDER", help="more recordings than memory: keep the arrays in this folder")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="fit on the workers of this Dask scheduler")
     parser.add_argument("--workers", type=int, metavar="N", help="fit on a Dask cluster of N workers on this machine")
@@ -77,7 +77,8 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
     from uncertain_lti.reports.text import fit_text, left_out_text, next_text, recording_text
-    from uncertain_lti.validation.left_out import leave_out_cheaply
+    from uncertain_lti.validation.groups import resolve_groups
+    from uncertain_lti.validation.left_out import leave_out_with_fit
 
     output = model_target(options.output)
     if options.workers is not None and options.workers < 1:
@@ -89,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
         if not options.json:
             print_notes(options, transient.notes)
         print_summary(options, recording_text(transient))
-    began = time.perf_counter()
+    resolve_groups(transients, options.group)  # what is wrong with the key is found before the fit
     with options.progress.stage("fitting") as step:
         model = fit(
             transients,
@@ -102,18 +103,18 @@ def run(options: argparse.Namespace) -> int:
         )
     sources = [{"file": name, "sha256": sha256(name)} for t in transients for name in t.sources]
     model = model.replace(fit_summary={**model.fit_summary, "sources": sources})
+    if options.group is not None:
+        model = model.replace(fit_summary={**model.fit_summary, "group": options.group})
     with options.progress.stage("validating") as step:
-        left_out = leave_out_cheaply(transients, model, time.perf_counter() - began, step)
-    if left_out is not None:
-        model = model.replace(validation=left_out)
+        left_out = leave_out_with_fit(transients, model, options.group, step)
+    model = model.replace(validation=left_out)
     model.save(output)
     if options.json:
         data = model.to_dict()
         print_json({"model": str(output), "fit": data["fit"], "validation": data["validation"]})
     else:
         print_summary(options, fit_text(model, transients))
-        if left_out is not None:
-            print_summary(options, left_out_text(left_out))
+        print_summary(options, left_out_text(left_out))
         print_summary(options, f"model written to {output}")
         print_summary(options, next_text(model, shlex.quote(str(output)), left_out))
     return DONE
@@ -128,6 +129,8 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
 
     if options.discard:
         raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
+    if options.group is not None:
+        raise FitError("--group needs all recordings in memory; leave out --cache, --scheduler and --workers")
     if options.count != "sample":
         raise FitError("--count transient needs all recordings in memory; leave out --cache, --scheduler and --workers")
     if options.cache and (options.scheduler or options.workers):

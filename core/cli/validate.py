@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from uncertain_lti.base.errors import BagError, FitError
-from uncertain_lti.cli.command import DONE, SILENT, Command, model_target, print_json, print_notes, print_summary
+from uncertain_lti.cli.command import DONE, GROUP, SILENT, Command, model_target, print_json, print_notes, print_summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "bags", metavar="BAG", nargs="*", help="MCAP files and folders (default: those the model was fitted to)"
     )
     parser.add_argument("--blocks", type=int, help="leave out blocks: so many per recording (a single one: 10)")
+    parser.add_argument(
+        "--group", metavar="KEY", help=f"{GROUP}; default: that of the fit; none: single recordings all the same"
+    )
     parser.add_argument("--gap", type=float, help="s beside a left-out block that are not fitted either")
     parser.add_argument("--confidence", type=float, default=0.9, help="of every interval (default: 0.9)")
     parser.add_argument(
@@ -75,7 +78,13 @@ def run(options: argparse.Namespace) -> int:
         print_notes(options, transient.notes)
     with options.progress.stage("validating") as step:
         validation = validate_model(
-            model, transients, blocks=options.blocks, gap=options.gap, confidence=options.confidence, progress=step
+            model,
+            transients,
+            blocks=options.blocks,
+            gap=options.gap,
+            groups=options.group,
+            confidence=options.confidence,
+            progress=step,
         )
     data = validation.to_dict()
     refusal = ""

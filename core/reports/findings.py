@@ -33,7 +33,11 @@ APART = 10
 """Verdicts without a violation that end an episode."""
 MOST_EPISODES = 1000
 
-YES, CARE, NO = "yes", "with care", "no"
+YES, CARE, UNKNOWN, NO = "yes", "with care", "unknown", "no"
+WEIGHTS = (NO, UNKNOWN, CARE, YES)
+"""From what weighs most: the answer is the first that some reason has."""
+MOST_VIOLATED = 0.5
+"""Share of the verdicts violated from which on a model is refused of which nothing shows that it ever holds."""
 
 
 def findings(
@@ -58,9 +62,9 @@ def findings(
     Returns
     -------
     dict
-        `rely`: an answer (yes, with care, no) and its reasons, each with how much it weighs; `happened`: a sentence
-        per recording; `model`, `validation` and `recordings` what they rest on. `recordings` holds what `check --json`
-        says, the files with their checksums, and episodes of violations.
+        `rely`: an answer (yes, with care, unknown, no) and its reasons, each with how much it weighs; `happened`: a
+        sentence per recording; `model`, `validation` and `recordings` what they rest on. `recordings` holds what
+        `check --json` says, the files with their checksums, and episodes of violations.
 
     Raises
     ------
@@ -75,12 +79,12 @@ def findings(
         *_stability_reasons(model),
         *_validation_reasons(validation, model),
         *_width_reasons(model, recordings),
-        *_recording_reasons(model, recordings),
+        *_recording_reasons(model, recordings, validation),
     ]
     weights = {YES, *(r["weight"] for r in reasons)}
     facts: dict[str, Any] = {
         "version": __version__,
-        "rely": {"answer": next(w for w in (NO, CARE, YES) if w in weights), "reasons": reasons},
+        "rely": {"answer": next(w for w in WEIGHTS if w in weights), "reasons": reasons},
         "happened": [_happened(r) for r in recordings],
         "alarm": any(r["alarm"] for r in recordings),
         "rule": {"violations": rule.violations, "window": rule.window, "margin": rule.margin},
@@ -202,6 +206,10 @@ def _validation(model: UncertainLTI) -> dict[str, Any] | None:
             ],
             "states": {name: _left_out(data["states"][name]) for name in model.state_names},
             "words": str(data["scenario"]["words"]),
+            "what": "group" if data.get("groups") else "recording" if data["kind"] == "transients" else "block",
+            "condition": str(data.get("condition", "")),
+            "condition_short": str(data.get("condition_short", "")),
+            "hint": str(data.get("hint", "")),
             "notes": [str(note) for note in data["notes"]],
         }
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
@@ -313,9 +321,9 @@ def _stability_reasons(model: UncertainLTI) -> list[dict[str, str]]:
 def _validation_reasons(validation: Mapping[str, Any] | None, model: UncertainLTI) -> list[dict[str, str]]:
     if validation is None or validation["inside"] is None:
         how = "run `uncertain-lti validate MODEL --output MODEL` where its recordings are"
-        return [
-            _reason(CARE, "validation", f"it has not been validated, so nothing is known of other recordings; {how}")
-        ]
+        why = f" ({why})" if (why := model.validation.get("not_done")) else ""
+        text = f"it has not been validated{why}, so how it does on other recordings is unknown; {how}"
+        return [_reason(UNKNOWN, "validation", text)]
     what = "recordings" if validation["kind"] == "transients" else "blocks"
     inside = float(validation["inside"])
     weight = NO if inside < TOO_FEW_INSIDE else CARE if inside < CAUTION_INSIDE else YES
@@ -328,13 +336,17 @@ def _validation_reasons(validation: Mapping[str, Any] | None, model: UncertainLT
     )
     if validation["kind"] != "transients":
         text += "; they are of the same run, so another day may differ"
-    return [_reason(weight, "validation", text)]
+    found = [_reason(weight, "validation", text)]
+    if validation["hint"]:
+        found.append(_reason(CARE, "validation", validation["hint"]))
+    return found
 
 
 def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Bounds about as wide as what the state does contain everything, and say nothing.
 
-    A recording in which a state hardly moves says nothing of that: the least share counts, and so does the fit's.
+    Widths and ranges are those of the fit, as the fit itself prints them; of a model that does not say them, those of
+    the recordings at hand: the least share, as a recording in which a state hardly moves says nothing.
     """
     wide: dict[str, float] = {}
     span = model.domain.x_max - model.domain.x_min
@@ -342,7 +354,8 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
     for name, width, of in zip(model.state_names, widths, span, strict=True):
         if math.isfinite(of) and of > 0 and math.isfinite(width):
             wide[name] = width / float(of)
-    for recording in recordings:
+    where = "in the fit" if wide else "in what was checked"
+    for recording in recordings if not wide else []:
         for name, state in recording["states"].items():
             if (share := state["width_to_range"]) is not None:
                 wide[name] = min(wide.get(name, math.inf), share)
@@ -353,14 +366,16 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
     if useless:
         listed = ", ".join(f"{shortened(name)} ({wide[name]:.0%})" for name in useless[:6])
         listed += " ..." if len(useless) > 6 else ""
-        text = f"bounds over {TOO_WIDE:.0%} as wide as the state's own range say next to nothing: {listed}"
+        text = f"bounds over {TOO_WIDE:.0%} as wide as the state's own range {where} say next to nothing: {listed}"
         return [_reason(NO if 2 * len(useless) >= model.n else CARE, "tightness", text)]
     worst = max(wide, key=lambda name: wide[name])
-    text = f"one-step bounds are at most {wide[worst]:.3g} times as wide as the state's own range ({shortened(worst)})"
-    return [_reason(CARE if names else YES, "tightness", text)]
+    text = f"one-step bounds are at most {wide[worst]:.3g} times as wide as the state's own range {where} "
+    return [_reason(CARE if names else YES, "tightness", f"{text}({shortened(worst)})")]
 
 
-def _recording_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _recording_reasons(
+    model: UncertainLTI, recordings: Sequence[Mapping[str, Any]], validation: Mapping[str, Any] | None
+) -> list[dict[str, str]]:
     found = []
     fitted = {s.get("sha256") for s in _list(model.fit_summary.get("sources")) if isinstance(s, Mapping)} - {None, ""}
     judged = sum(r["verdicts"] for r in recordings)
@@ -374,6 +389,13 @@ def _recording_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, An
             _reason(NO, "recordings", "no verdict was possible on what was checked, so nothing is known of it")
         )
         return found
+    violated = sum(r["violated"] for r in recordings) / judged
+    if violated > MOST_VIOLATED and (validation is None or validation["inside"] is None):
+        text = (
+            f"{_percent(violated)} of the verdicts are violated, and nothing shows that the model holds on any healthy "
+            f"recording that it was not fitted to: such a verdict cannot tell a fault"
+        )
+        found.append(_reason(NO, "recordings", text))
     outside = sum(r["outside_domain"] for r in recordings) / judged
     if outside > OUTSIDE_DOMAIN:
         text = f"{_percent(outside)} of the verdicts are on samples outside the ranges seen in the fit"

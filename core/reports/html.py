@@ -23,7 +23,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.reports import figures as plots
-from uncertain_lti.reports.findings import APART, CARE, NO, YES, shortened
+from uncertain_lti.reports.findings import APART, CARE, NO, UNKNOWN, WEIGHTS, YES, shortened
 from uncertain_lti.reports.text import beyond, number
 
 MOST_DRAWN = 8
@@ -34,7 +34,7 @@ _MOST_EPISODES = 20
 _DPI = 105
 _COLOURS = 96
 
-_ANSWER = {YES: "Yes", CARE: "With care", NO: "No"}
+_ANSWER = {YES: "Yes", CARE: "With care", UNKNOWN: "Unknown", NO: "No"}
 _STATE = {"quiet": "nothing", "violations": "violations", "alarm": "alarm", "unknown": "no verdict"}
 
 _STYLE = """
@@ -136,9 +136,9 @@ def write_page(path: str | os.PathLike[str], page: str) -> None:
 
 def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
     rely, happened = facts["rely"], facts["happened"]
-    tone = {YES: "good", CARE: "care", NO: "bad"}
-    reasons = sorted(rely["reasons"], key=lambda r: [NO, CARE, YES].index(r["weight"]))
-    words = {YES: "in its favour", CARE: "mind", NO: "against it"}
+    tone = {YES: "good", CARE: "care", UNKNOWN: "care", NO: "bad"}
+    reasons = sorted(rely["reasons"], key=lambda r: WEIGHTS.index(r["weight"]))
+    words = {YES: "in its favour", CARE: "mind", UNKNOWN: "unknown", NO: "against it"}
     listed = "".join(
         f'<li><b class="{tone[r["weight"]]}">{words[r["weight"]]}:</b> {_text(_without_address(r["text"]))}</li>'
         for r in reasons[:6]
@@ -168,7 +168,7 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
     rule = facts["rule"]
     return (
         f"<header><h1>{_text(name)}</h1>"
-        f'<p class="soft">{_text(_summary(facts))}. AlarmRule: {_rule(rule)}, margin '
+        f'<p class="soft">{_text(_summary(facts))}. Alarm rule: {_rule(rule)}, margin '
         f"{number(rule['margin'])}.</p>"
         '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a><a href="#trust">How far to trust it'
         '</a><a href="#origin">Where it comes from</a></nav></header>\n'
@@ -362,13 +362,15 @@ def _trust(facts: Mapping[str, Any]) -> str:
     else:
         what = "recording" if v["kind"] == "transients" else "block"
         low, high = v["inside_interval"]
+        under = f", {_text(v['condition_short'])}" if v["condition_short"] else ""
         parts.append(
-            f"<p>Left out one {what} at a time ({_text(v['parts'])}): {_text(v['verdicts'])} verdicts in "
+            f"<p>Left out one {v['what']} at a time ({_text(v['parts'])}): {_text(v['verdicts'])} verdicts in "
             f"{number(v['hours'])} h"
             + (
                 ""
                 if v["inside"] is None
-                else f", {v['inside']:.3%} inside all bounds ({v['confidence']:.0%} interval {low:.3%} to {high:.3%})"
+                else f", {v['inside']:.3%} inside all bounds "
+                f"({v['confidence']:.0%} interval {low:.3%} to {high:.3%}{under})"
             )
             + f"; whole {what}s inside: {_text(v['parts_inside'])}.</p>"
         )
@@ -393,8 +395,8 @@ def _trust(facts: Mapping[str, Any]) -> str:
             ]
             for a in v["false_alarms"]
         ]
-        parts.append(_table(("alarm rule", "false alarms", "per hour", "interval"), rows))
-        parts += [f"<p>{_text(line)}.</p>" for line in [v["words"], *v["notes"]]]
+        parts.append(_table(("alarm rule", "false alarms", "per hour", f"interval{under}"), rows))
+        parts += [f"<p>{_text(line)}.</p>" for line in [v["condition"], v["words"], *v["notes"]] if line]
     if facts["model"]["messages"]:
         listed = "".join(f"<li>{_text(_without_address(m))}</li>" for m in facts["model"]["messages"])
         parts.append(f"<h3>What the fit had to say</h3><ul>{listed}</ul>")

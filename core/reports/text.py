@@ -202,7 +202,7 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
     file : str
         Its file, as it would be typed.
     left_out : dict or None
-        What `leave_out_cheaply` returned.
+        What `leave_out_with_fit` returned.
 
     Returns
     -------
@@ -213,7 +213,7 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
     span = model.domain.x_max - model.domain.x_min
     share = np.asarray(facts["mean_width"]) / np.where(span > 0, span, np.inf)
     widest = int(np.argmax(share))
-    inside = None if left_out is None else left_out["inside"]
+    inside = None if left_out is None else left_out.get("inside")
     if share[widest] > WIDE:
         worry = (
             f"the bounds of '{model.state_names[widest]}' are {share[widest]:.0%} as wide as its range, so only gross "
@@ -461,8 +461,10 @@ def validation_text(data: dict[str, Any]) -> str:
     """
     what = "recording" if data["kind"] == "transients" else "block"
     gap = f", {number(data['gap'])} s on both sides not fitted either" if data["kind"] == "blocks" else ""
+    condition = data.get("condition_short")  # files written before it was stored have none
+    under = f", {condition}" if condition else ""
     lines = [
-        f"left out one {what} at a time ({plural(data['parts'], what)}{gap}): {plural(data['verdicts'], 'verdict')}, "
+        f"left out one {_unit(data)} at a time ({_how_many(data)}{gap}): {plural(data['verdicts'], 'verdict')}, "
         f"{number(data['hours'])} h",
         table(
             ("left out", "inside", f"{what}s inside", "mean width", "largest", "fitted: mean width", "largest"),
@@ -484,16 +486,19 @@ def validation_text(data: dict[str, Any]) -> str:
         percent = f"{data['confidence']:.0%}"
         low, high = data["inside_interval"]
         lines.append(
-            f"inside all bounds: {data['inside']:.3%} of the verdicts ({percent} interval {low:.3%} to {high:.3%})"
+            f"inside all bounds: {data['inside']:.3%} of the verdicts "
+            f"({percent} interval {low:.3%} to {high:.3%}{under})"
         )
         low, high = data["parts_inside_interval"]
         lines.append(
             f"whole {what}s inside all bounds: {data['parts_inside']} of {data['parts']} "
-            f"({percent} interval {low:.1%} to {high:.1%})"
+            f"({percent} interval {low:.1%} to {high:.1%}{under})"
         )
+        if groups := data.get("groups"):
+            lines.append(f"whole groups inside all bounds: {groups['inside']} of {groups['count']}")
         lines.append(
             table(
-                ("alarm rule", "alarms", "per hour", f"{percent} interval", "time in alarm"),
+                ("alarm rule", "alarms", "per hour", f"{percent} interval{under}", "time in alarm"),
                 [
                     [
                         f"{a['violations']} of {a['window']}, margin {number(a['margin'])}",
@@ -506,6 +511,8 @@ def validation_text(data: dict[str, Any]) -> str:
                 ],
             )
         )
+    if "condition" in data:
+        lines.append(data["condition"])
     lines.append(data["scenario"]["words"])
     if "calibration" in data:
         lines.append(data["calibration"]["words"])
@@ -515,27 +522,45 @@ def validation_text(data: dict[str, Any]) -> str:
 
 
 def left_out_text(data: dict[str, Any]) -> str:
-    """Short form of `validation_text`, one line, for a fit.
+    """Short form of `validation_text`, one line, for a fit, with the hint that recordings may come in groups.
 
     Parameters
     ----------
     data : dict
-        Of `Validation.to_dict`.
+        Of `leave_out_with_fit`.
 
     Returns
     -------
     str
-        One line.
+        One or two lines.
     """
+    if "not_done" in data:
+        return f"not validated, so how it does on other recordings is unknown: {data['not_done']}"
     what = "recording" if data["kind"] == "transients" else "block"
     ratio = max((s["left_out_to_full"] for s in data["states"].values()), default=math.nan)
     alarm = data["false_alarms"][0]
-    return (
-        f"left out one {what} of {data['parts']} at a time: {data['inside']:.3%} of the verdicts inside, "
+    inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} of the verdicts inside"
+    groups = data["groups"]
+    of = f"{groups['count']} at a time ({_how_many(data)})" if groups else f"{data['parts']} at a time"
+    line = (
+        f"left out one {_unit(data)} of {of}: {inside}, "
         f"{plural(data['parts_inside'], f'whole {what}')}, widths at most {ratio:.3g} times those above; "
-        f"{number(alarm['per_hour'])} false alarms per hour ({_interval(*alarm['interval'])}) at "
-        f"{alarm['violations']} of {alarm['window']}; more: uncertain-lti validate"
+        f"{number(alarm['per_hour'])} false alarms per hour ({_interval(*alarm['interval'])} "
+        f"{data['condition_short']}) at {alarm['violations']} of {alarm['window']}; more: uncertain-lti validate"
     )
+    return f"{line}\nnote: {data['hint']}" if data["hint"] else line
+
+
+def _unit(data: dict[str, Any]) -> str:
+    """What was left out at a time."""
+    return "group" if data.get("groups") else "recording" if data["kind"] == "transients" else "block"
+
+
+def _how_many(data: dict[str, Any]) -> str:
+    """How many there are of it."""
+    parts = plural(data["parts"], "recording" if data["kind"] == "transients" else "block")
+    groups = data.get("groups")
+    return f"{parts} in {plural(groups['count'], 'group')}, by {groups['key']}" if groups else parts
 
 
 def _interval(low: float, high: float | None) -> str:

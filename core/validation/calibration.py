@@ -13,7 +13,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.validation.intervals import cluster_size, rate_interval
-from uncertain_lti.validation.left_out import Part, Validation, borrowed_margin, rising
+from uncertain_lti.validation.left_out import Part, Validation, borrowed_margin, by_unit, peaks, rising, short_condition
 
 RULES = ((1, 1), (3, 5), (5, 10))
 """(violations, window) tried unless told otherwise."""
@@ -172,7 +172,7 @@ def calibrate(
     parts = validation.parts
     hours = sum(p.hours for p in parts)
     candidates = tuple(_candidate(parts, m, n, wish, each, hours) for m, n in rules)
-    needed = rate_interval(np.zeros(len(parts)), 1.0, each, one_sided=True)[1] / wish
+    needed = rate_interval(np.zeros(validation.units), 1.0, each, one_sided=True)[1] / wish
     found = [c for c in candidates if c.margin is not None]
     if not found:
         return Calibration(None, wish, confidence, hours, needed, candidates, _refusal(candidates, wish, hours, needed))
@@ -183,7 +183,8 @@ def calibrate(
     missed = 1.0 - float(best.detected[slow])
     words = (
         f"alarm at {best.violations} of {best.window} verdicts outside {best.margin:.3g} times the half-widths: at "
-        f"most {wish:g} false alarms per hour with {confidence:.0%} confidence ({best.alarms} in {hours:.3g} h left "
+        f"most {wish:g} false alarms per hour with {confidence:.0%} confidence {short_condition(validation)} "
+        f"({best.alarms} in {hours:.3g} h left "
         f"out, limit {best.upper:.3g} per hour); a fault that moves one state by {FAULT_SIZE:g} mean width more in "
         f"every step is seen "
         + (
@@ -209,13 +210,14 @@ def _deaf(detected: Array, names: Sequence[str]) -> str:
 
 def _candidate(parts: Sequence[Part], m: int, n: int, wish: float, confidence: float, hours: float) -> Candidate:
     levels = [p.level(m, n) for p in parts]
-    counts = np.array(
-        [[rising(level > margin, p.starts) for p, level in zip(parts, levels, strict=True)] for margin in MARGINS]
+    counts = by_unit(
+        parts,
+        [[rising(level > margin, p.starts) for p, level in zip(parts, levels, strict=True)] for margin in MARGINS],
     )
-    peaks = [float(level.max(initial=0.0)) for level in levels]
+    largest = peaks(parts, levels)
     chosen, count, limit = None, 0, math.inf
     for margin, row in zip(MARGINS, counts, strict=True):
-        nearby = int(np.argmax(np.array([*MARGINS, 0.0]) <= borrowed_margin(peaks, margin)))
+        nearby = int(np.argmax(np.array([*MARGINS, 0.0]) <= borrowed_margin(largest, margin)))
         typical = cluster_size(counts[min(nearby, len(counts) - 1)])
         upper = rate_interval(row, hours, confidence, typical, one_sided=True)[1]
         if upper > wish:

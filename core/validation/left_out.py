@@ -21,6 +21,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.intervals import (
     cluster_size,
     discarding_bound,
@@ -35,6 +36,8 @@ VOID = 0.9
 """A bound on the probability of leaving the envelope that is above this says nothing."""
 NEARBY = 0.75
 """Down to this share of the margin, alarms are taken to come in clusters as they do at the margin."""
+LIMIT = 1e9
+"""Elements of all left-out problems together up to which a fit leaves out as well: some minutes."""
 REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
 """Alarm rules whose false alarms are counted beside the model's own."""
 
@@ -69,6 +72,8 @@ class Part:
         The largest such width.
     relative_width : array (n,)
         The mean over that of the full model on the same samples.
+    group : str
+        What was left out together with it; "" if it was left out alone.
     """
 
     name: str
@@ -83,6 +88,7 @@ class Part:
     mean_width: Array
     max_width: Array
     relative_width: Array
+    group: str = ""
 
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
@@ -144,6 +150,47 @@ class Part:
         return rising(self.level(rule.violations, rule.window) > rule.margin, self.starts)
 
 
+def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
+    """Number of what each part was left out with: its group, or a number of its own.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Left-out parts.
+
+    Returns
+    -------
+    array (parts,) of int
+        From 0, in order of first appearance.
+    """
+    numbers: dict[str, int] = {}
+    found = [
+        numbers.setdefault(f"group {p.group}" if p.group else f"part {i}", len(numbers)) for i, p in enumerate(parts)
+    ]
+    return np.array(found, dtype=np.intp)
+
+
+def by_unit(parts: Sequence[Part], values: ArrayLike) -> Array:
+    """Sums over what was left out together.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Left-out parts.
+    values : array (..., parts)
+        One value per part.
+
+    Returns
+    -------
+    array (..., units)
+        Sums over each group, or the values themselves if every part was left out alone.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    numbers = unit_numbers(parts)
+    member = numbers[:, None] == np.arange(int(numbers.max(initial=-1)) + 1)
+    return np.asarray(values @ member)
+
+
 def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:
     """Rising edges of an alarm that starts anew, lowered, at each of `starts`.
 
@@ -180,6 +227,10 @@ class Validation:
         Time on both sides of a left-out block that was not fitted either, s; 0 for transients.
     confidence : float
         Of every interval.
+    grouping : str
+        In words, what the groups are that were left out as a whole; "" if every part was left out alone.
+    hint : str
+        A sentence if the recordings seem to come in groups and none were given, else "".
     """
 
     model: UncertainLTI
@@ -187,12 +238,25 @@ class Validation:
     kind: str
     gap: float
     confidence: float
+    grouping: str = ""
+    hint: str = ""
+
+    @property
+    def what(self) -> str:
+        """What was left out at a time, and what every interval takes for independent: recording, block or group."""
+        return "group" if self.grouping else "recording" if self.kind == "transients" else "block"
+
+    @property
+    def units(self) -> int:
+        """How many of them there are."""
+        return int(unit_numbers(self.parts).max(initial=-1)) + 1
 
     def __repr__(self) -> str:
         judged, violated = sum(p.judged for p in self.parts), sum(p.violated for p in self.parts)
         inside = f"{1 - violated / judged:.3%} of {plural(judged, 'verdict')} inside" if judged else "no verdict"
-        whole = sum(p.violated == 0 for p in self.parts)
-        return f"Validation(left out one of {len(self.parts)} {self.kind}: {inside}, {whole} whole)"
+        whole = int(np.count_nonzero(by_unit(self.parts, [p.violated for p in self.parts]) == 0))
+        of = "groups" if self.grouping else self.kind
+        return f"Validation(left out one of {self.units} {of}: {inside}, {whole} whole)"
 
     def _repr_html_(self) -> str:
         """Coverage beside widths, from `Validation.to_dict()`."""
@@ -239,12 +303,13 @@ def validate(
     alarm_rule: AlarmRule | None = None,
     blocks: int | None = None,
     gap: float | None = None,
+    groups: Sequence[Any] | str | None = None,
     confidence: float = 0.9,
     full: UncertainLTI | None = None,
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Validation:
-    """Leave out one recording at a time, fit to the others, and judge the one left out.
+    """Leave out one recording or group at a time, fit to the others, and judge what was left out.
 
     Parameters
     ----------
@@ -262,6 +327,10 @@ def validate(
     gap : float, optional
         Time on both sides of a left-out block that is not fitted either, s, because it resembles the block. Default:
         three times the slowest time constant of the nominal model, at most half a block.
+    groups : sequence or str, optional
+        What the recordings have in common: one name (of a machine, a day, an operator) per recording, or a key of
+        `groups.group_names`. A whole group is left out at a time, and the intervals count groups. Without it they
+        take every recording for independent of the others.
     confidence : float, default 0.9
         Of every interval, 0.5 to below 1.
     full : UncertainLTI, optional
@@ -290,6 +359,9 @@ def validate(
         full = fit(transients, weights=weights, operating_point=operating_point, alarm_rule=alarm_rule, **options)
     elif alarm_rule is not None:
         full = full.replace(alarm_rule=alarm_rule)
+    if groups is not None and blocks is not None:
+        raise FitError("groups leave out whole recordings, and blocks cut them; choose one")
+    names, grouping = resolve_groups(transients, groups)
     if blocks is None and len(transients) == 1:
         blocks = BLOCKS
     if blocks is None:
@@ -302,29 +374,41 @@ def validate(
             raise FitError(f"gap is {gap}; it must be 0 s or more")
         cuts = [(t, *span) for t in transients for span in _blocks(t, blocks)]
         gap = _gap(full, cuts) if gap is None else gap
-    parts = []
+    parts: dict[int, Part] = {}
     own = _split_weights(weights, transients, full.n)
-    for number, (left, start, stop) in enumerate(cuts):
+    units: dict[Any, list[int]] = {}
+    for i in range(len(cuts)):
+        units.setdefault(names[i] if grouping else i, []).append(i)
+    for number, (unit, together) in enumerate(units.items()):
+        left, start, stop = cuts[together[0]]
         name = left.name if blocks is None else f"{left.name} from {left.t[start]:.6g} to {left.t[stop - 1]:.6g} s"
+        name = f"group {unit}" if grouping else name
         if progress is not None:
-            progress(f"fit {number + 1} of {len(cuts)}: without {name}")
+            progress(f"fit {number + 1} of {len(units)}: without {name}")
+        absent = {id(cuts[i][0]): cuts[i][1:] for i in together}
         pieces, kept = [], []
         for transient, weight in zip(transients, own, strict=True):
-            for a, b in _rest(transient, start, stop, gap) if transient is left else [(0, len(transient))]:
+            whole = (0, len(transient))
+            gone = absent.get(id(transient))
+            for a, b in [whole] if gone is None else _rest(transient, *gone, gap):
                 if b - a >= 2:
-                    pieces.append(transient if (a, b) == (0, len(transient)) else cut(transient, a, b))
+                    pieces.append(transient if (a, b) == whole else cut(transient, a, b))
                     kept.append(None if weight is None else weight[a : b - 1])
         chosen = kept if own[0] is not None else weights
         try:
             model = fit(pieces, weights=chosen, operating_point=full.operating_point, describe_data=False, **options)  # type: ignore[arg-type]
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
-        tested = left if (start, stop) == (0, len(left)) else cut(left, start, stop)
-        parts.append(judge(model, full, tested, name))
-    return Validation(full, tuple(parts), "transients" if blocks is None else "blocks", float(gap), confidence)
+        for i in together:
+            left, start, stop = cuts[i]
+            tested = left if (start, stop) == (0, len(left)) else cut(left, start, stop)
+            parts[i] = judge(model, full, tested, left.name if grouping else name, names[i] if grouping else "")
+    kind = "transients" if blocks is None else "blocks"
+    hint = "" if grouping or blocks is not None else likely_groups(transients)
+    return Validation(full, tuple(parts[i] for i in sorted(parts)), kind, float(gap), confidence, grouping, hint)
 
 
-def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str) -> Part:
+def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str, group: str = "") -> Part:
     """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1.
 
     Parameters
@@ -337,6 +421,8 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         What was left out.
     name : str
         What it is called.
+    group : str, default ""
+        What was left out together with it.
 
     Returns
     -------
@@ -371,6 +457,7 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         np.full(n, np.nan) if empty else width.mean(axis=0),
         np.full(n, np.nan) if empty else width.max(axis=0),
         np.full(n, np.nan) if empty else width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
+        group,
     )
 
 
@@ -486,7 +573,8 @@ def summary(validation: Validation) -> dict[str, Any]:
             "left_out_to_full": float(_average(parts, [p.relative_width for p in parts])[i]),
             "unit": model.signals.states[i].unit,
         }
-    low, high = rate_interval(violated, judged, v.confidence) if judged else (0.0, math.inf)
+    units = by_unit(parts, violated)
+    low, high = rate_interval(units, judged, v.confidence) if judged else (0.0, math.inf)
     rules = [model.alarm_rule, *(AlarmRule(m, n, model.alarm_rule.margin) for m, n in REFERENCE_RULES)]
     alarms = [false_alarms(parts, rule, v.confidence) for rule in dict.fromkeys(rules)]
     return {
@@ -500,7 +588,18 @@ def summary(validation: Validation) -> dict[str, Any]:
         "inside_interval": [max(0.0, 1.0 - high), 1.0 - low],
         "parts_inside": inside,
         "parts_inside_share": inside / len(parts),
-        "parts_inside_interval": list(share_interval(inside, len(parts), v.confidence)),
+        "parts_inside_interval": _whole_interval(v),
+        "groups": None
+        if not v.grouping
+        else {
+            "key": v.grouping,
+            "count": v.units,
+            "inside": int(np.count_nonzero(units == 0)),
+            "recordings": {p.group: [q.name for q in parts if q.group == p.group] for p in parts},
+        },
+        "condition": condition(v),
+        "condition_short": short_condition(v),
+        "hint": v.hint,
         "outside_domain": sum(p.outside_domain for p in parts),
         "violated_inside_domain": sum(p.unseen for p in parts),
         "states": states,
@@ -512,6 +611,59 @@ def summary(validation: Validation) -> dict[str, Any]:
         ],
         "notes": _notes(v),
     }
+
+
+def short_condition(validation: Validation) -> str:
+    """What must be true for the intervals to hold, in a few words.
+
+    Parameters
+    ----------
+    validation : Validation
+        Of `validate`.
+
+    Returns
+    -------
+    str
+        A clause to stand beside an interval.
+    """
+    return f"if the {validation.what}s are independent"
+
+
+def condition(validation: Validation) -> str:
+    """What must be true for the intervals to hold.
+
+    Parameters
+    ----------
+    validation : Validation
+        Of `validate`.
+
+    Returns
+    -------
+    str
+        A sentence.
+    """
+    v = validation
+    if v.kind == "blocks":
+        return (
+            f"every interval counts {plural(v.units, 'block')}, and holds for more of the same runs if the blocks are "
+            f"independent of one another; of another day, machine or operator it says nothing"
+        )
+    alike = "" if v.grouping else ", machines or operators"
+    return (
+        f"every interval counts {plural(v.units, v.what)}, and holds if they are independent of one another and the "
+        f"machine is run like that again: no other days{alike} that differ by more than these do, no wear, no kind of "
+        f"event that none of them shows"
+    )
+
+
+def _whole_interval(validation: Validation) -> list[float]:
+    """For the share of whole parts inside all bounds: exact of independent parts, by clusters of groups."""
+    v, parts = validation, validation.parts
+    left = [p.violated > 0 for p in parts]
+    if not v.grouping:
+        return list(share_interval(len(parts) - sum(left), len(parts), v.confidence))
+    low, high = rate_interval(by_unit(parts, left), len(parts), v.confidence)
+    return [max(0.0, 1.0 - high), 1.0 - low]
 
 
 def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> dict[str, Any]:
@@ -534,7 +686,7 @@ def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> d
     counts = [p.alarms(rule) for p in parts]
     hours = sum(p.hours for p in parts)
     raised = sum(float(p.dt[p.level(rule.violations, rule.window) > rule.margin].sum()) for p in parts) / 3600.0
-    low, high = rate_interval(counts, hours, confidence, typical_cluster(parts, rule))
+    low, high = rate_interval(by_unit(parts, counts), hours, confidence, typical_cluster(parts, rule))
     return {
         "violations": rule.violations,
         "window": rule.window,
@@ -550,8 +702,8 @@ def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> d
 def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
     """Alarms that come at once, where few or none are counted: those of the same rule at a smaller margin.
 
-    The margin is that at which three parts alarm, but not below NEARBY times the rule's: far below, alarms are of
-    another kind.
+    The margin is that at which three parts or groups alarm, but not below NEARBY times the rule's: far below, alarms
+    are of another kind.
 
     Parameters
     ----------
@@ -566,17 +718,39 @@ def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
         As `cluster_size`.
     """
     levels = [p.level(rule.violations, rule.window) for p in parts]
-    margin = borrowed_margin([float(level.max(initial=0.0)) for level in levels], rule.margin)
-    return cluster_size([rising(level > margin, p.starts) for p, level in zip(parts, levels, strict=True)])
+    margin = borrowed_margin(peaks(parts, levels), rule.margin)
+    counts = [rising(level > margin, p.starts) for p, level in zip(parts, levels, strict=True)]
+    return cluster_size(by_unit(parts, counts))
 
 
-def borrowed_margin(peaks: Sequence[float], margin: float) -> float:
+def peaks(parts: Sequence[Part], levels: Sequence[Array]) -> list[float]:
+    """Largest level of each part that was left out alone, and of each group.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Left-out parts.
+    levels : sequence of array (K,)
+        `Part.level` of each.
+
+    Returns
+    -------
+    list of float
+        One per part or group.
+    """
+    found: dict[int, float] = {}
+    for unit, level in zip(unit_numbers(parts).tolist(), levels, strict=True):
+        found[unit] = max(found.get(unit, 0.0), float(level.max(initial=0.0)))
+    return list(found.values())
+
+
+def borrowed_margin(largest: Sequence[float], margin: float) -> float:
     """The margin at which to see how many alarms come at once.
 
     Parameters
     ----------
-    peaks : sequence of float
-        Largest level of each part.
+    largest : sequence of float
+        Of `peaks`.
     margin : float
         The rule's.
 
@@ -585,13 +759,13 @@ def borrowed_margin(peaks: Sequence[float], margin: float) -> float:
     float
         At most the rule's, at least NEARBY times it.
     """
-    third = sorted(peaks, reverse=True)[min(2, len(peaks) - 1)]
+    third = sorted(largest, reverse=True)[min(2, len(largest) - 1)]
     # a little below the third peak: an alarm that only just starts is always alone
     return min(margin, max(0.95 * third, NEARBY * margin))
 
 
 def scenario(validation: Validation) -> dict[str, Any]:
-    """The scenario bound on leaving the envelope anywhere in a whole fresh transient, or why there is none.
+    """The scenario bound on leaving the envelope anywhere in a whole fresh transient or group, or why there is none.
 
     Parameters
     ----------
@@ -604,44 +778,45 @@ def scenario(validation: Validation) -> dict[str, Any]:
         `words`, and where there is a bound its `interval` and what was counted.
     """
     v = validation
-    G = len(v.parts)
+    G, what = v.units, v.what
     discarded = _discarded(v.model)
     condition = (
-        "holds if the recordings were drawn independently of one another from one and the same distribution, and the "
-        "machine will be run like that again; counted by whole recordings, margin 1; a guide rather than a theorem, as "
-        "the theorem asks for an objective that does not depend on the recordings, and the sum of squared widths does"
+        f"holds if the {what}s were drawn independently of one another from one and the same distribution, and the "
+        f"machine will be run like that again; counted by whole {what}s, margin 1; a guide rather than a theorem, as "
+        f"the theorem asks for an objective that does not depend on the recordings, and the sum of squared widths does"
     )
     if v.kind == "blocks":
         return {"words": "no scenario bound: blocks of one recording are not independent of one another"}
+    counted = "transients" if what == "recording" else "groups"
     if discarded:
         variables = _variables(v.model)
         upper = discarding_bound(variables, discarded, G, v.confidence)
         if upper > VOID:
             return {
-                "words": f"not enough transients for a scenario bound: {G} with {variables} unknowns and at most "
+                "words": f"not enough {counted} for a scenario bound: {G} with {variables} unknowns and at most "
                 f"{discarded} with discarded transitions"
             }
         return {
             "interval": [0.0, upper],
             "discarded": discarded,
             "variables": variables,
-            "words": f"a fresh recording leaves the envelope with a probability of at most {upper:.1%} "
-            f"(confidence {v.confidence:.0%}); {condition}, and each recording with a discarded transition counted as "
+            "words": f"a fresh {what} leaves the envelope with a probability of at most {upper:.1%} "
+            f"(confidence {v.confidence:.0%}); {condition}, and each {what} with a discarded transition counted as "
             f"discarded",
         }
-    support = sum(p.violated > 0 for p in v.parts)
+    support = int(np.count_nonzero(by_unit(v.parts, [p.violated for p in v.parts])))
     low, high = scenario_interval(support, G, v.confidence)
     if high > VOID:
         return {
             "support": support,
-            "words": f"not enough transients for a scenario bound: {support} of {G} left the envelope of the others; "
+            "words": f"not enough {counted} for a scenario bound: {support} of {G} left the envelope of the others; "
             f"record more of them",
         }
     return {
         "support": support,
         "interval": [low, high],
-        "words": f"a fresh recording leaves the envelope somewhere with a probability between {low:.1%} and "
-        f"{high:.1%} (confidence {v.confidence:.0%}, {support} of {G} recordings left the envelope of the others); "
+        "words": f"a fresh {what} leaves the envelope somewhere with a probability between {low:.1%} and "
+        f"{high:.1%} (confidence {v.confidence:.0%}, {support} of {G} {what}s left the envelope of the others); "
         f"{condition}",
     }
 
@@ -690,12 +865,13 @@ def _average(parts: Sequence[Part], values: Sequence[Array]) -> Array:
 
 def _notes(validation: Validation) -> list[str]:
     v = validation
-    G = len(v.parts)
-    what = "recordings" if v.kind == "transients" else "blocks"
+    G, what = v.units, f"{v.what}s"
     notes = [
         f"the numbers are those of models fitted to {G - 1} of the {G} {what}: the model of all {G} is a little "
         f"better, so they err on the safe side"
     ]
+    if v.hint:
+        notes.insert(0, v.hint)
     if G < 6:
         notes.append(f"{G} {what} say little: an interval from so few is wide, and rests on them being typical")
     if count := len(v.model.fit_summary.get("discarded", [])):
@@ -724,10 +900,14 @@ def validate_model(
     *,
     blocks: int | None = None,
     gap: float | None = None,
+    groups: Sequence[Any] | str | None = None,
     confidence: float = 0.9,
     progress: Callable[[str], None] | None = None,
 ) -> Validation:
     """Validate a fitted model, or one from a file, with the recordings it was fitted to and the options it names.
+
+    The key by which its file says that the recordings are grouped, `fit --group`, counts unless groups or blocks are
+    given.
 
     Parameters
     ----------
@@ -739,6 +919,8 @@ def validate_model(
         As in `validate`.
     gap : float, optional
         As in `validate`.
+    groups : sequence or str, optional
+        As in `validate`; "none" leaves out single recordings all the same.
     confidence : float, default 0.9
         As in `validate`.
     progress : callable, optional
@@ -754,6 +936,10 @@ def validate_model(
     FitError
         Beside those of `validate`: the model does not say how it was fitted, or the recordings do not give it again.
     """
+    if isinstance(groups, str) and groups == "none":
+        groups = None
+    elif groups is None and blocks is None:
+        groups = model.fit_summary.get("group")
     if progress is not None:
         progress("the fit to all recordings")
     again = fit(transients, operating_point=model.operating_point, **_options(model))
@@ -768,6 +954,7 @@ def validate_model(
         alarm_rule=model.alarm_rule,
         blocks=blocks,
         gap=gap,
+        groups=groups,
         confidence=confidence,
         full=again,
         progress=progress,
@@ -797,45 +984,60 @@ def _same(one: UncertainLTI, other: UncertainLTI) -> bool:
     return np.allclose(one.fit_summary["mean_width"], np.asarray(other.fit_summary["mean_width"]), rtol=1e-6, atol=0.0)
 
 
-def leave_out_cheaply(
+def leave_out_with_fit(
     transients: Sequence[Transient],
     model: UncertainLTI,
-    seconds: float,
+    groups: Sequence[Any] | str | None = None,
     progress: Callable[[str], None] | None = None,
-    budget: float = 5.0,
-) -> dict[str, Any] | None:
-    """The summary of `validate`, if it takes little time beside a fit.
+    limit: float = LIMIT,
+) -> dict[str, Any]:
+    """The summary of `validate` for a model that was just fitted, or `{"not_done": why}`.
+
+    Whether it is done depends on the recordings and the model alone, never on how long anything took: it is done
+    if the elements of all left-out problems together (fits, transitions, states, signals) are at most `limit`.
 
     Parameters
     ----------
     transients : sequence of Transient
-        What the model was fitted to.
+        The recordings.
     model : UncertainLTI
-        Of `fit`.
-    seconds : float
-        Time that the fit took, s.
-    progress : callable, optional
+        Fitted to them.
+    groups : sequence or str, optional
         As in `validate`.
-    budget : float, default 5.0
-        Time that the validation may take, s, estimated as that of one fit per part.
+    progress : callable, optional
+        Called with one line of text per fit.
+    limit : float, default LIMIT
+        Elements of all left-out problems together.
 
     Returns
     -------
-    dict or None
-        As `summary`; None where it would take longer, the fit has weights, or too little is left when a part is left
-        out.
+    dict
+        As `summary`, or with the key `not_done` alone.
+
+    Raises
+    ------
+    FitError
+        The groups do not fit the recordings.
     """
-    parts = len(transients) if len(transients) > 1 else BLOCKS
-    if parts * seconds > budget or model.fit_summary.get("weights", "ones") != "ones":
-        return None
+    names, _ = resolve_groups(transients, groups)
+    fits = len(set(names)) if names else len(transients) if len(transients) > 1 else BLOCKS
+    size = float(model.fit_summary["transitions"]) * model.n * (model.n + model.m)
+    if fits * size > limit:
+        return {
+            "not_done": f"it takes {fits} fits of a problem as large as this one ({size:.2g} elements each); run "
+            f"uncertain-lti validate"
+        }
+    if model.fit_summary.get("weights", "ones") != "ones":
+        return {"not_done": "the weights belong to the samples; use validate() from Python"}
     try:
         return validate(
             transients,
             operating_point=model.operating_point,
             alarm_rule=model.alarm_rule,
+            groups=groups,
             full=model,
             progress=progress,
             **_options(model),
         ).to_dict()
-    except FitError:  # too little is left when a part is left out: the fit itself stands
-        return None
+    except FitError as error:  # too little is left when a part is left out: the fit itself stands
+        return {"not_done": str(error)}
