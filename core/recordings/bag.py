@@ -18,7 +18,7 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.bag_files import listed_parts, natural, os_error, parts_of, stem_and_index
 from uncertain_lti.recordings.mcap_index import outline
 from uncertain_lti.recordings.mcap_records import Block, Contents, count, messages, read_block, scan
-from uncertain_lti.recordings.message_types import Definition, define, header_stamp_ns, normal_name, undefined
+from uncertain_lti.recordings.message_types import Definition, define, header_stamp_ns, lines_of, normal_name, undefined
 from uncertain_lti.signals.field_types import FieldType, TypeFields
 from uncertain_lti.signals.paths import signal_paths
 
@@ -32,6 +32,10 @@ __all__ = [
     "group_recordings",
     "header_stamp_ns",
 ]
+
+
+_MOST_LINES = 100_000  # of definitions that are read in one file
+_LEAST_LINES = 50  # that a definition counts for, however short it is
 
 
 @dataclass(frozen=True)
@@ -501,6 +505,8 @@ def _of(channels: Mapping[int, RecordedChannel], topics: set[str], counted: bool
 def _channels(contents: Contents) -> dict[int, RecordedChannel]:
     """Channels of one file with their definitions, or the reason why there is none."""
     channels = {}
+    seen: set[int] = set()
+    lines = 0
     for key, channel in contents.channels.items():
         schema = contents.schemas.get(channel.schema_id) if channel.schema_id else None
         type_name = normal_name(schema.name) if schema else ""
@@ -510,7 +516,13 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
         elif schema is None:
             definition = undefined(type_name, "the file does not say what type it has")
         else:
-            definition = define(schema.name, schema.encoding, schema.data)
+            if schema.id not in seen:
+                seen.add(schema.id)
+                lines += _LEAST_LINES + lines_of(schema.data)
+            if lines > _MOST_LINES:
+                definition = undefined(type_name, "the definitions of the file are too long together")
+            else:
+                definition = define(schema.name, schema.encoding, schema.data)
         channels[key] = RecordedChannel(
             channel.topic, type_name, channel.message_encoding, schema, channel.metadata, definition
         )

@@ -24,10 +24,18 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.signals.field_types import FieldType
 
 _LARGEST_SCHEMA = 1 << 20  # bytes
+_LARGEST_PARSED = 1 << 18  # bytes without comments
+_MOST_LINES = 8192  # without comments
+_DEEPEST = 32  # messages in messages
+_MOST_NUMBERS = 50_000  # fields of a message with those of the messages in it
 _LARGEST_MESSAGE = 1 << 26  # bytes, decompressed
+_LARGEST_RATIO = 10_000
+_LEAST_INFLATED = 1 << 20
+_NOTHING = "structure_needs_at_least_one_member"  # what the middleware puts into a message without fields: one byte
 _ZSTD = b"\x28\xb5\x2f\xfd"
+_LINE = re.compile(rb"^[ \t\r]*[^#\s]", re.MULTILINE)
 _CDR = b"\0\0", b"\0\1", b"\0\3"  # plain, and what the middleware reads as such; only the first is big-endian
-_LONGEST_UNROLLED = 4096  # rosbags writes a line of code per element of a fixed array of strings or messages
+_MOST_UNROLLED = 1024  # rosbags writes a line of code per element of a fixed array of strings or messages
 CODES = {
     "bool": "?", "byte": "i1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
     "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
@@ -112,22 +120,23 @@ class Definition:
         """
         try:
             data = _plain(data)
-            return self.store.deserialize_cdr(data, self.type_name)
+            layout = self.store.get_msgdef(self.type_name)
+            read = layout.deserialize_cdr_le if data[1] else layout.deserialize_cdr_be
+            message, end = read(data[4:], 0, layout.cls, self.store)
+            left = len(data) - 4 - end
+            fits = self._may_end(message, left)
         except Exception as error:  # the generated decoders raise whatever the bytes lead them to
-            if "size mismatch" in str(error):
-                layout = self.store.get_msgdef(self.type_name)
-                read = layout.deserialize_cdr_le if data[1] else layout.deserialize_cdr_be
-                message, end = read(data[4:], 0, layout.cls, self.store)
-                if self._may_end(message, len(data) - 4 - end):
-                    return message
             raise BagError(_one_line(error)) from None
+        if not fits:
+            raise BagError(f"it is {left} bytes longer than its definition" if left > 0 else "it is cut")
+        return message
 
     def _may_end(self, message: Any, left: int) -> bool:
         """Whether so many bytes may be left behind a message: no more than `rclpy.serialization` leaves there.
 
         It reserves 4 for each empty sequence of 8-byte numbers, and so does every bag written through rosbag2_py.
         """
-        return left <= 3 + 4 * self._empty_sequences(self.type_name, message)
+        return 0 <= left <= 3 or 3 < left <= 3 + 4 * self._empty_sequences(self.type_name, message)
 
     def _empty_sequences(self, type_name: str, message: Any) -> int:
         count = 0
@@ -178,7 +187,7 @@ class Definition:
             except BagError:
                 return None
         try:
-            data = _plain(data)
+            data = _plain(data, 12)
         except (zstandard.ZstdError, TypesysError):
             return None
         if len(data) < 12:
@@ -209,7 +218,7 @@ class Definition:
         return {
             normalize_fieldname(name): _field_type(description)
             for name, description in self.types[type_name][1]
-            if name != "structure_needs_at_least_one_member"
+            if name != _NOTHING
         }
 
 
@@ -261,10 +270,11 @@ class _OddText:
         return data.split(b"\0")[0].decode(errors="replace")
 
 
-def _plain(data: bytes) -> bytes:
+def _plain(data: bytes, wanted: int = _LARGEST_MESSAGE) -> bytes:
     """Bytes of a message that the recorder may have compressed on its own (rosbag2's compression mode MESSAGE)."""
     if data[:4] == _ZSTD:  # no CDR begins like this
-        data = zstandard.ZstdDecompressor().stream_reader(data).read(_LARGEST_MESSAGE)
+        most = min(wanted, max(_LEAST_INFLATED, _LARGEST_RATIO * len(data)))
+        data = zstandard.ZstdDecompressor().stream_reader(data).read(most)
     if data[:2] not in _CDR:  # the decoder takes whatever it is for plain
         raise TypesysError(f"it is no plain CDR; it begins with {data[:2].hex() or 'nothing'}")
     return data
@@ -336,13 +346,14 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
         if len(text) > _LARGEST_SCHEMA:
             raise TypesysError(f"its definition is {len(text)} bytes long")
         if text.strip():
-            types = _parse(type_name, encoding, text.decode())
+            types = _parse(type_name, encoding, _readable(encoding, text))
         elif type_name in _jazzy().fielddefs:
             note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
         else:
             raise TypesysError(f"the file holds no definition of {type_name}, and ROS 2 Jazzy has none")
-        used: set[str] = set()
+        used: dict[str, int] = {}
         _complete(type_name, types, (), used)
+        _hold_bounds({name: types[name] for name in used})
         types = {name: types[name] for name in sorted(used)}
         store.register(types)
     except Exception as error:  # a schema may hold anything, and parsers raise whatever it leads them to
@@ -392,6 +403,26 @@ def _jazzy() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
+def _readable(encoding: str, text: bytes) -> str:
+    """The text of a schema as the parser takes it.
+
+    Editors leave a byte order mark and line ends of other systems, and comments in encodings of their own.
+    """
+    lines = re.split(r"\r\n|\r|\n", text.decode(errors="replace").replace("\ufeff", ""))
+    if encoding == "ros2msg":
+        lines = [line for line in lines if not line.lstrip().startswith("#")]
+    lines = [line for line in lines if line.strip()]
+    if len(lines) > _MOST_LINES or sum(map(len, lines)) > _LARGEST_PARSED:
+        size = sum(map(len, lines))
+        raise TypesysError(f"it has {len(lines)} lines and {size} letters without its comments, which is too long")
+    return "\n".join(lines) + "\n"
+
+
+def lines_of(text: bytes) -> int:
+    """Lines of a schema that are neither empty nor a comment alone: what reading it takes its time for."""
+    return len(_LINE.findall(text))
+
+
 def _parse(type_name: str, encoding: str, text: str) -> dict[str, Any]:
     if encoding == "ros2msg":
         return dict(get_types_from_msg(text, type_name))
@@ -407,28 +438,48 @@ def _parse(type_name: str, encoding: str, text: str) -> dict[str, Any]:
     return types
 
 
-def _complete(type_name: str, types: dict[str, Any], above: tuple[str, ...], done: set[str]) -> None:
-    """Add what is missing and is part of Jazzy; refuse what the decoder cannot take."""
+def _complete(type_name: str, types: dict[str, Any], above: tuple[str, ...], done: dict[str, int]) -> int:
+    """Add what is missing and is part of Jazzy, and refuse what the decoder cannot take; returns how many fields."""
     if type_name in above:
         raise TypesysError(f"{type_name} contains itself")
     if type_name in done:
-        return
+        return done[type_name]
+    if len(above) == _DEEPEST:
+        raise TypesysError(f"it nests messages more than {_DEEPEST} deep")
     if type_name not in types:
         if type_name not in _jazzy().fielddefs:
             raise TypesysError(f"{type_name} is used and not defined")
         types[type_name] = _jazzy().fielddefs[type_name]
-    for name, (node, what) in types[type_name][1]:
-        count = 0
+    constants, fields = types[type_name][:2]
+    if not fields:
+        fields = [(_NOTHING, (Nodetype.BASE, ("uint8", 0)))]
+        types[type_name] = constants, fields
+    number = 0
+    for name, (node, what) in fields:
+        if node == Nodetype.ARRAY and not what[1]:
+            raise TypesysError(f"{type_name}.{name} is a fixed array of 0, which no message has")
         if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            count = what[1] if node == Nodetype.ARRAY else 0
             node, what = what[0]
         if node == Nodetype.NAME:
-            _complete(what, types, (*above, type_name), done)
+            number += _complete(what, types, (*above, type_name), done)
         elif what[0] not in _KINDS:
             raise TypesysError(f"{type_name}.{name} is a {what[0]}, which the decoder does not know")
-        if count > _LONGEST_UNROLLED and (node == Nodetype.NAME or what[0] == "string"):
-            raise TypesysError(f"{type_name}.{name} is a fixed array of {count}, too long to decode")
-    done.add(type_name)
+        number += 1
+    if number > _MOST_NUMBERS:
+        raise TypesysError(f"{type_name} has {number} fields with those of the messages in it, too many to decode")
+    done[type_name] = number
+    return number
+
+
+def _hold_bounds(types: Mapping[str, Any]) -> None:
+    """Refuse what would take the decoder very long to write down."""
+    unrolled = 0
+    for name, (_, fields) in types.items():
+        for field, (node, what) in fields:
+            if node == Nodetype.ARRAY and (what[0][0] == Nodetype.NAME or what[0][1][0] == "string"):
+                unrolled += what[1]
+                if unrolled > _MOST_UNROLLED:
+                    raise TypesysError(f"{name}.{field} is a fixed array of {what[1]}, too long to decode")
 
 
 def _field_type(description: Any) -> FieldType:
