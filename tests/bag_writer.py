@@ -5,11 +5,14 @@ from __future__ import annotations
 import io
 import os
 import struct
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
+import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -163,3 +166,71 @@ def places(data: bytes) -> list[Place]:
         found.append(Place(opcode, position, position + 9 + length))
         position = found[-1].end
     return found
+
+
+# --- files record by record, for what no writer would write ----------------------------------------------------
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+def record(opcode: int, body: bytes = b"") -> bytes:
+    """One record as it stands in a file."""
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def _text(text: str) -> bytes:
+    return struct.pack("<I", len(text.encode())) + text.encode()
+
+
+def schema_record(number: int, topic: Topic, more: bytes = b"") -> bytes:
+    """A schema; more: bytes behind what the format knows."""
+    text = topic.schema_text().encode()
+    name = topic.type if topic.schema_name is None else topic.schema_name
+    body = struct.pack("<H", number) + _text(name) + _text(topic.schema_encoding) + struct.pack("<I", len(text)) + text
+    return record(3, body + more)
+
+
+def channel_record(number: int, topic: Topic, schema: int, more: bytes = b"") -> bytes:
+    return record(4, struct.pack("<HH", number, schema) + _text(topic.name) + _text(topic.encoding) + bytes(4) + more)
+
+
+def message_record(channel: int, log_time: int, data: bytes) -> bytes:
+    return record(5, struct.pack("<HIQQ", channel, 0, log_time, log_time) + data)
+
+
+def chunk_record(
+    records: bytes, compression: str = "zstd", span: tuple[int, int] = (0, 2**62), stated: int | None = None
+) -> bytes:
+    """A chunk of these records; stated: the size that it says it has decompressed."""
+    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}[compression](records)
+    head = struct.pack("<QQQI", *span, len(records) if stated is None else stated, zlib.crc32(records))
+    return record(6, head + _text(compression) + struct.pack("<Q", len(packed)) + packed)
+
+
+def chunk_index(
+    offset: int,
+    chunk: bytes,
+    span: tuple[int, int] = (0, 2**62),
+    channels: Iterable[int] = (),
+    compression: str = "zstd",
+) -> bytes:
+    """The index of a chunk without message indexes behind it."""
+    listed = b"".join(struct.pack("<HQ", channel, 0) for channel in channels)
+    body = struct.pack("<QQQQI", *span, offset, len(chunk), len(listed)) + listed + struct.pack("<Q", 0)
+    stated, length = struct.unpack_from("<16xQ", chunk, 9)[0], len(chunk) - 9 - 32 - len(compression) - 8
+    return record(8, body + _text(compression) + struct.pack("<QQ", length, stated))
+
+
+def statistics_record(counts: Mapping[int, int], chunks: int) -> bytes:
+    listed = b"".join(struct.pack("<HQ", *pair) for pair in counts.items())
+    body = struct.pack("<QHIIII", sum(counts.values()), 1, len(counts), 0, 0, chunks)
+    return record(11, body + struct.pack("<QQI", 0, 2**62, len(listed)) + listed)
+
+
+def raw_file(*records: bytes, summary: bytes | None = None) -> bytes:
+    """A file of these records behind its header; without a summary (None) it ends as one that was cut."""
+    data = MAGIC + record(1, _text("ros2") + _text("hand")) + b"".join(records)
+    if summary is None:
+        return data
+    data += record(15, bytes(4))
+    return data + summary + record(2, struct.pack("<QQI", len(data) if summary else 0, 0, 0)) + MAGIC

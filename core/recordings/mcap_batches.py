@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 import struct
+from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag_files import os_error
 from uncertain_lti.recordings.cdr_arrays import SLACK, numbers_at
-from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, parse, walk
+from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, most_records, parse, walk
 
 _BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
 _STRIDE = 1 << 15  # bytes between two walkers in a large block
@@ -42,6 +43,7 @@ _LOG_TIME_AT = RECORD.size + 6
 _DATA_AT = RECORD.size + MESSAGE.size
 _CHECKSUM_AT = RECORD.size + 24
 _FEW_BLOCKS = 32
+_MOST_STEPS = 1 << 14
 _AHEAD = 1 << 24  # bytes; a larger batch is not read while another one is worked on
 
 
@@ -298,7 +300,7 @@ class _Loader:
         """Decompress; False where that does not give as many bytes as the block has."""
         try:
             if not block.compression:
-                target[:] = data
+                target[:] = data[: block.length]
                 return True
             if block.compression == "zstd":
                 reader = self.zstd.stream_reader(data)
@@ -306,7 +308,8 @@ class _Loader:
                 while filled < block.length and (more := reader.readinto(target[filled:])):
                     filled += more
                 return filled == block.length and (not block.unchecked or not reader.read(1))
-            records, _, ended = lz4.frame.decompress_chunk(self.lz4, data, max_length=block.length + 1)
+            more = 1 if block.unchecked else 0  # `scan` may have left out what follows the last record
+            records, _, ended = lz4.frame.decompress_chunk(self.lz4, data, max_length=block.length + more)
             if not ended:  # the next block is not its continuation
                 lz4.frame.reset_decompression_context(self.lz4)
             target[: len(records)] = records  # ValueError where there is more than room
@@ -349,15 +352,18 @@ def _starts(data: bytearray, places: Sequence[_Place], contents: Contents) -> In
         starts = _together(data, begins, limits)
         if starts is not None:
             return starts
-    alone: list[int] = []
+    alone = array("q")
+    most = most_records(contents.size)
     for place in places:
         reached = place.begin
         for _, content, stop in walk(memoryview(data)[place.begin : place.end]):
+            if contents.indexed and len(alone) >= most:
+                raise IndexMismatchError
             alone.append(place.begin + content - RECORD.size)
             reached = place.begin + stop
         if contents.indexed and reached != place.end:
             raise IndexMismatchError
-    return np.array(alone, dtype=np.int64)
+    return np.frombuffer(alone, dtype=np.int64)
 
 
 def _walkers(data: bytearray, places: Sequence[_Place], by_index: bool) -> tuple[Integers, Integers]:
@@ -405,8 +411,10 @@ def _together(data: bytearray, begins: Integers, limits: Integers) -> Integers |
     """Where records begin, found by walkers that go side by side; None where one does not arrive."""
     length = numbers_at(data, "<u4")
     position, limit = begins, limits
-    found = []
+    found: list[Integers] = []
     while position.size:
+        if len(found) == _MOST_STEPS:
+            return None  # one after the other they are passed sooner
         found.append(position)
         position = position + length[position + 1]
         position += RECORD.size

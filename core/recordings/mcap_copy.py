@@ -7,23 +7,25 @@ into chunks, because readers that go by the index see no others.
 
 from __future__ import annotations
 
+import heapq
 import struct
 from collections.abc import Iterable, Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Schema
+from mcap.records import Channel, Header, Metadata, Schema
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC
 from uncertain_lti.recordings.bag_files import os_error
-from uncertain_lti.recordings.mcap_records import CHUNK, MESSAGE, RECORD, Block, Contents, inflate, parse, walk
-from uncertain_lti.recordings.mcap_writer import INDEX_ENTRY, McapWriter
+from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, inflate, parse, walk
+from uncertain_lti.recordings.mcap_writer import INDEX_ENTRY, McapWriter, channel_record, schema_record
 
 _PIECE = 1 << 20  # bytes of an attachment that are held at once
 _LARGEST_METADATA = 1 << 26  # bytes
 _ATTACHMENT = struct.Struct("<QQ")  # log time, time of creation
-_PRIVATE = 0x80
+_LARGEST_PRIVATE = 1 << 28  # bytes
 _NUMBER = struct.Struct("<H")
 _MESSAGE, _SCHEMA, _CHANNEL = int(Opcode.MESSAGE), int(Opcode.SCHEMA), int(Opcode.CHANNEL)
 
@@ -228,10 +230,11 @@ class Copier:
         """
         same = {number: self._is_same(contents, number, channels) for number in contents.channels}
         with _Source(contents.path) as source:
-            for place, length, block in _places(source, contents):
+            blocks = ((block.offset, block) for block in contents.blocks)
+            others = ((place, None) for place in contents.others)
+            for place, block in heapq.merge(blocks, others, key=itemgetter(0)):
                 if block is not None:
-                    whole = place + length <= contents.size
-                    yield self._block(source, contents, block, channels, same, whole), block.end
+                    yield self._block(source, contents, block, channels, same), block.end
                 else:
                     self._record(source, place)
 
@@ -254,12 +257,12 @@ class Copier:
         block: Block,
         channels: Mapping[int, int],
         same: Mapping[int, bool],
-        whole: bool,
     ) -> int:
         data = source.all_at(block.offset, block.size)
-        records, _ = inflate(block.compression, memoryview(data), block.length)
+        records, trouble = inflate(block.compression, memoryview(data), block.length)
         if len(records) < block.length:
             raise source.changed()
+        whole = not block.cut and not trouble and len(records) == block.length
         records = bytes(records[: block.length])
         found: list[tuple[int, int, int, int]] = []  # channel, log time, begin and end of the record
         as_it_stands, end = whole, 0
@@ -293,12 +296,19 @@ class Copier:
         return len(found)
 
     def _declared(self, contents: Contents, opcode: int, content: bytes, same: Mapping[int, bool]) -> bool:
-        """A definition inside a block says what the copy says of its number."""
+        """A definition inside a block says what the copy says of its number, and nothing behind that.
+
+        Behind it the format allows more, which not every reader passes over.
+        """
         if opcode == _CHANNEL:
             channel = parse(Channel, content)
-            return bool(channel and same.get(channel.id) and contents.channels[channel.id] == channel)
+            known = channel and same.get(channel.id) and contents.channels[channel.id] == channel
+            return bool(known and content == channel_record(*_entry(channel))[RECORD.size :])
         schema = parse(Schema, content)
-        return bool(schema and self._schemas.get(schema.id) == (schema.name, schema.encoding, schema.data))
+        known = schema and self._schemas.get(schema.id) == (schema.name, schema.encoding, schema.data)
+        return bool(
+            known and content == schema_record(schema.id, schema.name, schema.encoding, schema.data)[RECORD.size :]
+        )
 
     def _record(self, source: _Source, place: int) -> None:
         """A record outside blocks: an attachment, metadata, or one that only its maker knows."""
@@ -312,56 +322,16 @@ class Copier:
             pieces = (source.all_at(at, min(_PIECE, place + size - at)) for at in range(place, place + size, _PIECE))
             self._writer.copied_attachment(pieces, size, head)
             return
+        if size > (_LARGEST_METADATA if opcode == Opcode.METADATA else _LARGEST_PRIVATE):
+            self.notes.append(f"{source.path}: a record of {size} bytes at byte {place} is left out as too large")
+            return
         body = source.all_at(place, size)
         if opcode != Opcode.METADATA:
             self._writer.copied_record(opcode, body)
-        elif (name := _first_text(body)) is None:
+        elif (record := parse(Metadata, body)) is None:
             self.notes.append(f"{source.path}: a metadata record at byte {place} is damaged; it is left out")
         else:
-            self._writer.copied_metadata(body, name)
-
-
-def _places(source: _Source, contents: Contents) -> Iterator[tuple[int, int, Block | None]]:
-    """(begin, length, block) of what is to be copied, in file order; block is None for other records."""
-    blocks = {block.offset: block for block in contents.blocks}
-    position = len(MAGIC)
-    while position + RECORD.size <= contents.size:
-        head = source.at(position, RECORD.size + CHUNK.size)
-        if len(head) < RECORD.size:
-            return
-        opcode, length = RECORD.unpack_from(head)
-        size = RECORD.size + length
-        if (block := blocks.get(position)) is not None and opcode in (_MESSAGE, _SCHEMA, _CHANNEL):
-            yield position, block.size, block
-            position += block.size
-            continue
-        if opcode == Opcode.CHUNK and len(head) == RECORD.size + CHUNK.size:
-            name_length = CHUNK.unpack_from(head, RECORD.size)[4]
-            if (block := blocks.get(position + len(head) + name_length + 8)) is not None:
-                yield position, size, block
-        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-            return
-        if opcode == 0 or position + size > contents.size:  # damage: on to the next block that could be read
-            following = min((begin for b in blocks.values() if (begin := _begin(source, b)) > position), default=None)
-            if following is None:
-                return
-            position = following
-            continue
-        if opcode in (Opcode.ATTACHMENT, Opcode.METADATA) or opcode >= _PRIVATE:
-            if opcode == Opcode.ATTACHMENT or length <= _LARGEST_METADATA:
-                yield position, size, None
-        position += size
-
-
-def _begin(source: _Source, block: Block) -> int:
-    """Where the record, or the first record, of a block begins."""
-    begin = block.offset - (RECORD.size + CHUNK.size + len(block.compression) + 8)
-    if begin >= len(MAGIC):
-        head = source.at(begin, RECORD.size + CHUNK.size)
-        if head[:1] == bytes([Opcode.CHUNK]) and len(head) == RECORD.size + CHUNK.size:
-            if CHUNK.unpack_from(head, RECORD.size)[4] == len(block.compression):
-                return begin
-    return block.offset
+            self._writer.copied_metadata(body, record.name)
 
 
 def _renumbered(
@@ -392,7 +362,7 @@ def _attachment_head(begin: bytes, size: int) -> tuple[int, int, int, str, str] 
         (data_size,) = struct.unpack_from("<Q", begin, at)
     except (struct.error, UnicodeDecodeError, IndexError):
         return None
-    return (log_time, create_time, data_size, name, media_type) if at + 8 + data_size + 4 == size else None
+    return (log_time, create_time, data_size, name, media_type) if at + 8 + data_size + 4 <= size else None
 
 
 def _text_at(data: bytes, at: int) -> tuple[str, int]:
@@ -402,11 +372,8 @@ def _text_at(data: bytes, at: int) -> tuple[str, int]:
     return data[at + 4 : at + 4 + length].decode(), at + 4 + length
 
 
-def _first_text(body: bytes) -> str | None:
-    try:
-        return _text_at(body, 0)[0]
-    except (struct.error, UnicodeDecodeError, IndexError):
-        return None
+def _entry(channel: Channel) -> tuple[int, int, str, str, dict[str, str]]:
+    return channel.id, channel.schema_id, channel.topic, channel.message_encoding, channel.metadata
 
 
 def _free(taken: Mapping[int, object], wish: int) -> int:

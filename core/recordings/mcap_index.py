@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -20,12 +21,15 @@ from uncertain_lti.recordings.mcap_records import (
     CHUNK,
     FOOTER_SIZE,
     LARGEST_CHUNK,
+    LATEST,
     MESSAGE,
     RECORD,
     Block,
     Contents,
     Tally,
     crc32,
+    most_inflated,
+    most_records,
     parse,
     walk,
 )
@@ -94,13 +98,10 @@ def outline(path: Path) -> Contents | None:
 def _contents(path: Path, size: int, summary: bytes, data_end: int, data_crc: bool) -> Contents:
     found = Contents(path, size, indexed=True, summed=data_crc)
     statistics: Statistics | None = None
-    chunks = 0
+    blocks: list[Block] = []
     for opcode, begin, end in walk(summary):
         if opcode == Opcode.CHUNK_INDEX:
-            chunks += 1
-            block = _block(summary[begin:end], data_end)
-            if block.channels:
-                found.blocks.append(block)
+            blocks.append(_block(summary[begin:end], data_end))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             record = parse(Schema if opcode == Opcode.SCHEMA else Channel, summary[begin:end])
             table: dict[int, object] = found.schemas if isinstance(record, Schema) else found.channels  # type: ignore[assignment]
@@ -108,18 +109,30 @@ def _contents(path: Path, size: int, summary: bytes, data_end: int, data_crc: bo
                 raise _NoIndexError
         elif opcode == Opcode.STATISTICS:
             statistics = parse(Statistics, summary[begin:end])
-    if statistics is None or statistics.chunk_count != chunks:
+    if statistics is None or statistics.chunk_count != len(blocks):
+        raise _NoIndexError
+    if any(channel.schema_id and channel.schema_id not in found.schemas for channel in found.channels.values()):
+        raise _NoIndexError  # they are in the chunks
+    blocks.sort(key=lambda block: block.offset)
+    if any(before.offset + before.size > after.offset - after.unchecked for before, after in pairwise(blocks)):
+        raise _NoIndexError
+    if statistics.message_count > most_records(size) or sum(block.length for block in blocks) > most_inflated(size):
         raise _NoIndexError
     counts = {channel: number for channel, number in statistics.channel_message_counts.items() if number}
-    found.blocks.sort(key=lambda block: block.offset)
+    found.blocks = [block for block in blocks if block.channels]
+    room: dict[int, int] = {}  # messages that the blocks of a channel can hold
+    for block in found.blocks:
+        for channel in block.channels:
+            room[channel] = room.get(channel, 0) + block.length // (RECORD.size + MESSAGE.size)
+            there = found.tally.setdefault(channel, Tally(0, block.start, block.end))
+            there.first, there.last = min(there.first, block.start), max(there.last, block.end)
+    if not counts or room.keys() != counts.keys():
+        raise _NoIndexError
     for channel, number in counts.items():
-        there = [block for block in found.blocks if channel in block.channels]
-        room = sum(block.length for block in there) // (RECORD.size + MESSAGE.size)
-        if channel not in found.channels or number > room:
+        if channel not in found.channels or number > room[channel]:
             raise _NoIndexError
-        found.tally[channel] = Tally(number, min(b.start for b in there), max(b.end for b in there))
-    listed = frozenset().union(*(block.channels for block in found.blocks))
-    if not counts or listed != counts.keys() or statistics.message_count != found.count:
+        found.tally[channel].count = number
+    if statistics.message_count != found.count:
         raise _NoIndexError
     return found
 
@@ -146,6 +159,6 @@ def _block(index: bytes, data_end: int) -> Block:
         raise _NoIndexError
     if compression not in ("", "lz4", "zstd") or length > LARGEST_CHUNK or (not compression and length != size):
         raise _NoIndexError
-    if place + chunk_length + index_length > data_end:
+    if place + chunk_length + index_length > data_end or end > LATEST:
         raise _NoIndexError
     return Block(place + before, size, compression, length, start, end, channels, before, index_length)

@@ -10,8 +10,10 @@ What counts when a file is not whole:
 - A chunk whose checksum or sizes are wrong, or that cannot be decompressed, is left out altogether: a number
   with a flipped bit does more harm than a gap.
 - A record whose length cannot be: reading goes on at the next chunk that the summary knows, if it does.
-- Sizes stated in the file never decide how much memory is taken. A record is held against the size of the
-  file before it is read, a chunk is decompressed piece by piece up to the size it states, at most 256 MiB.
+- Sizes stated in the file never decide how much memory or time is taken. A record is held against the size of the
+  file before it is read; a chunk is decompressed piece by piece up to the size it states, at most 256 MiB; all
+  chunks together give at most 1000 times the size of the file (or 1 GiB), and at most one record per byte of it (or
+  2^20). What goes beyond is left out.
 
 Each of these is told in `Contents.warnings`.
 """
@@ -20,6 +22,7 @@ from __future__ import annotations
 
 import bisect
 import struct
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -31,7 +34,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistics
+from mcap.records import Channel, DataEnd, Footer, Schema, Statistics
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC
@@ -49,7 +52,25 @@ RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
 FOOTER_SIZE = RECORD.size + 20
-_FIRST_CHUNK_WARNINGS = 3
+PRIVATE = 0x80  # opcodes from here on mean something to their maker alone
+LATEST = 2**63 - 1  # ns; times are kept with a sign
+_CHUNK_AT = struct.Struct("<16xQ")  # in a chunk's index
+_FIRST_WARNINGS = 3  # of a kind that are told one by one
+_LEAST_RECORDS = 1 << 20
+_LEAST_INFLATED = 1 << 30
+_LARGEST_RATIO = 1000
+_LARGEST_DEFINITION = 1 << 24  # bytes
+_LARGEST_DEFINITIONS = 1 << 26  # bytes, all of a file
+
+
+def most_records(size: int) -> int:
+    """Records that chunks of a file of this size may hold; a compressed record of a recording takes several bytes."""
+    return max(_LEAST_RECORDS, size)
+
+
+def most_inflated(size: int) -> int:
+    """Bytes that chunks of a file of this size may have together when they are decompressed."""
+    return max(_LEAST_INFLATED, _LARGEST_RATIO * size)
 
 
 class Block(NamedTuple):
@@ -76,6 +97,8 @@ class Block(NamedTuple):
         be compared with the block, and the records with their checksum; 0 otherwise.
     indexed : int, default 0
         Of such a chunk, bytes behind its records, which say where its messages are; 0 otherwise.
+    cut : bool, default False
+        The file ends within it.
     """
 
     offset: int
@@ -87,6 +110,7 @@ class Block(NamedTuple):
     channels: frozenset[int]
     unchecked: int = 0
     indexed: int = 0
+    cut: bool = False
 
 
 @dataclass(slots=True)
@@ -133,6 +157,8 @@ class Contents:
         tally are those of the chunks that hold the channel.
     summed : bool, default False
         The file has a checksum over everything, which was not checked.
+    others : array of int, optional
+        Where attachments, metadata and private records begin, in file order; empty when the file was not walked.
     """
 
     path: Path
@@ -144,6 +170,7 @@ class Contents:
     warnings: list[str] = field(default_factory=list)
     indexed: bool = False
     summed: bool = False
+    others: array[int] = field(default_factory=lambda: array("Q"))
 
     @property
     def count(self) -> int:
@@ -289,7 +316,7 @@ def inflate(compression: str, data: memoryview, limit: int) -> tuple[bytes | mem
             piece: bytes = frame.decompress(part if frame.needs_input else b"", max_length=size)
             return piece
     else:
-        return b"", f"its compression '{compression}' is not known (zstd, lz4 and none are)"
+        return b"", f"its compression {compression[:20]!r} is not known (zstd, lz4 and none are)"
     pieces, total = [], 0
     try:
         while total <= limit and (piece := read(min(_PIECE, limit + 1 - total))):
@@ -343,10 +370,14 @@ class _Scanner:
         self.statistics: Statistics | None = None
         self.summary_schemas: dict[int, Schema] = {}
         self.summary_channels: dict[int, Channel] = {}
-        self.known: list[ChunkIndex] = []  # chunks that the summary knows, by offset
+        self.known: list[int] = []  # where chunks begin that the summary knows
+        self.told = {"place": 0, "chunk": 0, "definition": 0}  # warnings of each kind
         self.chunk_warnings: list[str] = []
         self.damaged = False
         self.odd_records = 0
+        self.records_left = most_records(size)  # in chunks
+        self.bytes_left = most_inflated(size)
+        self.definitions_left = _LARGEST_DEFINITIONS
         self._forget_bare()
 
     def run(self) -> Contents:
@@ -365,9 +396,14 @@ class _Scanner:
             )
         elif not self.closed:
             found.warnings.append(f"{path}: cut after {count(found.count, 'message')} (no footer); read up to the cut")
-        found.warnings += self.chunk_warnings[:_FIRST_CHUNK_WARNINGS]
-        if (more := len(self.chunk_warnings) - _FIRST_CHUNK_WARNINGS) > 0:
-            found.warnings.append(f"{path}: {count(more, 'more chunk')} left out for reasons like these")
+        found.warnings += self.chunk_warnings
+        for kind, what in (
+            ("place", "left out as damaged"),
+            ("chunk", "left out for reasons like these"),
+            ("definition", "that contradicts an earlier one"),
+        ):
+            if (more := self.told[kind] - _FIRST_WARNINGS) > 0:
+                found.warnings.append(f"{path}: {count(more, f'more {kind}')} {what}")
         if self.odd_records:
             found.warnings.append(
                 f"{path}: {count(self.odd_records, 'record')} that cannot be read left out; "
@@ -384,7 +420,7 @@ class _Scanner:
 
     def _data_section(self) -> bool:
         """Walk all records up to the end of the data section; False where the file ends before."""
-        size, offsets = self.found.size, [index.chunk_start_offset for index in self.known]
+        size, offsets = self.found.size, self.known
         position = len(MAGIC)
         self.sums = crc32(MAGIC)
         self.stream.seek(position)
@@ -396,7 +432,8 @@ class _Scanner:
             begin, end = position + RECORD.size, position + RECORD.size + length
             later = bisect.bisect_right(offsets, position)
             following = offsets[later] if later < len(offsets) else size
-            if opcode == 0 or end > following:
+            ends = opcode == Opcode.DATA_END or opcode == Opcode.FOOTER
+            if opcode == 0 or end > following or (ends and following < size):
                 if self.closed or opcode == 0:
                     self._damage(position, following)
                 elif opcode == Opcode.CHUNK:
@@ -406,7 +443,7 @@ class _Scanner:
                 position = following
                 self.stream.seek(position)
                 continue
-            if opcode == Opcode.DATA_END or opcode == Opcode.FOOTER:
+            if ends:
                 self._data_end(parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None)
                 return True
             self.sums = crc32(header, self.sums)
@@ -418,7 +455,9 @@ class _Scanner:
                 content = self.stream.read(length)
                 self.sums = crc32(content, self.sums)
                 self._chunk(position, begin, content)
-            else:  # attachments, metadata, indexes, private records: only their bytes count
+            else:  # attachments, metadata, indexes, private records: only their bytes and their place count
+                if opcode in (Opcode.ATTACHMENT, Opcode.METADATA) or opcode >= PRIVATE:
+                    self.found.others.append(position)
                 left = length
                 while left and (piece := self.stream.read(min(left, _PIECE))):
                     self.sums = crc32(piece, self.sums)
@@ -434,8 +473,14 @@ class _Scanner:
 
     def _damage(self, position: int, following: int) -> None:
         self.damaged = True
-        rest = "the rest is" if following == self.found.size else f"{count(following - position, 'byte')} are"
-        self.found.warnings.append(f"{self.found.path}: damaged at byte {position}; {rest} left out")
+        if self._first("place"):
+            rest = "the rest is" if following == self.found.size else f"{count(following - position, 'byte')} are"
+            self.found.warnings.append(f"{self.found.path}: damaged at byte {position}; {rest} left out")
+
+    def _first(self, kind: str) -> bool:
+        """Whether a warning of this kind is one of the first, which are told one by one."""
+        self.told[kind] += 1
+        return self.told[kind] <= _FIRST_WARNINGS
 
     def _bare(self, position: int, opcode: int, content: bytes) -> None:
         """A record outside chunks: continues the current block or begins one."""
@@ -482,7 +527,11 @@ class _Scanner:
             )
             return
         stated = min(stated, max(LARGEST_CHUNK, len(data)))
+        if compression and stated > self.bytes_left:
+            self._leave_out(where, f"with it the file is over {_LARGEST_RATIO} times its size when decompressed", cut)
+            return
         records, trouble = inflate(compression, data, stated)
+        self.bytes_left -= len(records) if compression else 0
         if cut:
             records = records[:stated]
         else:
@@ -495,20 +544,27 @@ class _Scanner:
                 return
         tally: dict[int, Tally] = {}
         end = 0
-        for opcode, start, end in walk(records):
+        for opcode, start, stop in walk(records):
+            if compression:
+                if not self.records_left:
+                    self._leave_out(where, "with it the file holds more records than bytes", cut)
+                    return
+                self.records_left -= 1
+            end = stop
             if opcode == Opcode.MESSAGE:
                 self._message(records, start, end, tally)
             elif opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
-                self._definition(opcode, bytes(records[start:end]))
+                self._definition(opcode, records[start:end])
         self.odd_records += end < len(records) and not cut
         if tally:
-            self._block(begin + data_begin, len(data), compression, len(records), tally)
+            self._block(begin + data_begin, len(data), compression, end, tally, cut)
 
     def _leave_out(self, where: object, why: str, cut: bool = False) -> None:
         if not cut:  # what little a cut leaves of a chunk's beginning is told with the cut
             self.damaged = True
-            path = self.found.path
-            self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
+            if self._first("chunk"):
+                path = self.found.path
+                self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
 
     def _message(self, records: bytes | memoryview, begin: int, end: int, tally: dict[int, Tally]) -> None:
         if end - begin < MESSAGE.size:
@@ -524,7 +580,9 @@ class _Scanner:
         else:
             tally[channel] = Tally(1, time, time)
 
-    def _block(self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally]) -> None:
+    def _block(
+        self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally], cut: bool = False
+    ) -> None:
         self.found.blocks.append(
             Block(
                 offset,
@@ -534,6 +592,7 @@ class _Scanner:
                 start=min(entry.first for entry in tally.values()),
                 end=max(entry.last for entry in tally.values()),
                 channels=frozenset(tally),
+                cut=cut,
             )
         )
         for channel, entry in tally.items():
@@ -543,13 +602,21 @@ class _Scanner:
             else:
                 self.found.tally[channel] = entry
 
-    def _definition(self, opcode: int, content: bytes) -> None:
-        record = parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
+    def _definition(self, opcode: int, content: bytes | memoryview) -> None:
+        record = None
+        if len(content) <= _LARGEST_DEFINITION:
+            record = parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
         if record is None:
             self.odd_records += 1
             return
         table: dict[int, Any] = self.found.schemas if isinstance(record, Schema) else self.found.channels
-        if table.setdefault(record.id, record) != record and not self.damaged:
+        if (known := table.get(record.id)) is None:
+            self.definitions_left -= len(content)
+            if self.definitions_left >= 0:
+                table[record.id] = record
+            else:
+                self.odd_records += 1
+        elif known != record and not self.damaged and self._first("definition"):
             what = "schema" if isinstance(record, Schema) else f"channel ({record.topic})"
             self.found.warnings.append(
                 f"{self.found.path}: {what} {record.id} is defined twice, differently; the first one counts"
@@ -583,11 +650,10 @@ class _Scanner:
             elif opcode == Opcode.STATISTICS:
                 self.statistics = parse(Statistics, records[begin:end])
             elif opcode == Opcode.CHUNK_INDEX:
-                index = parse(ChunkIndex, records[begin:end])
-                offset = index.chunk_start_offset if index else 0
-                if offset > 0 and self._at(offset, 1) == bytes([Opcode.CHUNK]):
-                    self.known.append(index)
-        self.known.sort(key=lambda index: index.chunk_start_offset)
+                offset = _CHUNK_AT.unpack_from(records, begin)[0] if end - begin >= _CHUNK_AT.size else 0
+                if len(MAGIC) <= offset < footer_at and self._at(offset, 1) == bytes([Opcode.CHUNK]):
+                    self.known.append(offset)
+        self.known.sort()
 
     def _at(self, offset: int, size: int) -> bytes:
         if offset < 0 or offset >= self.found.size:

@@ -37,6 +37,18 @@ def _record(opcode: int, body: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
+def schema_record(number: int, name: str, encoding: str, data: bytes) -> bytes:
+    """A schema as it stands in a file."""
+    body = struct.pack("<H", number) + _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
+    return _record(_SCHEMA, body)
+
+
+def channel_record(number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
+    """A channel as it stands in a file; schema 0 for none."""
+    body = struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + _map(metadata)
+    return _record(_CHANNEL, body)
+
+
 def _compressor(name: str | None) -> tuple[str, Callable[[bytes], bytes]]:
     if name == "lz4":
         import lz4.frame  # type: ignore[import-untyped]
@@ -131,8 +143,7 @@ class McapWriter:
         data : bytes
             The text.
         """
-        body = struct.pack("<H", number) + _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
-        self._schemas[number] = _record(_SCHEMA, body)
+        self._schemas[number] = schema_record(number, name, encoding, data)
         self._write(self._schemas[number])
 
     def declare_channel(self, number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> None:
@@ -151,8 +162,7 @@ class McapWriter:
         metadata : mapping of str to str
             To be stored with it.
         """
-        body = struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + _map(metadata)
-        self._channels[number] = _record(_CHANNEL, body)
+        self._channels[number] = channel_record(number, schema, topic, encoding, metadata)
         self._write(self._channels[number])
 
     def message(self, channel: int, log_time: int, data: bytes) -> None:

@@ -1,0 +1,314 @@
+"""Files made to hurt: none takes unbounded memory or time; each gives a correct reading or one clear sentence."""
+
+import struct
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from bag_writer import (
+    Message,
+    Topic,
+    channel_record,
+    chunk_index,
+    chunk_record,
+    float64,
+    message_record,
+    ramp,
+    raw_file,
+    record,
+    schema_record,
+    statistics_record,
+    write,
+)
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import Writer
+from test_annotate import held
+
+from uncertain_lti import SignalMap, UncertainLTI
+from uncertain_lti.base.errors import BagError
+from uncertain_lti.cli.main import main
+from uncertain_lti.recordings import bag as bag_module
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.mcap_index import outline
+from uncertain_lti.recordings.message_types import define
+from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
+
+TOPIC = Topic("/a")
+DEFINED = schema_record(1, TOPIC) + channel_record(1, TOPIC, 1)
+STEP = 10**9
+
+
+def said(count, begin=0):
+    """Message records of a Float64 0.0, 1.0, ... a second apart."""
+    return b"".join(message_record(1, k * STEP, float64(float(k))) for k in range(begin, begin + count))
+
+
+@pytest.fixture
+def model(tmp_path):
+    """A model file of one state, /a, which is outside its bounds at no step."""
+    state = {"name": "x", "topic": "/a", "field": "data", "type": "std_msgs/msg/Float64"}
+    signals = SignalMap.from_dict({"states": [state], "clock": "/a", "max_gap": 5.0, "topics": {"/a": {"time": "log"}}})
+    path = tmp_path / "m.model.json"
+    UncertainLTI([[0.0]], np.zeros((1, 0)), [[1.0]], np.zeros((1, 0)), v=[2.0], signals=signals).save(path)
+    return path
+
+
+def limited(arguments, memory=1 << 30, seconds=30):
+    """A command in a process that may take so much memory beyond its start, and so much processor time."""
+    program = f"""
+import os, resource, sys
+from uncertain_lti.cli.main import main
+import uncertain_lti.recordings.bag, uncertain_lti.reports.text, uncertain_lti.reports.annotate
+size = int(open("/proc/self/statm").read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+resource.setrlimit(resource.RLIMIT_AS, (size + {memory}, resource.RLIM_INFINITY))
+resource.setrlimit(resource.RLIMIT_CPU, ({seconds}, {seconds}))
+sys.exit(main(sys.argv[1:]))
+"""
+    return subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.mark.parametrize("what", ["zeros", "private records", "messages without content"])
+def test_a_small_file_takes_little_memory_and_time(tmp_path, model, what):
+    """20 KB that decompress to 250 MiB of the smallest records; before, walking them took 4 GiB and minutes."""
+    rest = {
+        "zeros": bytes(9),
+        "private records": record(0x80),
+        "messages without content": message_record(1, STEP, b""),
+    }[what]
+    path = tmp_path / "small.mcap"
+    path.write_bytes(raw_file(chunk_record(DEFINED + said(20) + rest * ((250 << 20) // len(rest))), summary=b""))
+    assert path.stat().st_size < 50_000
+    done = limited(["check", model, path])
+    assert done.returncode in (0, 2), done.stderr[-2000:]
+    assert "Traceback" not in done.stderr and "not enough memory" not in done.stderr
+    if what == "zeros":  # what follows a record that is none is left out, what stands before it counts
+        assert "20 samples, 19 verdicts" in done.stdout and "left out" in done.stderr
+    else:
+        assert "more records than bytes" in done.stderr
+
+
+def test_many_chunks_do_not_decompress_to_more_than_a_multiple_of_the_file(tmp_path, model):
+    """300 chunks of 250 MiB each in one file of 2.4 MB: 75 GiB, were they all decompressed."""
+    bomb = chunk_record(record(0x80, bytes(250 << 20)))
+    path = tmp_path / "bombs.mcap"
+    path.write_bytes(raw_file(chunk_record(DEFINED + said(20)), *[bomb] * 300, summary=b""))
+    done = limited(["check", model, path])
+    assert done.returncode == 0 and "20 samples, 19 verdicts" in done.stdout, done.stderr[-2000:]
+    assert "when decompressed" in done.stderr and len(done.stderr) < 5000
+
+
+def test_a_chunk_that_reaches_over_its_neighbour_costs_the_copy_nothing(tmp_path, model):
+    first, second = chunk_record(DEFINED + said(20)), chunk_record(DEFINED + said(20, begin=20))
+    start = len(raw_file())
+    longer = first[:1] + struct.pack("<Q", len(first) - 9 + 40) + first[9:]
+    index = chunk_index(start, first) + chunk_index(start + len(first), second)
+    path, copy = tmp_path / "over.mcap", tmp_path / "copy.mcap"
+    path.write_bytes(raw_file(longer, second, summary=index))
+    read = [(m.log_time_ns, m.data) for m in Bag(path).raw_messages()]
+    assert len(read) == 20
+    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
+    assert [(m.log_time_ns, m.data) for m in Bag(copy).raw_messages(["/a"])] == read
+
+
+@pytest.mark.parametrize("opcode", [2, 15])
+def test_what_looks_like_the_end_is_not_while_chunks_follow(tmp_path, opcode):
+    """As the index has it, so a damaged opcode does not hide what stands behind it."""
+    first, second = chunk_record(DEFINED + said(20)), chunk_record(DEFINED + said(20, begin=20))
+    start = len(raw_file())
+    index = chunk_index(start, first) + chunk_index(start + len(first) + 9, second)
+    path = tmp_path / "ends.mcap"
+    path.write_bytes(raw_file(first, record(opcode), second, summary=index))
+    bag = Bag(path)
+    assert bag.topics["/a"].count == 40 and any("damaged" in warning for warning in bag.warnings)
+
+
+def test_chunks_that_lie_in_each_other_are_walked(tmp_path):
+    """An index that has one chunk inside another: going by it and walking the file read different messages."""
+    other = Topic("/b")
+    inner = chunk_record(message_record(2, 5, float64(1.0)), "")
+    outer = chunk_record(message_record(1, 5, float64(2.0)) + record(0x80, inner), "")
+    start, top = len(raw_file()), DEFINED + channel_record(2, other, 1)
+    within = start + outer.index(inner)
+    for second in (within, start + len(outer)):
+        listed = chunk_index(start, outer, channels=[1], compression="")
+        listed += chunk_index(second, inner, channels=[2], compression="")
+        summary = top + statistics_record({1: 1, 2: 1}, 2) + listed
+        path = save(
+            tmp_path / f"{second}.mcap", raw_file(outer, *([inner] if second != within else []), summary=summary)
+        )
+        assert (outline(path) is None) == (second == within)
+        signals = SignalMap.from_dict({"states": [{"name": "x", "topic": "/b", "field": "data"}]})
+        assert read_stream(Bag(path, indexed=True), signals).values[0].tolist() == [[1.0]]
+
+
+def save(path, data):
+    path.write_bytes(data)
+    return path
+
+
+def test_a_summary_without_schemas_reads_alike_everywhere(tmp_path, model):
+    """Channels are repeated in the summary and schemas are not: `topics` read such a file, `fit` refused it."""
+    path = tmp_path / "bare.mcap"
+    with open(path, "wb") as stream:
+        writer = Writer(stream, repeat_schemas=False)
+        writer.start()
+        schema = writer.register_schema(TOPIC.type, "ros2msg", TOPIC.schema_text().encode())
+        channel = writer.register_channel("/a", "cdr", schema)
+        for m in ramp("/a", range(0, 20 * STEP, STEP)):
+            writer.add_message(channel, m.log_time, m.data, m.log_time)
+        writer.finish()
+    assert Bag(path).topics["/a"].readable
+    signals = UncertainLTI.load(model).signals
+    stream = read_stream(Bag(path, indexed=True), signals)
+    assert stream.values[0][:, 0].tolist() == list(range(20))
+    assert main(["check", str(model), str(path)]) == 0
+
+
+TEXTS = {
+    "CRLF": b"float64 data\r\nint32 more # of it\r\n",
+    "CR": b"float64 data\rint32 more\r",
+    "byte order mark": b"\xef\xbb\xbffloat64 data\nint32 more\n",
+    "Latin-1 comment": b"# gr\xf6\xdfe\nfloat64 data # \xb0C\nint32 more\n",
+    "form feed in a comment": b"float64 data\n# a\x0cb\nint32 more\n",
+    "CRLF in parts": b"Inner inner\r\n" + b"=" * 80 + b"\r\nMSG: p/Inner\r\nfloat64 data\r\nint32 more\r\n",
+}
+
+
+@pytest.mark.parametrize("what", TEXTS)
+def test_schemas_of_other_editors_are_read(what):
+    definition = define("p/msg/T", "ros2msg", TEXTS[what])
+    assert not definition.reason
+    read = definition.decode(b"\0\1\0\0" + struct.pack("<di", 1.5, 7))
+    inner = read.inner if "parts" in what else read
+    assert (inner.data, inner.more) == (1.5, 7)
+
+
+def parts(*types):
+    return ("\n" + "=" * 80 + "\n").join(types).encode()
+
+
+def chain(fields, length):
+    """Types of which each has the next one in these fields."""
+    types = [f"MSG: p/T{i}\n" + fields.format(i + 1) for i in range(length)] + [f"MSG: p/T{length}\nint8 a"]
+    return parts(types[0].partition("\n")[2], *types[1:])
+
+
+SCHEMAS = {
+    "fixed arrays of texts": b"".join(b"string[4096] a%d\n" % i for i in range(8)),
+    "fixed arrays in types": chain("T{} a\nstring[1000] s", 9),
+    "a tree": chain("T{0} a\nT{0} b", 30),
+    "deep": chain("T{} a", 900),
+    "blank lines": b"\n" * 1_000_000 + b"float64 x\n",
+    "comments": b"# nothing\n" * 100_000 + b"float64 x\n",
+    "many fields": b"".join(b"float64 x%d\n" % i for i in range(60_000)),
+    "no end": b"float64[" * 100_000,
+    "a long default": b"float64[] x [" + b"1," * 400_000 + b"1]\n",
+    "a long name": b"float64 " + b"x" * 1_000_000,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", SCHEMAS)
+def test_no_schema_takes_long(what):
+    """Before, eight arrays in 120 bytes took 22 s, and a MB of blank lines 24 s."""
+    began = time.process_time()
+    definition = define("p/msg/T", "ros2msg", SCHEMAS[what])
+    if not definition.reason:
+        with pytest.raises(BagError):
+            definition.decode(b"\0\1\0\0")
+    assert time.process_time() - began < 3.0
+    assert len(definition.reason) < 300 and "\n" not in definition.reason
+    assert (definition.reason == "") == (what in ("blank lines", "comments"))
+
+
+def test_a_file_of_nothing_but_schemas_ends(tmp_path, monkeypatch):
+    """Definitions that nobody has read before are parsed up to a number of lines in all."""
+    monkeypatch.setattr(bag_module, "_MOST_LINES", 5000)
+    topics = [
+        Topic(f"/t{k}", "p/msg/T", schema="".join(f"float64 x{i}\n" for i in range(1000)) + f"float64 y{k}\n")
+        for k in range(2000)
+    ]
+    records = b"".join(schema_record(k + 1, t) + channel_record(k + 1, t, k + 1) for k, t in enumerate(topics))
+    path = save(
+        tmp_path / "schemas.mcap", raw_file(chunk_record(records + message_record(1, 5, bytes(8))), summary=b"")
+    )
+    began = time.process_time()
+    bag = Bag(path)
+    assert time.process_time() - began < 3.0
+    assert not bag.topics["/t0"].reason and "too long together" in bag.topics["/t999"].reason
+
+
+def test_a_nested_message_without_fields_is_one_byte():
+    """As the middleware writes it; read as none, every field behind it was shifted, silently."""
+    text = parts("float64 data\nNothing nothing\nNothing[2] two\nfloat32 more", "MSG: p/Nothing\nint32 CONSTANT=5")
+    data = b"\0\1\0\0" + struct.pack("<dBBBxf", 1.5, 0, 0, 0, 2.5)
+    definition = define("p/msg/T", "ros2msg", text)
+    assert definition.decode(data).more == 2.5
+    assert list(definition.fields("p/msg/T")) == ["data", "nothing", "two", "more"]
+    last = define("p/msg/L", "ros2msg", parts("float64 data\nNothing nothing", "MSG: p/Nothing\n# not a thing"))
+    assert last.decode(b"\0\1\0\0" + struct.pack("<dB", 1.5, 0)).data == 1.5
+    with pytest.raises(BagError):
+        last.decode(b"\0\1\0\0" + struct.pack("<d", 1.5))
+
+
+CUT = {
+    "an empty message last": (parts("float64 data\nN n", "MSG: p/N\n"), struct.pack("<dB", 1.5, 0), 8),
+    "text last": (b"float64 data\nstring text", struct.pack("<dI6s", 1.5, 6, b"hello\0"), 17),
+    "texts last": (b"float64 data\nstring[] text", struct.pack("<dII6s", 1.5, 1, 6, b"hello\0"), 21),
+    "numbers last": (b"float64 data\nuint8[] more", struct.pack("<dI3B", 1.5, 3, 1, 2, 3), 14),
+    "no numbers last": (b"float64 data\nfloat64[] more", struct.pack("<dI", 1.5, 0), 11),
+    "a truth value last": (b"float64 data\nbool more", struct.pack("<d?", 1.5, True), 8),
+}
+
+
+@pytest.mark.parametrize("what", CUT)
+def test_messages_cut_before_their_end_are_left_out(tmp_path, what):
+    text, body, longest = CUT[what]
+    topic = Topic("/a", "p/msg/T", schema=text.decode())
+    bodies = [b"\0\1\0\0" + body[:size] for size in (len(body), len(body), *range(longest + 1))]
+    path = write([topic], [Message("/a", k * STEP, b) for k, b in enumerate(bodies)]).save(tmp_path / "cut.mcap")
+    signals = SignalMap.from_dict({"states": [{"name": "x", "topic": "/a", "field": "data"}]})
+    for read in (read_stream, read_stream_by_message):
+        assert read(Bag(path), signals).values[0].tolist() == [[1.5], [1.5]]
+
+
+def test_attachments_and_metadata_in_copies(tmp_path, model):
+    """Bytes behind what the format knows are no damage; a metadata record with a broken map is."""
+    body = struct.pack("<QQ", 1, 2) + struct.pack("<I", 1) + b"n" + struct.pack("<I", 1) + b"t" + struct.pack("<Q", 3)
+    good = record(9, body + b"abc" + bytes(4) + b"more of it")
+    broken = record(12, struct.pack("<I", 1) + b"m" + struct.pack("<I", 4000) + b"key")
+    whole = record(12, struct.pack("<I", 1) + b"w" + struct.pack("<III", 10, 1, 0)[:4] + struct.pack("<I", 1) + b"k"
+                   + struct.pack("<I", 1) + b"v" + b"padding")  # fmt: skip
+    path, copy = tmp_path / "a.mcap", tmp_path / "copy.mcap"
+    path.write_bytes(raw_file(good, broken, whole, chunk_record(DEFINED + said(20)), summary=b""))
+    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
+    found = held(copy, without=["/envelope_monitor/"])
+    assert [(a.name, a.data) for a in found.attachments] == [("n", b"abc")]
+    assert [(m.name, m.metadata) for m in found.metadata] == [("w", {"k": "v"})]
+    with open(copy, "rb") as stream:
+        reader = make_reader(stream)
+        assert len(list(reader.iter_attachments())) == 1 and len(list(reader.iter_metadata())) == 2
+
+
+def test_copies_of_padded_definitions_can_be_walked(tmp_path, model):
+    """The format allows bytes behind a definition; inside chunks the mcap library does not pass over them."""
+    padded = schema_record(1, TOPIC, b"padding") + channel_record(1, TOPIC, 1, b"padding")
+    path, copy = tmp_path / "padded.mcap", tmp_path / "copy.mcap"
+    path.write_bytes(raw_file(chunk_record(padded + said(20)), summary=b""))
+    read = [m.data for m in Bag(path).raw_messages()]
+    assert len(read) == 20 and by_the_library(path) != read
+    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
+    assert by_the_library(copy) == read
+
+
+def by_the_library(path):
+    """Data on /a as the mcap library reads it from the first byte to the last; None where it cannot."""
+    with open(path, "rb") as stream:
+        try:
+            found = list(NonSeekingReader(stream).iter_messages(log_time_order=False))
+        except Exception:
+            return None
+    return [m.data for _, c, m in found if c.topic == "/a"]
