@@ -64,12 +64,32 @@ _LARGEST_DEFINITIONS = 1 << 26  # bytes, all of a file
 
 
 def most_records(size: int) -> int:
-    """Records that chunks of a file of this size may hold; a compressed record of a recording takes several bytes."""
+    """Records that compressed chunks may hold together; one of a recording takes several bytes.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of the file.
+
+    Returns
+    -------
+    int
+    """
     return max(_LEAST_RECORDS, size)
 
 
 def most_inflated(size: int) -> int:
-    """Bytes that chunks of a file of this size may have together when they are decompressed."""
+    """Bytes that compressed chunks may have together when they are decompressed.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of the file.
+
+    Returns
+    -------
+    int
+    """
     return max(_LEAST_INFLATED, _LARGEST_RATIO * size)
 
 

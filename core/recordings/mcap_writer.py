@@ -38,13 +38,47 @@ def _record(opcode: int, body: bytes) -> bytes:
 
 
 def schema_record(number: int, name: str, encoding: str, data: bytes) -> bytes:
-    """A schema as it stands in a file."""
+    """A schema as it stands in a file.
+
+    Parameters
+    ----------
+    number : int
+        Its own.
+    name : str
+        Of the type.
+    encoding : str
+        Of the text.
+    data : bytes
+        The text.
+
+    Returns
+    -------
+    bytes
+    """
     body = struct.pack("<H", number) + _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
     return _record(_SCHEMA, body)
 
 
 def channel_record(number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
-    """A channel as it stands in a file; schema 0 for none."""
+    """A channel as it stands in a file.
+
+    Parameters
+    ----------
+    number : int
+        Its own.
+    schema : int
+        Number of its schema; 0 for none.
+    topic : str
+        Name of its topic.
+    encoding : str
+        Of its messages.
+    metadata : mapping of str to str
+        Stored with it.
+
+    Returns
+    -------
+    bytes
+    """
     body = struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + _map(metadata)
     return _record(_CHANNEL, body)
 

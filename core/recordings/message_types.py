@@ -419,7 +419,17 @@ def _readable(encoding: str, text: bytes) -> str:
 
 
 def lines_of(text: bytes) -> int:
-    """Lines of a schema that are neither empty nor a comment alone: what reading it takes its time for."""
+    """Count the lines of a schema that are neither empty nor a comment alone; they are what takes time to read.
+
+    Parameters
+    ----------
+    text : bytes
+        The schema's text.
+
+    Returns
+    -------
+    int
+    """
     return len(_LINE.findall(text))
 
 
