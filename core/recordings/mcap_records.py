@@ -74,6 +74,7 @@ def most_records(size: int) -> int:
     Returns
     -------
     int
+        At most so many.
     """
     return max(_LEAST_RECORDS, size)
 
@@ -89,6 +90,7 @@ def most_inflated(size: int) -> int:
     Returns
     -------
     int
+        At most so many.
     """
     return max(_LEAST_INFLATED, _LARGEST_RATIO * size)
 

@@ -54,6 +54,7 @@ def schema_record(number: int, name: str, encoding: str, data: bytes) -> bytes:
     Returns
     -------
     bytes
+        With its opcode and its length.
     """
     body = struct.pack("<H", number) + _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
     return _record(_SCHEMA, body)
@@ -78,6 +79,7 @@ def channel_record(number: int, schema: int, topic: str, encoding: str, metadata
     Returns
     -------
     bytes
+        With its opcode and its length.
     """
     body = struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + _map(metadata)
     return _record(_CHANNEL, body)

@@ -429,6 +429,7 @@ def lines_of(text: bytes) -> int:
     Returns
     -------
     int
+        How many there are.
     """
     return len(_LINE.findall(text))
 
