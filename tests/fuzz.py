@@ -182,7 +182,7 @@ def read_file(rng: random.Random, folder: Path) -> str:
     from uncertain_lti import SignalMap
     from uncertain_lti.base.errors import UncertainLTIError
     from uncertain_lti.cli.main import main
-    from uncertain_lti.recordings.bag import Bag, describe
+    from uncertain_lti.recordings.bag import Bag
     from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
 
     path = folder / "damaged.mcap"
@@ -197,7 +197,7 @@ def read_file(rng: random.Random, folder: Path) -> str:
         raise WrongError(f"topics ended with {status}: {said.getvalue()[-500:]}")
     try:
         bag = Bag(path)
-        describe(bag)
+        bag.facts()
         written = {(m.log_time, m.data) for m in messages_of_a_run()}
         checked &= not any("cut after" in warning for warning in bag.warnings)  # nothing vouches for the last chunk
         if checked and any((m.log_time_ns, m.data) not in written for m in bag.raw_messages()):

@@ -27,7 +27,8 @@ from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli.main import main
 from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, NODE, TOPICS, TRUE, NamedVector, VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
-from uncertain_lti.recordings.bag import Bag, group_recordings
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.reports.annotate import METADATA, annotate, targets
 from uncertain_lti.sampling.reading import read_as_fitted, read_as_fitted_with_decisions
 from uncertain_lti.sampling.sampler import Sampler

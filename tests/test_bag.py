@@ -53,7 +53,10 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.bag import Bag, RawMessage, describe, group_recordings, header_stamp_ns
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.formats import group_recordings
+from uncertain_lti.recordings.message_types import header_stamp_ns
+from uncertain_lti.recordings.raw_messages import RawMessage
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import FieldType
 
@@ -440,7 +443,7 @@ def test_fuzzed_files_give_a_reading_or_one_sentence(layout: Layout, tmp_path: P
             assert times == sorted(times)
             assert sum(info.count for info in bag.topics.values()) <= len(times)
             list(bag.messages([topic for topic, info in bag.topics.items() if info.readable]))
-            describe(bag)
+            bag.facts()
             readings += 1
             sentences = bag.warnings
         except BagError as error:
@@ -495,7 +498,7 @@ def test_a_topic_that_cannot_be_decoded_disturbs_no_other(case: str, tmp_path: P
     with pytest.raises(BagError, match="topic /bad cannot be decoded") as caught:
         bag.messages(["/good", "/bad"])
     assert reason in str(caught.value) and "\n" not in str(caught.value)
-    assert {item.info.topic for item in describe(bag)} == {"/good", "/bad"}
+    assert {item.info.topic for item in bag.facts()} == {"/good", "/bad"}
 
 
 def test_a_topic_that_is_not_there(tmp_path: Path) -> None:
@@ -633,7 +636,7 @@ def test_messages_that_rosbag2_compressed_one_by_one(tmp_path: Path) -> None:
             writer.write(connection, i, JAZZY.serialize_cdr(stamped, "geometry_msgs/msg/PointStamped"))
     bag = Bag(tmp_path / "bag")
     assert [m.point.y for _, _, m in bag.messages(["/p"])] == [2.0] * 10
-    assert describe(bag)[0].stamps == "usable"
+    assert bag.facts()[0].stamps == "usable"
 
 
 # --- what is no recording -----------------------------------------------------------------------------------
@@ -819,7 +822,7 @@ def test_the_part_that_was_open_when_the_power_went(tmp_path: Path) -> None:
 def test_a_recording_without_messages_is_one(tmp_path: Path) -> None:
     bag = read(write(TWO, []), tmp_path)
     assert list(bag.messages(bag.topics)) == [] and bag.warnings == []
-    assert [item.info.count for item in describe(bag)] == [0] * len(bag.topics)
+    assert [item.info.count for item in bag.facts()] == [0] * len(bag.topics)
 
 
 def names(bags: list[Bag]) -> list[list[str]]:
@@ -916,7 +919,7 @@ def test_describe_offers_paths_that_can_be_read(tmp_path: Path) -> None:
         Message("/text", 1, cdr("std_msgs/msg/String", data="3")),
     ]
     bag = read(write(topics, messages), tmp_path)
-    found = {item.info.topic: item for item in describe(bag)}
+    found = {item.info.topic: item for item in bag.facts()}
     assert found["/joints"].fields == (
         *("position[fan]", 'position["3"]', 'position[" spaced "]', 'position["a[b]"]'),
         "velocity[0..2]",
@@ -950,7 +953,7 @@ def test_describe_counts_rates_gaps_and_stamps(tmp_path: Path) -> None:
         behind = b"\0\1\0\0" + struct.pack("<diII", 1.0, 5, 7, 1) + b"\0"
         messages += [Message("/late", t, behind)]
     messages.append(Message("/once", 0, float64(0)))
-    found = {item.info.topic: item for item in describe(read(write(topics, messages), tmp_path))}
+    found = {item.info.topic: item for item in read(write(topics, messages), tmp_path).facts()}
     stamps = {topic: item.stamps for topic, item in found.items()}
     assert stamps == {
         "/usable": "usable", "/zero": "zero", "/mixed": "mixed", "/none": "none", "/once": "none", "/big": "usable",
@@ -1021,7 +1024,7 @@ def test_real_recordings(name: str) -> None:
         assert bag.warnings == [f"{DATA / name}: cut after 2 025 messages (no footer); read up to the cut"]
     else:
         assert bag.warnings == []
-    assert {item.info.topic for item in describe(bag)} == set(bag.topics)
+    assert {item.info.topic for item in bag.facts()} == set(bag.topics)
 
 
 @needs_data
@@ -1078,13 +1081,13 @@ def test_real_split_bag_is_one_and_real_runs_are_separate(tmp_path: Path) -> Non
 
 @needs_data
 def test_real_stamps_and_offers() -> None:
-    cougars = {item.info.topic: item for item in describe(Bag(DATA / "cougars_auv/SO_bag_0.mcap"))}
+    cougars = {item.info.topic: item for item in Bag(DATA / "cougars_auv/SO_bag_0.mcap").facts()}
     assert cougars["/coug2/modem_imu"].stamps == "zero"
     assert cougars["/coug2/depth_data"].stamp_offset == pytest.approx(515_220, abs=1)
-    go2 = {item.info.topic: item for item in describe(Bag(DATA / "go2/test_3.mcap"))}
+    go2 = {item.info.topic: item for item in Bag(DATA / "go2/test_3.mcap").facts()}
     assert "position[j11]" in go2["/go2/joint_states"].fields and go2["/go2/joint_states"].stamps == "usable"
     assert go2["/go2/joint_command"].rate == pytest.approx(500, rel=0.01)
-    vicon = {item.info.topic: item for item in describe(Bag(DATA / "crazyflie/yx3bag_0.mcap"))}
+    vicon = {item.info.topic: item for item in Bag(DATA / "crazyflie/yx3bag_0.mcap").facts()}
     pose = vicon["/vicon/Group466CF/Group466CF/pose"]
     assert pose.largest_gap == pytest.approx(0.93, abs=0.01) and "roll(pose.orientation)" in pose.fields
 
@@ -1101,7 +1104,7 @@ def test_mutated_real_recordings(name: str, tmp_path: Path) -> None:
         begin = time.monotonic()
         with contextlib.suppress(BagError):
             bag = Bag(path)
-            describe(bag)
+            bag.facts()
             list(bag.messages([topic for topic, info in bag.topics.items() if info.readable]))
         assert time.monotonic() - begin < 20
 

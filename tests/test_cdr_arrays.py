@@ -30,7 +30,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uncertain_lti.base.errors import SignalError, UncertainLTIError
-from uncertain_lti.recordings.bag import Bag, describe
+from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import Definition, define
 from uncertain_lti.sampling.streams import Stream, read_stream, read_stream_by_message
 from uncertain_lti.signals import functions
@@ -338,7 +338,7 @@ def test_a_function_added_to_the_table_is_read_and_offered(tmp_path, monkeypatch
     signals = SignalMap((Signal("tilt", "/pose", "tilt(orientation)"), Signal("x", "/pose", "position.x")))
     assert_same(path, signals)
     np.testing.assert_allclose(read_stream(Bag(path), signals).values[0][:, 0], [*map(abs, turns), math.nan])
-    (facts,) = describe(Bag(path))
+    (facts,) = Bag(path).facts()
     assert "tilt(orientation)" in facts.fields
     with pytest.raises(SignalError, match=r"wants a quaternion"):
         read_stream(Bag(path), SignalMap((Signal("tilt", "/pose", "tilt(position)"),)))

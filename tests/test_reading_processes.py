@@ -16,7 +16,7 @@ from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
 import uncertain_lti.sampling.reading_processes
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.bag import group_recordings
+from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.sampling.reading import read_transients
 from uncertain_lti.sampling.reading_processes import processes_for
 from uncertain_lti.signals.signal_map import Signal, SignalMap

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -58,6 +59,22 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
         raise
+
+
+def natural(path: Path) -> tuple[tuple[int, str], ...]:
+    """Sort key that puts `bag_2` before `bag_10`.
+
+    Parameters
+    ----------
+    path : Path
+        A file.
+
+    Returns
+    -------
+    tuple of object
+        To be compared with that of another file.
+    """
+    return tuple((int(text), "") if text.isdigit() else (-1, text) for text in re.split(r"(\d+)", path.name))
 
 
 def sha256(path: str | os.PathLike[str]) -> str:

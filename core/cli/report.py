@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
         The model or a recording cannot be read, or the page cannot be written.
     """
     from uncertain_lti import EnvelopeMonitor
-    from uncertain_lti.recordings.bag import group_recordings
+    from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.findings import findings, page_target
     from uncertain_lti.reports.text import findings_text
     from uncertain_lti.sampling.reading import read_as_fitted

@@ -37,11 +37,11 @@ def run(options: argparse.Namespace) -> int:
     BagError
         The recording cannot be read.
     """
-    from uncertain_lti.recordings.bag import Bag, describe
+    from uncertain_lti.recordings.formats import open_recording
     from uncertain_lti.reports.text import number, table
 
-    bag = Bag(options.bag)
-    facts = describe(bag, options.progress.iterate("reading"))
+    bag = open_recording(options.bag)
+    facts = bag.facts(options.progress.iterate("reading"))
     if options.json:
         print_json(
             {

@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
         The recordings do not give the model again, or no alarm rule keeps to the wish.
     """
     from uncertain_lti import UncertainLTI
-    from uncertain_lti.recordings.bag import group_recordings
+    from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.text import validation_text
     from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.calibration import calibrate

@@ -21,7 +21,7 @@ from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.recordings.bag import Bag, group_recordings
+from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.reading import load_signals, sample
 from uncertain_lti.sampling.sampler import resolve
@@ -190,7 +190,7 @@ def survey(recording: Recording, signals: SignalMap) -> Survey:
     Parameters
     ----------
     recording : (str, tuple of str)
-        Path and files, as `Bag` takes them.
+        Path and files, as `open_recording` takes them.
     signals : SignalMap
         The map, not resolved.
 
@@ -204,7 +204,7 @@ def survey(recording: Recording, signals: SignalMap) -> Survey:
     BagError
         The recording cannot be read, or a topic has no message.
     """
-    stream = read_stream(Bag(recording[0], recording[1], indexed=True), signals)
+    stream = read_stream(open_recording(recording[0], recording[1], indexed=True), signals)
     states = {s.topic for s in signals.states}
     types, stamped, counted = {}, {}, {}
     header, log = {}, {}
@@ -247,7 +247,7 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     Parameters
     ----------
     recording : (str, tuple of str)
-        Path and files, as `Bag` takes them.
+        Path and files, as `open_recording` takes them.
     signals : SignalMap
         Resolved.
     columns : Columns
@@ -258,7 +258,7 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     Problem
         Weights are ones; empty where no transition is usable.
     """
-    transient = sample(read_stream(Bag(recording[0], recording[1], indexed=True), signals), signals)
+    transient = sample(read_stream(open_recording(recording[0], recording[1], indexed=True), signals), signals)
     point = OperatingPoint.of(signals.states, signals.controls)
     return replace(assemble([transient], point, None, "none", empty=True), columns=columns)
 

@@ -15,7 +15,7 @@ from uncertain_lti.proposal.quantities import set_operating_point, set_own_scale
 from uncertain_lti.proposal.reading import Iterate, read_sources
 from uncertain_lti.proposal.roles import assign_roles
 from uncertain_lti.proposal.signals_file import signals_file
-from uncertain_lti.recordings.bag import group_recordings
+from uncertain_lti.recordings.formats import group_recordings
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from uncertain_lti.base.errors import SignalError
 from uncertain_lti.proposal.candidates import FEWEST, OF_QUATERNION, WRAPPING, Candidate, Source
 from uncertain_lti.proposal.effects import residual
 from uncertain_lti.proposal.roles import role_by_name
-from uncertain_lti.recordings.bag import Bag, TopicFacts, describe
-from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
+from uncertain_lti.recordings.recording import Recording, TopicFacts
 from uncertain_lti.signals.field_path import FieldPath
 
 Iterate = Callable[[Iterable[object], int], Iterable[object]]
@@ -34,12 +33,12 @@ MOST_VALUES = 50_000_000
 _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 
 
-def read_sources(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
+def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[Source]:
     """Every topic of the recordings with its numbers.
 
     Parameters
     ----------
-    bags : sequence of Bag
+    bags : sequence of Recording
         The recordings.
     progress : callable or None
         As for `read_transients`.
@@ -51,7 +50,7 @@ def read_sources(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
     """
     facts: dict[str, TopicFacts] = {}
     for bag in bags:
-        for fact in describe(bag, progress):
+        for fact in bag.facts(progress):
             known = facts.get(fact.info.topic)
             if known is None or (not known.fields and fact.fields):
                 facts[fact.info.topic] = fact
@@ -87,7 +86,7 @@ def read_sources(bags: Sequence[Bag], progress: Iterate | None) -> list[Source]:
     return sources
 
 
-def _limit(bags: Sequence[Bag], sources: Sequence[Source]) -> None:
+def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
     """Look at no more numbers than memory holds: commands first, then states, from the first field on."""
     order = ("control", "state", "wish", "")
     left = MOST_VALUES
@@ -123,13 +122,13 @@ def _candidates(topic: str, fields: Sequence[str]) -> list[Candidate]:
     return found
 
 
-def _read(bag: Bag, sources: Sequence[Source], progress: Iterate | None) -> None:
+def _read(bag: Recording, sources: Sequence[Source], progress: Iterate | None) -> None:
     """Values of every candidate in one recording."""
     for source in sources:
         readable = [c for c in source.candidates if not c.reason]
         paths = [FieldPath(c.path) for c in readable]
         try:
-            columns = read_columns(bag, [source.topic], [paths], progress)
+            columns = bag.columns([source.topic], [paths], progress)
             arrival, stamp, values = columns.arrival, columns.stamp, columns.values[0]
             stamps = columns.stamp[columns.stamp >= 0]
             if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(arrival) - 1):

@@ -8,18 +8,18 @@ from collections.abc import Sequence
 from uncertain_lti.base.english import shortlist
 from uncertain_lti.proposal.candidates import Candidate, Source
 from uncertain_lti.proposal.quantities import longest_hold
-from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.recording import Recording
 
 
 def signals_file(
-    bags: Sequence[Bag], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
+    bags: Sequence[Recording], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
     doubt: str,
 ) -> str:  # fmt: skip
     """Write the text of the file.
 
     Parameters
     ----------
-    bags : sequence of Bag
+    bags : sequence of Recording
         The recordings.
     sources : sequence of Source
         All topics, with the reasons of those left out.

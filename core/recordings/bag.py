@@ -5,138 +5,30 @@ from __future__ import annotations
 import bisect
 import itertools
 import os
-from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from statistics import median
-from typing import Any, Literal, NamedTuple
-
-from mcap.records import Schema
+from typing import Any
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.bag_files import listed_parts, natural, os_error, parts_of, stem_and_index
-from uncertain_lti.recordings.mcap_index import outline
+from uncertain_lti.recordings.bag_arrays import read_columns
+from uncertain_lti.recordings.bag_files import parts_of
+from uncertain_lti.recordings.bag_seams import not_one_recording
+from uncertain_lti.recordings.mcap_index import outline_or_scan
 from uncertain_lti.recordings.mcap_records import Block, Contents, count, messages, read_block, scan
-from uncertain_lti.recordings.message_types import Definition, define, header_stamp_ns, lines_of, normal_name, undefined
+from uncertain_lti.recordings.message_types import define, lines_of, normal_name, undefined
+from uncertain_lti.recordings.raw_messages import RawMessage, RecordedChannel
+from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo
+from uncertain_lti.recordings.topic_facts import topic_facts
+from uncertain_lti.recordings.unreadable import os_error
+from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import FieldType, TypeFields
-from uncertain_lti.signals.paths import signal_paths
 
-__all__ = [
-    "Bag",
-    "RawMessage",
-    "RecordedChannel",
-    "TopicFacts",
-    "TopicInfo",
-    "describe",
-    "group_recordings",
-    "header_stamp_ns",
-]
+__all__ = ["Bag"]
 
 
 _MOST_LINES = 100_000  # of definitions that are read in one file
 _LEAST_LINES = 50  # that a definition counts for, however short it is
-
-
-@dataclass(frozen=True)
-class TopicInfo:
-    """What a recording holds of one topic.
-
-    Parameters
-    ----------
-    topic : str
-        Its name.
-    type : str
-        Message type, `pkg/msg/Type`.
-    count : int
-        Messages that count.
-    encoding : str
-        Of its messages; `cdr` is what can be decoded.
-    readable : bool
-        Whether its messages can be decoded.
-    reason : str
-        Why not, or which of its messages are left out; empty otherwise.
-    first : int or None
-        First log time, ns; None without a message.
-    last : int or None
-        Last log time, ns; None without a message.
-    """
-
-    topic: str
-    type: str
-    count: int
-    encoding: str
-    readable: bool
-    reason: str
-    first: int | None
-    last: int | None
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedChannel:
-    """A channel as the file describes it: everything needed to write its messages again.
-
-    Parameters
-    ----------
-    topic : str
-        Name of its topic.
-    type : str
-        Message type, `pkg/msg/Type`.
-    encoding : str
-        Of its messages.
-    schema : Schema or None
-        Its record in the file; None without one.
-    metadata : mapping of str to str
-        What the recorder stored of the channel, QoS for example.
-    definition : Definition
-        How its messages are decoded.
-    counted : bool, default False
-        Whether its messages are those of its topic (see `Bag` on topics with several types).
-    """
-
-    topic: str
-    type: str
-    encoding: str
-    schema: Schema | None
-    metadata: Mapping[str, str]
-    definition: Definition
-    counted: bool = False
-
-
-class RawMessage(NamedTuple):
-    """One message as recorded.
-
-    Parameters
-    ----------
-    log_time_ns : int
-        Log time, ns.
-    publish_time_ns : int
-        Publish time, ns.
-    data : bytes
-        Serialised message.
-    channel : RecordedChannel
-        What it was recorded on.
-    """
-
-    log_time_ns: int
-    publish_time_ns: int
-    data: bytes
-    channel: RecordedChannel
-
-    @property
-    def topic(self) -> str:
-        """Topic it was published on."""
-        return self.channel.topic
-
-    @property
-    def type(self) -> str:
-        """Message type, `pkg/msg/Type`."""
-        return self.channel.type
-
-    @property
-    def encoding(self) -> str:
-        """Encoding of `data`; `cdr` is what can be decoded."""
-        return self.channel.encoding
 
 
 class Bag:
@@ -176,7 +68,7 @@ class Bag:
         self.path = Path(path)
         self._warnings: list[str] = []
         self._undecoded: dict[str, str] = {}
-        survey = _outline_or_scan if indexed else scan
+        survey = outline_or_scan if indexed else scan
         contents = [part if isinstance(part, Contents) else survey(Path(part)) for part in parts]
         self._take(contents or self._open(survey))
 
@@ -199,7 +91,7 @@ class Bag:
         BagError
             As opening the bag does.
         """
-        if any(part.indexed for part in self._contents):
+        if self.indexed:
             self._warnings = self._folder_warnings
             self._undecoded = {}
             self._take([scan(part.path) if part.indexed else part for part in self._contents])
@@ -228,15 +120,15 @@ class Bag:
             for contents, channels in zip(self._contents, self._channels, strict=True)
         ]
 
-    def tell(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
-        """Take over the warnings of another process that read the same recording.
+    def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
+        """Set `reading_notes`, for example to those of another process that read the same recording.
 
         Parameters
         ----------
         warnings : sequence of str
-            As of `said`.
+            As of `reading_notes`.
         undecoded : mapping of str to str
-            As of `said`, by topic.
+            As of `reading_notes`, by topic.
         """
         self._warnings, self._undecoded = list(warnings), dict(undecoded)
 
@@ -260,9 +152,23 @@ class Bag:
         return f"{self.path}: {topic}: {count(number, 'message')} left out that cannot be decoded ({why})"
 
     @property
-    def said(self) -> tuple[list[str], dict[str, str]]:
-        """What `tell` takes."""
+    def reading_notes(self) -> tuple[list[str], dict[str, str]]:
+        """Warnings so far, and sentences on messages left out by topic; what `restore_notes` takes."""
         return list(self._warnings), dict(self._undecoded)
+
+    @property
+    def size(self) -> int:
+        """Bytes of its files."""
+        return sum(part.size for part in self._contents)
+
+    @property
+    def indexed(self) -> bool:
+        """Whether of any file only the index was read."""
+        return any(part.indexed for part in self._contents)
+
+    def __reduce__(self) -> tuple[type[Bag], tuple[Path, tuple[Contents, ...]]]:
+        """For another process, which need not open the files again."""
+        return Bag, (self.path, self.contents)
 
     @property
     def contents(self) -> tuple[Contents, ...]:
@@ -346,6 +252,50 @@ class Bag:
         wanted = self._required(topics)
         return self._decoded([_of(channels, wanted, counted=True) for channels in self._channels])
 
+    def columns(
+        self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
+    ) -> Columns:
+        """Numbers at some paths of each topic, read block by block; see `read_columns`.
+
+        Parameters
+        ----------
+        topics : sequence of str
+            Names.
+        paths : sequence of sequence of FieldPath
+            Per topic the paths to read.
+        progress : Progress, optional
+            Wraps what goes through the messages, given their number.
+
+        Returns
+        -------
+        Columns
+            In order of arrival.
+        """
+        return read_columns(self, topics, paths, progress)
+
+    def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
+        """Facts about every topic; reads the recording once, and decodes one message of each topic.
+
+        Parameters
+        ----------
+        progress : Progress, optional
+            Wraps the messages, given their number.
+
+        Returns
+        -------
+        list of TopicFacts
+            One per topic.
+
+        Raises
+        ------
+        BagError
+            The recording cannot be read any more.
+        """
+        messages: Iterable[Any] = self.raw_messages()
+        if progress is not None:
+            messages = progress(messages, sum(info.count for info in self.topics.values()))
+        return topic_facts(self.topics, messages)
+
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """Messages as recorded, of these topics or of all, also those that cannot be decoded; same order.
 
@@ -388,7 +338,7 @@ class Bag:
                 self._warnings.append(f"{path}: the file is empty; it is left out")
             else:
                 contents.append(survey(path))
-        if not listed and (why := _not_one_recording(contents)):
+        if not listed and (why := not_one_recording(contents)):
             raise BagError(
                 f"{self.path}: without a metadata.yaml its files do not look like one recording ({why}); name them "
                 f"one by one: {', '.join(path.name for path in paths)}"
@@ -490,10 +440,6 @@ class Bag:
             del pending[:final]
 
 
-def _outline_or_scan(path: Path) -> Contents:
-    return outline(path) or scan(path)
-
-
 def _of(channels: Mapping[int, RecordedChannel], topics: set[str], counted: bool = False) -> dict[int, RecordedChannel]:
     return {
         key: channel
@@ -527,214 +473,3 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
             channel.topic, type_name, channel.message_encoding, schema, channel.metadata, definition
         )
     return channels
-
-
-# --- which files are one recording --------------------------------------------------------------------------
-
-
-def group_recordings(paths: Iterable[str | os.PathLike[str]], indexed: bool = False) -> list[Bag]:
-    """Recordings that some paths name, in the order of their first mention.
-
-    A folder is one recording. Files are one recording each, except the parts of a split bag: files
-    `<stem>_<i>.mcap` of one stem in one folder that either
-
-    - are listed together in the metadata.yaml beside them, or
-    - are numbered 0, 1, 2, ... without a hole, carry the same topics, and follow each other in log time
-      without a break: each begins at most 1 s, or the longest pause inside one of them, after the one
-      before ends, and overlaps it by no more than 10 % of the shorter (messages at a seam may be out of order).
-
-    In doubt files stay apart: that loses the one transition at a seam, while joining two runs would invent one.
-
-    Parameters
-    ----------
-    paths : iterable of path
-        Files and folders.
-    indexed : bool, default False
-        As in `Bag`.
-
-    Returns
-    -------
-    list of Bag
-        One per recording.
-
-    Raises
-    ------
-    BagError
-        A file cannot be read, or is named twice.
-    """
-    order: list[tuple[Path, str]] = []
-    files: dict[tuple[Path, str], list[Path]] = {}
-    for path in map(Path, paths):
-        pair = None if path.is_dir() else stem_and_index(path)
-        group = (path.parent, f"{pair[0]}_*.mcap" if pair else path.name)
-        if group not in files or path.is_dir():
-            order.append(group)
-        files.setdefault(group, []).append(path)
-    bags = []
-    for group in order:
-        bags += _group(files[group], indexed)
-    seen: set[Path] = set()
-    for part in itertools.chain.from_iterable(bag.parts for bag in bags):
-        if part.resolve() in seen:
-            raise BagError(f"{part}: named twice; name each recording once")
-        seen.add(part.resolve())
-    return bags
-
-
-def _group(paths: list[Path], indexed: bool) -> list[Bag]:
-    if len(paths) == 1 or len(set(paths)) < len(paths):
-        return [Bag(path, indexed=indexed) for path in paths]
-    try:
-        listed = {part.resolve(): i for i, part in enumerate(listed_parts(paths[0].parent) or [])}
-    except BagError:  # about other files in the folder
-        listed = {}
-    if all(path.resolve() in listed for path in paths):
-        paths = sorted(paths, key=lambda path: listed[path.resolve()])
-        return [Bag(paths[0], paths, indexed)]
-    survey = _outline_or_scan if indexed else scan
-    contents = {path: survey(path) for path in paths}
-    ordered = [contents[path] for path in sorted(paths, key=natural)]
-    numbers = [pair[1] for part in ordered if (pair := stem_and_index(part.path))]
-    if numbers[0] == 0 and not _not_one_recording(ordered):
-        return [Bag(ordered[0].path, ordered)]
-    return [Bag(path, [contents[path]]) for path in paths]
-
-
-def _not_one_recording(parts: Sequence[Contents]) -> str:
-    """Why files are not the consecutive parts of one recording; "" where they may be."""
-    pause: int | None = None
-    for before, after in itertools.pairwise(parts):
-        names = f"{before.path.name} and {after.path.name}"
-        pair = stem_and_index(before.path), stem_and_index(after.path)
-        if not pair[0] or not pair[1] or pair[1][1] != pair[0][1] + 1:
-            return f"{names} are not numbered one after the other"
-        if not before.tally or not after.tally:
-            continue  # nothing in it that could contradict
-        kinds = [{(c.topic, c.type) for c in _channels(part).values()} for part in (before, after)]
-        if not (kinds[0] <= kinds[1] or kinds[1] <= kinds[0]):
-            return f"{names} do not carry the same topics"
-        (begin, end), (next_begin, next_end) = _span(before), _span(after)
-        if next_begin - end > 10**9 and pause is None:
-            pause = max(_longest_pause(part) for part in parts)
-        if next_begin - end > max(10**9, pause or 0):
-            return f"{(next_begin - end) / 1e9:.1f} s lie between {names}"
-        if next_begin < begin or (end - next_begin) * 10 > min(end - begin, next_end - next_begin):
-            return f"{names} overlap in time"
-    return ""
-
-
-def _span(contents: Contents) -> tuple[int, int]:
-    return min(block.start for block in contents.blocks), max(block.end for block in contents.blocks)
-
-
-def _longest_pause(contents: Contents) -> int:
-    """Longest time without any message, ns."""
-    if contents.indexed:
-        contents = scan(contents.path)
-    times: list[int] = []
-    for block in contents.blocks:
-        times += (message[1] for message in messages(read_block(contents.path, block)))
-    return max((b - a for a, b in itertools.pairwise(sorted(times))), default=0)
-
-
-# --- what could be a signal ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class TopicFacts:
-    """One topic as `uncertain-lti topics` shows it.
-
-    Parameters
-    ----------
-    info : TopicInfo
-        What the recording holds of it.
-    rate : float or None
-        That of the median log-time step, 1/s; None where there is no step or it is 0.
-    largest_gap : float or None
-        Longest log-time step, s; None where there is no step.
-    fields : tuple of str
-        Paths that can be signals; `data[0..99]` stands for `data[0]` to `data[99]`.
-    stamps : {"none", "usable", "zero", "mixed"}
-        Whether header stamps can be used.
-    stamp_offset : float or None
-        Median of log time less header stamp, s; None without a stamp.
-    """
-
-    info: TopicInfo
-    rate: float | None
-    largest_gap: float | None
-    fields: tuple[str, ...]
-    stamps: Literal["none", "usable", "zero", "mixed"]
-    stamp_offset: float | None
-
-
-def describe(bag: Bag, progress: Callable[[Iterable[Any], int], Iterable[Any]] | None = None) -> list[TopicFacts]:
-    """Facts about every topic of a recording; reads it once, and decodes one message of each topic.
-
-    Field paths are taken from the longest message of a topic, so that its arrays have their lengths.
-
-    Parameters
-    ----------
-    bag : Bag
-        The recording.
-    progress : callable, optional
-        Wraps the messages, given their number, as in `read_transients`.
-
-    Returns
-    -------
-    list of TopicFacts
-        One per topic.
-
-    Raises
-    ------
-    BagError
-        The recording cannot be read any more.
-    """
-    times: dict[str, array[int]] = {topic: array("Q") for topic in bag.topics}
-    offsets: dict[str, array[float]] = {topic: array("d") for topic in bag.topics}
-    zeros = dict.fromkeys(bag.topics, 0)
-    longest: dict[str, RawMessage] = {}
-    messages: Iterable[RawMessage] = bag.raw_messages()
-    if progress is not None:
-        messages = progress(messages, sum(info.count for info in bag.topics.values()))
-    for raw in messages:
-        channel, topic = raw.channel, raw.channel.topic
-        if not channel.counted:
-            continue
-        times[topic].append(raw.log_time_ns)
-        if channel.definition.reason:
-            continue
-        if topic not in longest or len(raw.data) > len(longest[topic].data):
-            longest[topic] = raw
-        if channel.definition.has_header:
-            if stamp := channel.definition.stamp_ns(raw.data):
-                offsets[topic].append((raw.log_time_ns - stamp) * 1e-9)
-            else:
-                zeros[topic] += 1
-    return [
-        _facts(info, times[topic], offsets[topic], zeros[topic], longest.get(topic))
-        for topic, info in bag.topics.items()
-    ]
-
-
-def _facts(
-    info: TopicInfo, times: array[int], offsets: array[float], zeros: int, longest: RawMessage | None
-) -> TopicFacts:
-    steps = [b - a for a, b in itertools.pairwise(times)]
-    step = median(steps) if steps else 0
-    fields: tuple[str, ...] = ()
-    if longest:
-        definition = longest.channel.definition
-        try:
-            message = definition.decode(longest.data)
-            fields = tuple(signal_paths(definition.fields, definition.type_name, message))
-        except BagError:
-            pass  # `messages` tells it
-    return TopicFacts(
-        info,
-        rate=1e9 / step if step else None,
-        largest_gap=max(steps) * 1e-9 if steps else None,
-        fields=fields,
-        stamps="mixed" if zeros and offsets else "usable" if offsets else "zero" if zeros else "none",
-        stamp_offset=median(offsets) if offsets else None,
-    )

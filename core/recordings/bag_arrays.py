@@ -3,47 +3,25 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.cdr_arrays import FieldReader, Messages
 from uncertain_lti.recordings.mcap_batches import Batch, IndexMismatchError, batches
+from uncertain_lti.recordings.mcap_records import Contents
 from uncertain_lti.recordings.message_types import Definition
+from uncertain_lti.recordings.raw_messages import RecordedChannel
+from uncertain_lti.recordings.recording import Columns, Progress, TopicInfo
 from uncertain_lti.signals.field_path import FieldPath
 
-Progress = Callable[[Iterable[object], int], Iterable[object]]
 LATEST = 2**63 - 1  # ns; log times are kept with a sign
-
-
-@dataclass
-class Columns:
-    """Messages of some topics in order of arrival.
-
-    Parameters
-    ----------
-    topic : array (messages,) of int
-        Positions in the topics asked for.
-    arrival : array (messages,) of int
-        Log time, ns.
-    stamp : array (messages,) of int
-        Header stamp, ns; -1 for no stamp.
-    values : list of array (messages of the topic, paths)
-        One array per topic.
-    alone : int, default 0
-        Messages that had to be decoded one by one.
-    """
-
-    topic: NDArray[np.int64]
-    arrival: NDArray[np.int64]
-    stamp: NDArray[np.int64]
-    values: list[NDArray[np.float64]]
-    alone: int = 0
 
 
 @dataclass
@@ -62,14 +40,76 @@ class _Undecoded:
             self.last, self.why = place, why
 
 
+class Blocks(Protocol):
+    """A recording whose files are read block by block: `Bag`."""
+
+    @property
+    def path(self) -> Path:
+        """Name of the recording."""
+
+    @property
+    def topics(self) -> Mapping[str, TopicInfo]:
+        """Topics by name."""
+
+    @property
+    def reading_notes(self) -> tuple[list[str], dict[str, str]]:
+        """Warnings, and sentences on messages left out by topic."""
+
+    def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
+        """Set `reading_notes`.
+
+        Parameters
+        ----------
+        warnings : sequence of str
+            Sentences.
+        undecoded : mapping of str to str
+            Topic -> sentence on its messages that are left out.
+        """
+
+    def walk(self) -> None:
+        """Read what the index stated from the files themselves."""
+
+    def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
+        """Each file, and its channels that count for some topics.
+
+        Parameters
+        ----------
+        topics : iterable of str
+            Names.
+
+        Returns
+        -------
+        list of (Contents, dict of int to RecordedChannel)
+            Files in order; channels by their number in the file.
+        """
+
+    def left_out(self, topic: str, number: int, why: str) -> str:
+        """Sentence about messages that cannot be decoded.
+
+        Parameters
+        ----------
+        topic : str
+            Name of the topic.
+        number : int
+            Messages left out.
+        why : str
+            The reason.
+
+        Returns
+        -------
+        str
+            The sentence.
+        """
+
+
 def read_columns(
-    bag: Bag, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
+    bag: Blocks, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
 ) -> Columns:
     """Read some paths of each topic; messages that cannot be decoded are left out, and the bag warns of them.
 
     Parameters
     ----------
-    bag : Bag
+    bag : Blocks
         The recording.
     topics : sequence of str
         Names.
@@ -100,12 +140,12 @@ def read_columns(
         raise BagError(f"{bag.path}: the file changed while it was read; read it again when it is written") from None
 
 
-def in_reach(bag: Bag, log_time: int) -> int:
+def in_reach(path: Path, log_time: int) -> int:
     """Check that a log time can be kept as a 64-bit integer.
 
     Parameters
     ----------
-    bag : Bag
+    path : Path
         The recording, for the error.
     log_time : int
         Log time, ns.
@@ -122,14 +162,14 @@ def in_reach(bag: Bag, log_time: int) -> int:
     """
     if log_time > LATEST:
         raise BagError(
-            f"{bag.path}: a message has a log time of {log_time} ns, which is past the year 2262; "
+            f"{path}: a message has a log time of {log_time} ns, which is past the year 2262; "
             f"the recorder's clock was wrong, so record anew"
         )
     return log_time
 
 
 class _Reading:
-    def __init__(self, bag: Bag, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]]) -> None:
+    def __init__(self, bag: Blocks, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]]) -> None:
         self.bag, self.topics, self.paths = bag, topics, paths
         self.parts = bag.described(topics)
         counts = [bag.topics[name].count for name in topics]
@@ -152,7 +192,7 @@ class _Reading:
             )
         for _ in steps:
             pass
-        self._tell()
+        self._note_left_out()
         return self._in_order()
 
     def _steps(self) -> Iterator[int]:
@@ -195,7 +235,7 @@ class _Reading:
         where_to = slice(self.filled, self.filled + number)
         log_time = batch.log_time[kept]
         if number:
-            in_reach(self.bag, int(log_time.max()))
+            in_reach(self.bag.path, int(log_time.max()))
         self.topic[where_to] = topic[kept]
         self.arrival[where_to] = log_time
         self.stamp[where_to] = stamp[kept]
@@ -228,12 +268,12 @@ class _Reading:
         self.filled_of[where] += len(rows) - len(failures)
         return [row for row, _ in failures]
 
-    def _tell(self) -> None:
-        warnings, undecoded = self.bag.said
+    def _note_left_out(self) -> None:
+        warnings, undecoded = self.bag.reading_notes
         met = [(entry.first, name, entry) for name, entry in zip(self.topics, self.undecoded, strict=True)]
         for _, name, entry in sorted((m for m in met if m[2].number), key=lambda m: m[0]):
             undecoded[name] = self.bag.left_out(name, entry.number, entry.why)
-        self.bag.tell(warnings, undecoded)
+        self.bag.restore_notes(warnings, undecoded)
 
     def _in_order(self) -> Columns:
         """Stable sort by log time: messages are in file order so far."""

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.bag_files import os_error
 from uncertain_lti.recordings.cdr_arrays import SLACK, numbers_at
 from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, most_records, parse, walk
+from uncertain_lti.recordings.unreadable import os_error
 
 _BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
 _STRIDE = 1 << 15  # bytes between two walkers in a large block

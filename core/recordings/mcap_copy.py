@@ -18,9 +18,9 @@ from mcap.records import Channel, Header, Metadata, Schema
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC
-from uncertain_lti.recordings.bag_files import os_error
 from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, inflate, parse, walk
 from uncertain_lti.recordings.mcap_writer import INDEX_ENTRY, McapWriter, channel_record, schema_record
+from uncertain_lti.recordings.unreadable import os_error
 
 _PIECE = 1 << 20  # bytes of an attachment that are held at once
 _LARGEST_METADATA = 1 << 26  # bytes

@@ -16,7 +16,6 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
 from uncertain_lti.base.files import MAGIC
-from uncertain_lti.recordings.bag_files import os_error
 from uncertain_lti.recordings.mcap_records import (
     CHUNK,
     FOOTER_SIZE,
@@ -31,8 +30,10 @@ from uncertain_lti.recordings.mcap_records import (
     most_inflated,
     most_records,
     parse,
+    scan,
     walk,
 )
+from uncertain_lti.recordings.unreadable import os_error
 
 _DATA_END_SIZE = RECORD.size + 4
 _FOOTER = struct.Struct("<QQI")  # begin of the summary, begin of its offsets, checksum
@@ -162,3 +163,19 @@ def _block(index: bytes, data_end: int) -> Block:
     if place + chunk_length + index_length > data_end or end > LATEST:
         raise _NoIndexError
     return Block(place + before, size, compression, length, start, end, channels, before, index_length)
+
+
+def outline_or_scan(path: Path) -> Contents:
+    """What the index of a file states, or else what is found by walking it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    Contents
+        What is known of the file.
+    """
+    return outline(path) or scan(path)

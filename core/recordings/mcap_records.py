@@ -38,7 +38,7 @@ from mcap.records import Channel, DataEnd, Footer, Schema, Statistics
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC
-from uncertain_lti.recordings.bag_files import not_mcap, os_error
+from uncertain_lti.recordings.unreadable import not_mcap, os_error
 
 try:
     from isal.isal_zlib import crc32 as crc32

@@ -24,12 +24,11 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.monitor.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
-from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.bag_arrays import Progress
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of
 from uncertain_lti.recordings.mcap_records import Contents, scan
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
+from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.sampling.sampler_arrays import Decisions
 
 METADATA = "uncertain_lti_check"
@@ -63,7 +62,7 @@ class Annotated:
     notes: tuple[str, ...]
 
 
-def targets(wish: str | os.PathLike[str], bags: Sequence[Bag]) -> list[Path]:
+def targets(wish: str | os.PathLike[str], bags: Sequence[Recording]) -> list[Path]:
     """Where annotated copies of these recordings go: a file `*.mcap` for one, any other path is a folder.
 
     In a folder, which is made, the copy of `run.mcap` is `run_annotated.mcap`.
@@ -72,7 +71,7 @@ def targets(wish: str | os.PathLike[str], bags: Sequence[Bag]) -> list[Path]:
     ----------
     wish : path
         What the user named.
-    bags : sequence of Bag
+    bags : sequence of Recording
         The recordings.
 
     Returns

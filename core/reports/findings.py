@@ -18,7 +18,7 @@ from uncertain_lti.base.files import sha256, target
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
-from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.reports.text import check_data, number
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
@@ -96,7 +96,7 @@ def findings(
     return finite
 
 
-def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Bag]) -> Path | None:
+def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Recording]) -> Path | None:
     """Where the page goes; an older page gives way, a recording or the model never.
 
     Parameters
@@ -105,7 +105,7 @@ def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequ
         What the user named; None for no page.
     model_file : str
         The model, which is never replaced.
-    bags : sequence of Bag
+    bags : sequence of Recording
         The recordings, which are never replaced.
 
     Returns

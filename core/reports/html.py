@@ -21,7 +21,7 @@ from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
-from uncertain_lti.recordings.bag_arrays import Progress
+from uncertain_lti.recordings.recording import Progress
 from uncertain_lti.reports import figures as plots
 from uncertain_lti.reports.findings import APART, CARE, NO, UNKNOWN, WEIGHTS, YES, shortened
 from uncertain_lti.reports.text import beyond, number

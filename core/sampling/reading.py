@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.bag import Bag, group_recordings
-from uncertain_lti.recordings.bag_arrays import Progress
+from uncertain_lti.recordings.formats import group_recordings, open_recording
+from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.sampling.operating_point import resolve_auto
 from uncertain_lti.sampling.reading_processes import processes_for, read_streams
 from uncertain_lti.sampling.sampler import Sampler, Status, resolve
@@ -167,7 +167,7 @@ def read_transients(
     Parameters
     ----------
     paths : Paths
-        MCAP files and folders; parts of one split bag are one recording (see `bag.group_recordings`).
+        MCAP files and folders; parts of one split bag are one recording (see `formats.group_recordings`).
     signals : SignalMap or path
         A map, or the signals file.
     progress : callable, optional
@@ -222,7 +222,9 @@ def read_transients(
     return [_with_signals(t, resolved, note if t is transients[0] else None) for t in transients]
 
 
-def _streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None, processes: int | None) -> list[Stream]:
+def _streams(
+    bags: Sequence[Recording], signals: SignalMap, progress: Progress | None, processes: int | None
+) -> list[Stream]:
     if processes != 1 and len(bags) > 1:
         processes = processes_for(bags) if processes is None else processes
         if processes != 1:
@@ -233,13 +235,13 @@ def _streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None,
 
 
 def read_as_fitted(
-    recording: Bag | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
+    recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> Transient:
     """Read one recording with the signals and sampling that a model was fitted with.
 
     Parameters
     ----------
-    recording : Bag or path
+    recording : Recording or path
         MCAP file or folder.
     signals : SignalMap
         Of the model.
@@ -264,13 +266,13 @@ def read_as_fitted(
 
 
 def read_as_fitted_with_decisions(
-    recording: Bag | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
+    recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> tuple[Transient, Decisions]:
     """`read_as_fitted`, and which message decided each clock message.
 
     Parameters
     ----------
-    recording : Bag or path
+    recording : Recording or path
         MCAP file or folder.
     signals : SignalMap
         Of the model.
@@ -297,13 +299,13 @@ def read_as_fitted_with_decisions(
 
 
 def _stream_for_model(
-    recording: Bag | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
+    recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> Stream:
     if any(not s.topic for s in signals.signals):
         raise SignalError(
             "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
         )
-    bag = recording if isinstance(recording, Bag) else Bag(recording, indexed=True)
+    bag = open_recording(recording, indexed=True) if isinstance(recording, (str, os.PathLike)) else recording
     for topic, found in _types([bag], signals).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
@@ -363,12 +365,12 @@ def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.Pat
         raise
 
 
-def no_topic(bag: Bag, topic: str) -> str:
+def no_topic(bag: Recording, topic: str) -> str:
     """The sentence for a topic that a recording lacks, with the nearest names and all of them.
 
     Parameters
     ----------
-    bag : Bag
+    bag : Recording
         The recording.
     topic : str
         The name that it lacks.
@@ -382,7 +384,7 @@ def no_topic(bag: Bag, topic: str) -> str:
     return f"{bag.path}: there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
 
 
-def _types(bags: Sequence[Bag], signals: SignalMap) -> Mapping[str, str]:
+def _types(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]:
     types: dict[str, str] = {}
     for bag in bags:
         for topic in signals.topics:

@@ -10,13 +10,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.bag_arrays import Progress
-from uncertain_lti.recordings.mcap_records import Contents
+from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.sampling.streams import Stream, read_stream
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -24,14 +21,14 @@ WORTH_IT = 1 << 28
 """Bytes of recordings from which on processes that have to be started first save time."""
 
 
-def processes_for(bags: Sequence[Bag]) -> int:
+def processes_for(bags: Sequence[Recording]) -> int:
     """How many processes to read these recordings with: 1 for small ones, and on few cores.
 
     One process keeps nearly two cores busy, as it reads ahead.
 
     Parameters
     ----------
-    bags : sequence of Bag
+    bags : sequence of Recording
         The recordings.
 
     Returns
@@ -39,17 +36,19 @@ def processes_for(bags: Sequence[Bag]) -> int:
     int
         At most one per recording, and one for every two cores.
     """
-    size = sum(part.size for bag in bags for part in bag.contents)
+    size = sum(bag.size for bag in bags)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(len(bags), cores // 2)) if size >= WORTH_IT else 1
 
 
-def read_streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | None, processes: int) -> list[Stream]:
+def read_streams(
+    bags: Sequence[Recording], signals: SignalMap, progress: Progress | None, processes: int
+) -> list[Stream]:
     """`read_stream` of every recording, in processes; progress advances by whole recordings.
 
     Parameters
     ----------
-    bags : sequence of Bag
+    bags : sequence of Recording
         The recordings.
     signals : SignalMap
         The map.
@@ -74,7 +73,7 @@ def read_streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | N
     """
     counts = [sum(bag.topics[topic].count for topic in signals.topics) for bag in bags]
     with _pool(min(processes, len(bags))) as pool:
-        futures = {pool.submit(_read, bag.path, bag.contents, signals): number for number, bag in enumerate(bags)}
+        futures = {pool.submit(_read, bag, signals): number for number, bag in enumerate(bags)}
 
         def messages() -> Iterator[None]:
             for future in as_completed(futures):
@@ -86,7 +85,7 @@ def read_streams(bags: Sequence[Bag], signals: SignalMap, progress: Progress | N
         return [_stream(bag, future) for bag, future in zip(bags, futures, strict=True)]
 
 
-def _stream(bag: Bag, future: Future[tuple[Any, ...]]) -> Stream:
+def _stream(bag: Recording, future: Future[tuple[Any, ...]]) -> Stream:
     try:
         walked, undecoded, *columns = future.result()
     except BrokenProcessPool:
@@ -96,17 +95,16 @@ def _stream(bag: Bag, future: Future[tuple[Any, ...]]) -> Stream:
         ) from None
     if walked:
         bag.walk()
-    bag.tell(bag.said[0], undecoded)
+    bag.restore_notes(bag.reading_notes[0], undecoded)
     return Stream(bag, *columns)
 
 
-def _read(path: Path, contents: Sequence[Contents], signals: SignalMap) -> tuple[Any, ...]:
+def _read(bag: Recording, signals: SignalMap) -> tuple[Any, ...]:
     """In a process of its own: whether the index did not hold, messages left out by topic, and the columns."""
-    bag = Bag(path, contents)
-    indexed = any(part.indexed for part in bag.contents)
+    indexed = bag.indexed
     stream = read_stream(bag, signals)
-    walked = indexed and not any(part.indexed for part in bag.contents)
-    return walked, bag.said[1], stream.topic, stream.arrival, stream.stamp, stream.values
+    walked = indexed and not bag.indexed
+    return walked, bag.reading_notes[1], stream.topic, stream.arrival, stream.stamp, stream.values
 
 
 @contextmanager

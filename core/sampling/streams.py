@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.bag_arrays import Progress, in_reach, read_columns
+from uncertain_lti.recordings.bag_arrays import in_reach
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.message_types import header_stamp_ns
+from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -25,7 +25,7 @@ class Stream:
 
     Parameters
     ----------
-    bag : Bag
+    bag : Recording
         The recording.
     topic : array (messages,) of int
         Positions in `signals.topics`.
@@ -37,21 +37,21 @@ class Stream:
         One array per topic, in the order of `signals.on(topic)`.
     """
 
-    bag: Bag
+    bag: Recording
     topic: NDArray[np.int64]
     arrival: NDArray[np.int64]
     stamp: NDArray[np.int64]
     values: list[NDArray[np.float64]]
 
 
-def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
+def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = None) -> Stream:
     """Read the fields of a signals file from one recording.
 
     Messages are read in blocks (`bag_arrays`), with what `read_stream_by_message` gives to the last bit.
 
     Parameters
     ----------
-    bag : Bag
+    bag : Recording
         The recording.
     signals : SignalMap
         The map; it need not be resolved.
@@ -72,19 +72,19 @@ def read_stream(bag: Bag, signals: SignalMap, progress: Progress | None = None) 
     """
     paths = check_paths(bag, signals)
     try:
-        columns = read_columns(bag, signals.topics, paths, progress)
+        columns = bag.columns(signals.topics, paths, progress)
     except RepeatedNamesError:
         return read_stream_by_message(bag, signals, progress)
     _refuse_absent(bag, signals, paths, columns.values)
     return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
 
 
-def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | None = None) -> Stream:
+def read_stream_by_message(bag: Recording, signals: SignalMap, progress: Progress | None = None) -> Stream:
     """What `read_stream` gives, message by message.
 
     Parameters
     ----------
-    bag : Bag
+    bag : Recording
         The recording.
     signals : SignalMap
         The map; it need not be resolved.
@@ -115,7 +115,7 @@ def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | No
     for name, log_time, message in messages:
         where = position[name]
         order.append(where)
-        arrival.append(in_reach(bag, log_time))
+        arrival.append(in_reach(bag.path, log_time))
         stamp.append(header_stamp_ns(message) or -1)
         values[where].extend([path.read(message) for path in paths[where]])
     arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
@@ -123,12 +123,12 @@ def read_stream_by_message(bag: Bag, signals: SignalMap, progress: Progress | No
     return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
 
 
-def check_paths(bag: Bag, signals: SignalMap) -> list[list[FieldPath]]:
+def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
     """Field paths per topic; every problem of the map is found before the long read.
 
     Parameters
     ----------
-    bag : Bag
+    bag : Recording
         The recording.
     signals : SignalMap
         The map.
@@ -150,7 +150,7 @@ def check_paths(bag: Bag, signals: SignalMap) -> list[list[FieldPath]]:
 
 
 def _refuse_absent(
-    bag: Bag, signals: SignalMap, paths: Sequence[Sequence[FieldPath]], values: Sequence[NDArray[np.float64]]
+    bag: Recording, signals: SignalMap, paths: Sequence[Sequence[FieldPath]], values: Sequence[NDArray[np.float64]]
 ) -> None:
     """What the first message lacks, and what gave no number in any other, is a mistake in the map."""
     for name, columns, read in zip(signals.topics, paths, values, strict=True):
@@ -158,8 +158,8 @@ def _refuse_absent(
             looked_up = any(kind != "attribute" for kind, _ in path.steps)
             if not looked_up or not len(column) or not math.isnan(column[0]) or not np.isnan(column).all():
                 continue
-            said = bag.said
+            notes = bag.reading_notes
             _, _, first = next(iter(bag.messages([name])))
-            bag.tell(*said)
+            bag.restore_notes(*notes)
             if absent := path.absent(first):
                 raise SignalError(f"field '{path.text}' of {name} in {bag.path}: {absent}")

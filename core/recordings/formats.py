@@ -1,0 +1,117 @@
+"""Formats of recordings: one entry for each kind of file that can be read."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from uncertain_lti.base.errors import BagError
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.bag_groups import group_bags
+from uncertain_lti.recordings.recording import Recording
+
+
+@dataclass(frozen=True)
+class Format:
+    """One kind of recording.
+
+    Parameters
+    ----------
+    name : str
+        What it is called.
+    recognises : callable
+        Takes a path, and returns whether this format reads it.
+    open : callable
+        Takes the path of one recording, its files in order where they are known (else none), and whether an index may
+        be believed until messages are read; returns the `Recording`.
+    group : callable
+        Takes paths that a user named together, and the same flag; returns the recordings they are, in order.
+    """
+
+    name: str
+    recognises: Callable[[Path], bool]
+    open: Callable[[Path, Sequence[Path], bool], Recording]
+    group: Callable[[Sequence[Path], bool], Sequence[Recording]]
+
+
+FORMATS: list[Format] = [Format("MCAP", lambda path: True, Bag, group_bags)]
+"""Every format; the first that recognises a path reads it. MCAP is last: its errors say what another file is."""
+
+
+def format_of(path: Path) -> Format:
+    """Find the format that reads a file or folder.
+
+    Parameters
+    ----------
+    path : Path
+        File or folder, there or not.
+
+    Returns
+    -------
+    Format
+        The first that recognises it.
+    """
+    return next(format for format in FORMATS if format.recognises(path))
+
+
+def open_recording(
+    path: str | os.PathLike[str], parts: Sequence[str | os.PathLike[str]] = (), indexed: bool = False
+) -> Recording:
+    """Open one recording.
+
+    Parameters
+    ----------
+    path : path
+        File or folder; with parts, the name of the recording.
+    parts : sequence of path, optional
+        Its files in order, where they are known.
+    indexed : bool, default False
+        Believe an index until messages are read, as `Bag` does.
+
+    Returns
+    -------
+    Recording
+        In the format that recognises the path.
+
+    Raises
+    ------
+    BagError
+        There is no recording, or no message of it can be read.
+    """
+    return format_of(Path(path)).open(Path(path), [Path(part) for part in parts], indexed)
+
+
+def group_recordings(paths: Iterable[str | os.PathLike[str]], indexed: bool = False) -> list[Recording]:
+    """Recordings that some paths name, in the order of their first mention.
+
+    A folder is one recording. Files are one recording each, except the parts of a split bag (`group_bags`).
+
+    Parameters
+    ----------
+    paths : iterable of path
+        Files and folders.
+    indexed : bool, default False
+        As in `open_recording`.
+
+    Returns
+    -------
+    list of Recording
+        One per recording.
+
+    Raises
+    ------
+    BagError
+        A file cannot be read, or is named twice.
+    """
+    recordings: list[Recording] = []
+    for format, run in itertools.groupby(map(Path, paths), format_of):
+        recordings += format.group(list(run), indexed)
+    seen: set[Path] = set()
+    for part in itertools.chain.from_iterable(recording.parts for recording in recordings):
+        if part.resolve() in seen:
+            raise BagError(f"{part}: named twice; name each recording once")
+        seen.add(part.resolve())
+    return recordings

@@ -1,0 +1,78 @@
+"""Messages as recorded, and what the file says of the channels they were recorded on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from mcap.records import Schema
+
+from uncertain_lti.recordings.message_types import Definition
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedChannel:
+    """A channel as the file describes it: everything needed to write its messages again.
+
+    Parameters
+    ----------
+    topic : str
+        Name of its topic.
+    type : str
+        Message type, `pkg/msg/Type`.
+    encoding : str
+        Of its messages.
+    schema : Schema or None
+        Its record in the file; None without one.
+    metadata : mapping of str to str
+        What the recorder stored of the channel, QoS for example.
+    definition : Definition
+        How its messages are decoded.
+    counted : bool, default False
+        Whether its messages are those of its topic (see `Bag` on topics with several types).
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    schema: Schema | None
+    metadata: Mapping[str, str]
+    definition: Definition
+    counted: bool = False
+
+
+class RawMessage(NamedTuple):
+    """One message as recorded.
+
+    Parameters
+    ----------
+    log_time_ns : int
+        Log time, ns.
+    publish_time_ns : int
+        Publish time, ns.
+    data : bytes
+        Serialised message.
+    channel : RecordedChannel
+        What it was recorded on.
+    """
+
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+    channel: RecordedChannel
+
+    @property
+    def topic(self) -> str:
+        """Topic it was published on."""
+        return self.channel.topic
+
+    @property
+    def type(self) -> str:
+        """Message type, `pkg/msg/Type`."""
+        return self.channel.type
+
+    @property
+    def encoding(self) -> str:
+        """Encoding of `data`; `cdr` is what can be decoded."""
+        return self.channel.encoding

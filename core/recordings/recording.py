@@ -1,0 +1,239 @@
+"""Recording: what every format of recordings offers to the rest of the program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.field_types import TypeFields
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """What a recording holds of one topic.
+
+    Parameters
+    ----------
+    topic : str
+        Its name.
+    type : str
+        Message type, `pkg/msg/Type`.
+    count : int
+        Messages that count.
+    encoding : str
+        Of its messages; `cdr` is what can be decoded.
+    readable : bool
+        Whether its messages can be decoded.
+    reason : str
+        Why not, or which of its messages are left out; empty otherwise.
+    first : int or None
+        First log time, ns; None without a message.
+    last : int or None
+        Last log time, ns; None without a message.
+    """
+
+    topic: str
+    type: str
+    count: int
+    encoding: str
+    readable: bool
+    reason: str
+    first: int | None
+    last: int | None
+
+
+@dataclass(frozen=True)
+class TopicFacts:
+    """One topic as `uncertain-lti topics` shows it.
+
+    Parameters
+    ----------
+    info : TopicInfo
+        What the recording holds of it.
+    rate : float or None
+        That of the median log-time step, 1/s; None where there is no step or it is 0.
+    largest_gap : float or None
+        Longest log-time step, s; None where there is no step.
+    fields : tuple of str
+        Paths that can be signals; `data[0..99]` stands for `data[0]` to `data[99]`.
+    stamps : {"none", "usable", "zero", "mixed"}
+        Whether header stamps can be used.
+    stamp_offset : float or None
+        Median of log time less header stamp, s; None without a stamp.
+    """
+
+    info: TopicInfo
+    rate: float | None
+    largest_gap: float | None
+    fields: tuple[str, ...]
+    stamps: Literal["none", "usable", "zero", "mixed"]
+    stamp_offset: float | None
+
+
+@dataclass
+class Columns:
+    """Messages of some topics in order of arrival.
+
+    Parameters
+    ----------
+    topic : array (messages,) of int
+        Positions in the topics asked for.
+    arrival : array (messages,) of int
+        Log time, ns.
+    stamp : array (messages,) of int
+        Header stamp, ns; -1 for no stamp.
+    values : list of array (messages of the topic, paths)
+        One array per topic.
+    alone : int, default 0
+        Messages that had to be decoded one by one.
+    """
+
+    topic: NDArray[np.int64]
+    arrival: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    values: list[NDArray[np.float64]]
+    alone: int = 0
+
+
+Progress = Callable[[Iterable[object], int], Iterable[object]]
+"""Wraps what goes through messages, given their number, and may draw how far it has come."""
+
+
+class Recording(Protocol):
+    """One recording of a machine, whatever the format of its files (`formats`).
+
+    Everything that is read of a recording goes through this. Topics, types and log times are those of ROS 2 or stand
+    in their place: a format without topics gives its data one, with fields that `FieldPath` reads.
+    """
+
+    @property
+    def path(self) -> Path:
+        """File or folder, as errors and reports call the recording."""
+
+    @property
+    def parts(self) -> tuple[Path, ...]:
+        """Files of the recording, in order."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of these files."""
+
+    @property
+    def topics(self) -> Mapping[str, TopicInfo]:
+        """Topics by name."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is missing or left out, each one sentence that begins with the file; grows while messages are read."""
+
+    @property
+    def indexed(self) -> bool:
+        """Whether anything known of the recording comes from an index that reading may prove wrong."""
+
+    @property
+    def reading_notes(self) -> tuple[list[str], dict[str, str]]:
+        """Warnings so far, and sentences on messages left out by topic; what `restore_notes` takes."""
+
+    def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
+        """Set `reading_notes`, for example to those of another process that read the same recording.
+
+        Parameters
+        ----------
+        warnings : sequence of str
+            Sentences.
+        undecoded : mapping of str to str
+            Topic -> sentence on its messages that are left out.
+        """
+
+    def walk(self) -> None:
+        """Read what an index stated from the files themselves."""
+
+    def type_fields(self, topic: str) -> TypeFields:
+        """Fields of message types as the topic's own definition has them.
+
+        Parameters
+        ----------
+        topic : str
+            Name of the topic.
+
+        Returns
+        -------
+        callable
+            Type name -> {field name: FieldType}.
+
+        Raises
+        ------
+        BagError
+            The topic is not there or cannot be decoded.
+        """
+
+    def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
+        """Decoded messages in order of log time.
+
+        Parameters
+        ----------
+        topics : iterable of str
+            Names.
+
+        Returns
+        -------
+        iterator of (str, int, object)
+            Topic, log time in ns, message.
+
+        Raises
+        ------
+        BagError
+            A topic is not there or cannot be decoded.
+        """
+
+    def columns(
+        self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
+    ) -> Columns:
+        """Numbers at some paths of each topic as arrays: what `FieldPath.read` gives for each of `messages`.
+
+        Parameters
+        ----------
+        topics : sequence of str
+            Names.
+        paths : sequence of sequence of FieldPath
+            Per topic the paths to read.
+        progress : Progress, optional
+            Wraps what goes through the messages, given their number.
+
+        Returns
+        -------
+        Columns
+            In order of arrival.
+
+        Raises
+        ------
+        BagError
+            A topic is not there or cannot be decoded.
+        RepeatedNamesError
+            What a path gives depends on the order of the messages, so that `messages` has to be read.
+        """
+
+    def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
+        """Rates, gaps, stamps and fields of every topic, for a person who looks for signals.
+
+        Parameters
+        ----------
+        progress : Progress, optional
+            Wraps the messages, given their number.
+
+        Returns
+        -------
+        list of TopicFacts
+            One per topic.
+
+        Raises
+        ------
+        BagError
+            The recording cannot be read any more.
+        """
