@@ -1,0 +1,118 @@
+"""Envelopes of real machines: widths of the one-step bounds, and what is inside on recordings that were not fitted.
+
+    ./run python benchmarks/real_machines.py                    # the table of docs/real_machines.md (Markdown)
+    ./run python benchmarks/real_machines.py --data FOLDER
+
+The recordings are public and not part of this repository; docs/real_machines.md names the machines. Without them the
+exit status is 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from measure import table
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti.sampling.reading import read_as_fitted
+from uncertain_lti.validation.left_out import cut
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A machine, its signals file in config/signals, what is fitted and what is checked."""
+
+    machine: str
+    signals: str
+    fitted: Sequence[str]
+    checked: Sequence[str]
+
+
+CASES = (
+    Case(
+        "micro gas turbine, 1 Hz", "micro_gas_turbine", ["micro_gas_turbine/ex_1.mcap", "micro_gas_turbine/ex_20.mcap"],
+        ["micro_gas_turbine/ex_24.mcap"],
+    ),
+    Case(
+        "Hunter SE (simulated), 27 Hz", "hunter_se", ["hunter_se/straight_odd_t_0_5_run_01.mcap"],
+        ["hunter_se/straight_odd_t_0_5_run_02.mcap", "hunter_se/straight_even_t_0_2_run_01.mcap"],
+    ),
+    Case(
+        "Crazyflie, Vicon, 100 Hz", "crazyflie_vicon", ["crazyflie/rollbag_0.mcap"],
+        ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"],
+    ),
+    Case(
+        "Crazyflie, estimate, 10 Hz", "crazyflie_estimate", ["crazyflie/rollbag_0.mcap"],
+        ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"],
+    ),
+    Case("Neato, 5 Hz", "neato", ["neato/person_follower.mcap"], ["neato/draw_square.mcap"]),
+)  # fmt: skip
+
+
+def rows_of(
+    machine: str, model: UncertainLTI, fitted: Sequence[Transient], checked: Sequence[Transient]
+) -> list[list[str]]:
+    """One row per state: mean width, rms step and range where it was fitted, share inside where it was not."""
+    steps = [t.transitions() for t in fitted]
+    states = np.vstack([s.x for s in steps])
+    rms = np.sqrt(np.mean(np.vstack([s.x_next - s.x for s in steps]) ** 2, axis=0))
+    verdicts = [EnvelopeMonitor(model, 1, 1, 1.0).check(t) for t in checked]
+    rows = []
+    for i, signal in enumerate(model.signals.states):
+        inside = [f"{1 - (v.flags[v.judged, i] == 1.0).mean():.2%} of {v.judged.sum()}" for v in verdicts]
+        rows.append(
+            [
+                f"{machine}: {signal.name} [{signal.unit or '-'}]",
+                f"{model.fit_summary['mean_width_recorded'][i]:.3g}",
+                f"{rms[i]:.2g}",
+                f"{np.ptp(states[:, i]):.3g}",
+                "; ".join(inside),
+            ]
+        )
+    return rows
+
+
+def go2(data: Path, signals: Path) -> list[list[str]]:
+    """Joint 0 fitted on every other second, checked on the others taken together."""
+    (whole,) = read_transients(data / "go2" / "test_3.mcap", signals / "go2_joint.yaml")
+    seconds = [cut(whole, start, start + 500) for start in range(0, 6500, 500)]
+    model = fit(seconds[::2])
+    verdicts = [EnvelopeMonitor(model, 1, 1, 1.0).check(part) for part in seconds[1::2]]
+    judged = sum(int(v.judged.sum()) for v in verdicts)
+    inside = 1 - sum(int(v.violated.sum()) for v in verdicts) / judged
+    rows = rows_of("Unitree Go2, joint 0, 500 Hz", model, seconds[::2], [])
+    for entry in rows:
+        entry[-1] = f"{inside:.2%} of {judged} (both)"
+    return rows
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
+    data = parser.parse_args().data
+    if not data.is_dir():
+        print(f"{data}: the recordings are not there; name their folder with --data", file=sys.stderr)
+        return 2
+    signals = ROOT / "config" / "signals"
+    rows = go2(data, signals)
+    for case in CASES:
+        fitted = read_transients([data / name for name in case.fitted], signals / f"{case.signals}.yaml")
+        model = fit(fitted)
+        rows += rows_of(
+            case.machine, model, fitted, [read_as_fitted(data / name, model.signals) for name in case.checked]
+        )
+    table(
+        "Envelopes of real machines", ("machine: state", "mean width", "rms step", "range", "inside, not fitted"), rows
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
