@@ -9,7 +9,7 @@ from uncertain_lti import fit
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.plants import leibov
 from uncertain_lti.plants.turbofan_runs import make_run, simulate
-from uncertain_lti.reports.text import table
+from uncertain_lti.reports.tables import table
 
 
 def main() -> None:

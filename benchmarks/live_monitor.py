@@ -386,7 +386,7 @@ LIMITS = (
 
 
 def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, left: float) -> None:
-    from uncertain_lti.reports.text import table
+    from uncertain_lti.reports.tables import table
 
     rows, held = [], []
     for n in sizes:

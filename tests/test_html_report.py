@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.cli.main import main
-from uncertain_lti.reports.findings import APART, CARE, MOST_EPISODES, NO, UNKNOWN, YES, findings
+from uncertain_lti.reports.findings import APART, MOST_EPISODES, findings
 from uncertain_lti.reports.html import MOST_DRAWN, _first_screen, html_report
-from uncertain_lti.reports.text import beyond
+from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, YES
+from uncertain_lti.reports.tables import beyond
 from uncertain_lti.validation.left_out import validate
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;<img src=http://x/y.png onerror=alert(2)>\u202e\x07"

@@ -9,18 +9,16 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.reports.figure_columns import PIXELS, DrawnColumns, TimeAxis
 from uncertain_lti.reports.figures import (
-    PIXELS,
-    _Drawn,
-    _Time,
     budget_figure,
     coverage_figure,
     envelope_figure,
     matrices_figure,
     save,
     utilisation_figure,
-    width_budget,
 )
+from uncertain_lti.reports.width_budget import width_budget
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 LONG = "x_$the$_total <pressure>\nbehind_the_high_pressure_compressor_état_"
@@ -65,7 +63,7 @@ def test_no_violation_is_hidden_in_a_long_recording(count, jumps, gaps, back):
     """Every violated sample lies in a stretch that is marked, and every extreme is drawn."""
     model = by_hand(3, 1)
     verdicts = checked(model, count, jumps, gaps, back)
-    drawn = _Drawn.of(verdicts, _Time(verdicts.transient).t, None)
+    drawn = DrawnColumns.of(verdicts, TimeAxis(verdicts.transient).t, None)
     assert drawn.binned and len(drawn.t) <= PIXELS
     ends = np.append(drawn.starts[1:], drawn.stop)
     for i in range(3):

@@ -21,8 +21,10 @@ from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
+from uncertain_lti.reports.check_data import check_data
+from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.reports.figures import budget_figure, envelope_figure, matrices_figure, save, utilisation_figure
-from uncertain_lti.reports.text import check_data, check_text, fit_text
+from uncertain_lti.reports.fit_text import fit_text
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti_ros.process import Life, living
 from uncertain_lti_ros.terminal import say, speed

@@ -52,7 +52,8 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.base.english import plural
     from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.reports.text import check_data, check_text
+    from uncertain_lti.reports.check_data import check_data
+    from uncertain_lti.reports.check_text import check_text
     from uncertain_lti.sampling.reading import read_as_fitted_with_decisions
 
     model = load_model(options.model)

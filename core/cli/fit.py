@@ -76,7 +76,8 @@ def run(options: argparse.Namespace) -> int:
     """
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
-    from uncertain_lti.reports.text import fit_text, left_out_text, next_text, recording_text
+    from uncertain_lti.reports.fit_text import fit_text, next_text, recording_text
+    from uncertain_lti.reports.validation_text import left_out_text
     from uncertain_lti.validation.groups import resolve_groups
     from uncertain_lti.validation.left_out import leave_out_with_fit
 
@@ -125,7 +126,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
 
     from uncertain_lti.base.files import sha256
     from uncertain_lti.identification.archive import fit_archive
-    from uncertain_lti.reports.text import archive_text, next_text
+    from uncertain_lti.reports.fit_text import archive_text, next_text
 
     if options.discard:
         raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     ModelError
         The model cannot be read.
     """
-    from uncertain_lti.reports.text import model_text
+    from uncertain_lti.reports.model_text import model_text
 
     model = load_model(options.model)
     if options.json:

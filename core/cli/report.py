@@ -41,8 +41,9 @@ def run(options: argparse.Namespace) -> int:
     """
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.reports.findings import findings, page_target
-    from uncertain_lti.reports.text import findings_text
+    from uncertain_lti.reports.findings import findings
+    from uncertain_lti.reports.findings_text import findings_text
+    from uncertain_lti.reports.page_file import page_target
     from uncertain_lti.sampling.reading import read_as_fitted
 
     model = load_model(options.model)
@@ -57,7 +58,8 @@ def run(options: argparse.Namespace) -> int:
     facts = findings(model, options.model, checked, monitor.rule)
     print_summary(options, findings_text(facts))
     if output is not None:
-        from uncertain_lti.reports.html import html_report, write_page
+        from uncertain_lti.reports.html import html_report
+        from uncertain_lti.reports.page_file import write_page
 
         write_page(output, html_report(model, checked, facts, options.progress.iterate("drawing", "sections")))
         print_summary(options, f"report written to {output}")

@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
         The recording cannot be read.
     """
     from uncertain_lti.recordings.formats import open_recording
-    from uncertain_lti.reports.text import number, table
+    from uncertain_lti.reports.tables import number, table
 
     bag = open_recording(options.bag)
     facts = bag.facts(options.progress.iterate("reading"))

@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from uncertain_lti import UncertainLTI
     from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.reports.text import validation_text
+    from uncertain_lti.reports.validation_text import validation_text
     from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.calibration import calibrate
     from uncertain_lti.validation.left_out import validate_model

@@ -11,25 +11,32 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array, Mask
+from uncertain_lti.base.arrays import Array, Integers
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.reports.figure_columns import PIXELS, DrawnColumns, TimeAxis
+from uncertain_lti.reports.tables import shortened
+from uncertain_lti.reports.width_budget import width_budget
 from uncertain_lti.sampling.transient import Transient
 
 ENVELOPE, RECORDED, VIOLATED, ALARM, NO_VERDICT = "#56B4E9", "#000000", "#D55E00", "#F0E442", "#999999"
-PIXELS = 1200
-"""Stretches of time that a longer recording is drawn in."""
+
+
 _FEW = 8  # states that get a panel of full size each, and columns whose numbers fit into a heat map
+
+
 _WIDTH = 10.0  # inches
+
+
 _LONGEST_NAME = 34
+
+
 _MANY = 30  # names beside each other are written smaller from here on
 
 
@@ -66,8 +73,8 @@ def envelope_figure(
         A name is not a state of the model.
     """
     chosen = _chosen(model, states)
-    axis_time = _Time(verdicts.transient)
-    drawn = _Drawn.of(verdicts, axis_time.t, span)
+    axis_time = TimeAxis(verdicts.transient)
+    drawn = DrawnColumns.of(verdicts, axis_time.t, span)
     figure, axes = _panels(len(chosen))
     for axis, i in zip(axes, chosen, strict=True):
         lower, upper = drawn.least(verdicts.lower[:, i]), drawn.greatest(verdicts.upper[:, i])
@@ -128,8 +135,8 @@ def utilisation_figure(
         A name is not a state of the model.
     """
     chosen = _chosen(model, states)
-    axis_time = _Time(verdicts.transient)
-    drawn = _Drawn.of(verdicts, axis_time.t, span, always=len(chosen) > _FEW)
+    axis_time = TimeAxis(verdicts.transient)
+    drawn = DrawnColumns.of(verdicts, axis_time.t, span, always=len(chosen) > _FEW)
     if len(chosen) > _FEW:
         return _utilisation_map(model, verdicts, chosen, axis_time, drawn)
     figure, axes = _panels(len(chosen), height=1.0)
@@ -248,7 +255,8 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
     ModelError
         No recording has a usable transition.
     """
-    shares, width, columns = width_budget(model, transients)
+    shares, width, names = width_budget(model, transients)
+    columns = [_short(name) for name in names]
     rows = []
     for i, name in enumerate(model.state_names):
         unit = model.signals.states[i].unit
@@ -282,55 +290,6 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
                 j, i, f"{100 * shares[i, j]:.0f}", ha="center", va="center", fontsize=7, color="w" if dark else "k"
             )
     return figure
-
-
-def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[Array, Array, list[str]]:
-    """Which element contributes how much of the mean one-step width.
-
-    Columns are states, controls, and what the model has of drift and noise.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-    transients : sequence of Transient
-        In recorded units, with the model's signals.
-
-    Returns
-    -------
-    array (n, columns)
-        Share of each column; a row of zeros where the width is 0.
-    array (n,)
-        Mean width, recorded units.
-    list of str
-        Names of the columns.
-
-    Raises
-    ------
-    ModelError
-        No recording has a usable transition.
-    """
-    point = model.operating_point
-    total, count = np.zeros(model.n + model.m + 2), 0
-    for transient in transients:
-        steps = transient.transitions()
-        if not len(steps.k):
-            continue
-        count += len(steps.k)
-        z = np.abs(np.hstack([point.normalise_x(steps.x), point.normalise_u(steps.u)]))
-        total += [*(steps.dt @ z), steps.dt.sum(), len(steps.k)]
-    if not count:
-        raise ModelError("no recording has a usable transition, so there is no width to share out")
-    parts = 2.0 * np.hstack([model.dA, model.dB, model.dc[:, None], model.v[:, None]]) * (total / count)
-    columns = [_short(name) for name in (*model.state_names, *model.control_names)]
-    kept = list(range(model.n + model.m))
-    for place, (values, name) in enumerate(((model.dc, "drift"), (model.v, "noise")), start=len(kept)):
-        if values.any():
-            kept.append(place)
-            columns.append(name)
-    width = parts.sum(axis=1)
-    shares = np.divide(parts, width[:, None], out=np.zeros_like(parts), where=width[:, None] > 0)
-    return shares[:, kept], width * point.X, columns
 
 
 def coverage_figure(model: UncertainLTI, checked: Sequence[Verdicts]) -> Any:
@@ -429,122 +388,10 @@ def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) 
             figure.savefig(stream, dpi=dpi, format=kind)
 
 
-# --- long recordings, by pixel ----------------------------------------------------------------------------------
+# --- pieces ----------------------------------------------------------------------------------------------------------
 
 
-class _Time:
-    """Time axis of a recording: s since the first sample; passes of a looped one stand one behind the other."""
-
-    def __init__(self, transient: Transient) -> None:
-        t = transient.t
-        steps = np.diff(t)
-        self.loops = int((steps < 0).sum())
-        if self.loops:
-            forward = steps[steps > 0]
-            steps[steps < 0] = float(np.median(forward)) if len(forward) else 1.0
-            t = np.concatenate([[0.0], np.cumsum(steps)])
-        self.t: Array = t
-
-    @property
-    def label(self) -> str:
-        return "time [s]" + (f", {self.loops + 1} passes one behind the other" if self.loops else "")
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """What of a recording is drawn: its samples, or stretches of time with all of their samples.
-
-    t (P,) s where each stands; starts (P,) its first sample and stop the end of the last; judged, alarm, and after,
-    whether something lies between it and the one before, (P,); edges (P, 2) from where to where it reaches, s.
-    """
-
-    t: Array
-    starts: NDArray[np.intp]
-    stop: int
-    binned: bool
-    judged: Mask
-    alarm: Mask
-    after: Mask
-    edges: Array
-
-    @classmethod
-    def of(cls, verdicts: Verdicts, t: Array, span: tuple[float, float] | None, always: bool = False) -> _Drawn:
-        first, stop = 0, len(t)
-        if span is not None:
-            first, stop = int(np.searchsorted(t, span[0])), int(np.searchsorted(t, span[1], side="right"))
-        here = t[first:stop]
-        count = len(here)
-        broken = np.zeros(count, dtype=bool)
-        broken[1:] = np.diff(verdicts.transient.segment[first:stop]) != 0
-        if count <= 2 * PIXELS and not always:
-            starts = np.arange(first, stop)
-            before = np.concatenate([here[:1], here[:-1]])
-            judged, alarm = verdicts.judged[first:stop], verdicts.alarm[first:stop]
-            return cls(here, starts, stop, False, judged, alarm, broken, np.column_stack([before, here]))
-        low, high = (float(here[0]), float(here[-1])) if count else (0.0, 1.0)
-        cells = np.linspace(low, high if high > low else low + 1.0, min(PIXELS, max(count, 1)) + 1)
-        places = np.searchsorted(here, cells[:-1])
-        ends = np.append(places[1:], count)
-        filled = np.flatnonzero(ends > places)
-        starts = (places[filled] + first).astype(np.intp)
-        any_of = [np.logical_or.reduceat(a[:stop], starts) for a in (verdicts.judged, verdicts.alarm)]
-        centre = (cells[filled] + cells[filled + 1]) / 2
-        after = np.zeros(len(filled), dtype=bool)
-        after[1:] = np.diff(filled) > 1
-        return cls(
-            centre, starts, stop, True, any_of[0], any_of[1], after, np.column_stack([cells[filled], cells[filled + 1]])
-        )
-
-    def least(self, values: Array) -> Array:
-        """Least value of each; NaN only where there is none."""
-        return self._reduced(np.fmin, values)
-
-    def greatest(self, values: Array) -> Array:
-        """Greatest value of each."""
-        return self._reduced(np.fmax, values)
-
-    def _reduced(self, which: np.ufunc, values: Array) -> Array:
-        if not self.binned:
-            return values[self.starts]
-        reduced: Array = which.reduceat(np.ascontiguousarray(values[: self.stop]), self.starts)
-        return reduced
-
-    def worst(self, verdicts: Verdicts, state: int, values: Array) -> tuple[Array, Array, Array]:
-        """Where something of a state is violated: t, the value of the worst sample there, and its utilisation."""
-        flags, utilisation = verdicts.flags[:, state], verdicts.utilisation[:, state]
-        bad = np.flatnonzero(self.greatest(flags) == 1.0)
-        if not self.binned:
-            rows = self.starts[bad]
-        else:
-            ends = np.append(self.starts[1:], self.stop)
-            rows = np.array([_worst_row(flags, utilisation, self.starts[b], ends[b]) for b in bad], dtype=np.intp)
-        return self.t[bad], values[rows], utilisation[rows]
-
-    def broken(self, *values: Array) -> list[Array]:
-        """Times and values with a hole wherever something lies between."""
-        at = np.flatnonzero(self.after)
-        return [np.insert(array, at, np.nan) for array in (self.t, *values)]
-
-    def alarms(self) -> list[tuple[float, float]]:
-        """(begin, length) of each stretch of alarm, s: from the verdict that raised it to the one that ended it."""
-        if self.binned:
-            return self.spans(self.alarm)
-        runs = np.flatnonzero(np.diff(np.concatenate([[False], self.alarm, [False]]).astype(np.int8))).reshape(-1, 2)
-        return [(float(self.t[a]), float(self.t[min(b, len(self.t) - 1)] - self.t[a])) for a, b in runs]
-
-    def spans(self, which: Mask) -> list[tuple[float, float]]:
-        """(begin, length) of each run, s."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8))).reshape(-1, 2)
-        return [(float(self.edges[a, 0]), float(self.edges[b - 1, 1] - self.edges[a, 0])) for a, b in edges]
-
-
-def _worst_row(flags: Array, utilisation: Array, start: int, stop: int) -> int:
-    """The violated sample that lies farthest out."""
-    rows = np.flatnonzero(flags[start:stop] == 1.0) + start
-    return int(rows[np.argmax(np.abs(utilisation[rows]))])
-
-
-def _outside(checked: Sequence[Verdicts], n: int) -> tuple[Array, Array, NDArray[np.int64]]:
+def _outside(checked: Sequence[Verdicts], n: int) -> tuple[Array, Array, Integers]:
     """Shares of the verdicts violated (recordings, n), of any state (recordings,), and the verdicts."""
     judged = np.array([int(v.judged.sum()) for v in checked], dtype=np.int64)
     outside, of_any = np.full((len(checked), n), np.nan), np.full(len(checked), np.nan)
@@ -553,9 +400,6 @@ def _outside(checked: Sequence[Verdicts], n: int) -> tuple[Array, Array, NDArray
             outside[row] = (v.flags == 1.0).sum(axis=0) / count
             of_any[row] = v.violated.sum() / count
     return outside, of_any, judged
-
-
-# --- pieces -----------------------------------------------------------------------------------------------------
 
 
 def _chosen(model: UncertainLTI, states: Sequence[str] | None) -> list[int]:
@@ -600,7 +444,7 @@ def _panels(count: int, height: float = 1.45) -> tuple[Any, list[Any]]:
 
 
 def _utilisation_map(
-    model: UncertainLTI, verdicts: Verdicts, chosen: Sequence[int], axis_time: _Time, drawn: _Drawn
+    model: UncertainLTI, verdicts: Verdicts, chosen: Sequence[int], axis_time: TimeAxis, drawn: DrawnColumns
 ) -> Any:
     names = [_short(model.state_names[i]) for i in chosen]
     label = _length(names, 0)
@@ -698,7 +542,7 @@ def _mark(axis: Any, t: Array, values: Array, utilisation: Array, bottom: float,
     )  # fmt: skip
 
 
-def _shade(axis: Any, drawn: _Drawn) -> None:
+def _shade(axis: Any, drawn: DrawnColumns) -> None:
     silent = ~drawn.judged | drawn.after
     silent[:1] = False
     low, length = (drawn.edges[0, 0], drawn.edges[-1, 1] - drawn.edges[0, 0]) if len(drawn.t) else (0.0, 1.0)
@@ -721,7 +565,7 @@ def _shade(axis: Any, drawn: _Drawn) -> None:
     axis.set_xlim(low - 0.01 * length, low + 1.01 * length)
 
 
-def _title(axis: Any, model: UncertainLTI, i: int, verdicts: Verdicts, drawn: _Drawn, unit: bool = True) -> None:
+def _title(axis: Any, model: UncertainLTI, i: int, verdicts: Verdicts, drawn: DrawnColumns, unit: bool = True) -> None:
     signal = model.signals.states[i]
     first = int(drawn.starts[0]) if len(drawn.starts) else 0
     bad = int((verdicts.flags[first : drawn.stop, i] == 1.0).sum())
@@ -750,7 +594,7 @@ def _ticks(axis: Any) -> None:
 
 
 def _finish_time(
-    figure: Any, axes: Sequence[Any], axis_time: _Time, drawn: _Drawn, event: tuple[float, str] | None
+    figure: Any, axes: Sequence[Any], axis_time: TimeAxis, drawn: DrawnColumns, event: tuple[float, str] | None
 ) -> None:
     for axis in axes:
         if axis.get_xlabel():
@@ -826,8 +670,5 @@ def _plain(text: str) -> str:
 
 
 def _short(text: str, longest: int = _LONGEST_NAME) -> str:
-    """A name with its middle left out where it is long."""
-    text = " ".join(text.split())
-    if len(text) > longest:
-        text = f"{text[: longest // 2]}…{text[len(text) - longest // 2 + 1 :]}"
-    return text.replace("$", r"\$")
+    """A name of a file, with its middle left out where it is long."""
+    return _plain(shortened(" ".join(text.split()), longest))

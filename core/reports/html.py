@@ -17,14 +17,14 @@ from typing import Any
 from PIL import Image  # which matplotlib brings
 
 from uncertain_lti.base.english import plural, shortlist
-from uncertain_lti.base.errors import BagError, ModelError
-from uncertain_lti.base.files import whole_file
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.recording import Progress
 from uncertain_lti.reports import figures as plots
-from uncertain_lti.reports.findings import APART, CARE, NO, UNKNOWN, WEIGHTS, YES, shortened
-from uncertain_lti.reports.text import beyond, number
+from uncertain_lti.reports.findings import APART
+from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, WEIGHTS, YES
+from uncertain_lti.reports.tables import beyond, number, shortened
 
 MOST_DRAWN = 8
 """Recordings with figures of their own; those with most violations."""
@@ -107,28 +107,6 @@ def html_report(
         + "\n".join(parts)
         + f'\n<p class="soft">Written by uncertain-lti {_text(facts["version"])}.</p>\n</body>\n</html>\n'
     )
-
-
-def write_page(path: str | os.PathLike[str], page: str) -> None:
-    """Write a page, whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-    page : str
-        Its text; what UTF-8 cannot hold is replaced.
-
-    Raises
-    ------
-    BagError
-        The file cannot be written.
-    """
-    try:
-        with whole_file(path) as stream:
-            stream.write(page.encode("utf-8", "replace"))
-    except OSError as error:
-        raise BagError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
 # --- sections ---------------------------------------------------------------------------------------------------

@@ -1,0 +1,108 @@
+"""Facts of a check as plain data."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.sampling.reading import unused
+from uncertain_lti.sampling.transient import Transient
+
+
+def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) -> dict[str, Any]:
+    """Result of a check as plain data.
+
+    Counts, the first and the longest violation of each state, the spans in which the alarm was raised, widths beside
+    coverage; with samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no
+    verdict).
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model checked with.
+    verdicts : Verdicts
+        Of `EnvelopeMonitor.check`.
+    samples : bool, default True
+        Whether a verdict per sample is among it.
+
+    Returns
+    -------
+    dict
+        Plain data for JSON.
+    """
+    transient = verdicts.transient
+    t = transient.t_ns
+    judged = int(verdicts.judged.sum())
+    width = np.where(verdicts.judged[:, None], verdicts.upper - verdicts.lower, np.nan)
+    states = {}
+    for i, name in enumerate(model.state_names):
+        flags = verdicts.flags[:, i]
+        bad = flags == 1.0
+        runs = _runs(bad)
+        longest = max(runs, key=lambda run: (run[1] - run[0], -run[0]), default=None)
+        states[name] = {
+            "violations": int(bad.sum()),
+            "inside": None if not judged else 1.0 - int(bad.sum()) / judged,
+            "first_violation": _instant(transient, runs[0][0]) if runs else None,
+            "longest_violation": None
+            if longest is None
+            else {**_instant(transient, longest[0]), "samples": longest[1] - longest[0], **_length(t, longest)},
+            "mean_width": float(np.nanmean(width[:, i])) if judged else None,
+            "max_width": float(np.nanmax(width[:, i])) if judged else None,
+            "unit": model.signals.states[i].unit,
+        }
+    alarms = _runs(verdicts.alarm)
+    data: dict[str, Any] = {
+        "recording": transient.name,
+        "samples": len(transient),
+        "verdicts": judged,
+        "no_verdict": unused(transient),
+        "violated": int(verdicts.violated.sum()),
+        "inside": None if not judged else 1.0 - int(verdicts.violated.sum()) / judged,
+        "outside_domain": int(verdicts.outside_domain.sum()),
+        "states": states,
+        "alarm": bool(alarms),
+        "alarms": [{**_instant(transient, start), **_length(t, (start, stop))} for start, stop in alarms],
+    }
+    if samples:
+        data["verdict_per_sample"] = [
+            {
+                "t_ns": int(t[k]),
+                "status": status.value,
+                "flags": _list(verdicts.flags[k]),
+                "lower": _list(verdicts.lower[k]),
+                "upper": _list(verdicts.upper[k]),
+                "state": _list(transient.x[k]),
+                "utilisation": _list(verdicts.utilisation[k]),
+                "outside_domain": bool(verdicts.outside_domain[k]),
+                "alarm": bool(verdicts.alarm[k]),
+            }
+            for k, status in enumerate(transient.statuses())
+        ]
+    return data
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """[start, stop) of every run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _instant(transient: Transient, k: int) -> dict[str, Any]:
+    """Sample k: its time since the first sample, s, and its stamp, ns."""
+    return {"k": k, "t": float(transient.t[k]), "t_ns": int(transient.t_ns[k])}
+
+
+def _length(t_ns: NDArray[np.int64], run: tuple[int, int]) -> dict[str, float]:
+    """From the first to the last sample of a run, s."""
+    return {"seconds": float(t_ns[run[1] - 1] - t_ns[run[0]]) * 1e-9}
+
+
+def _list(row: Array) -> list[float | None]:
+    return [v if math.isfinite(v) else None for v in row.tolist()]

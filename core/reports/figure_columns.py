@@ -1,0 +1,235 @@
+"""Long recordings drawn by pixel: what of them each column of a figure shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array, Mask
+from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.sampling.transient import Transient
+
+PIXELS = 1200
+"""Stretches of time that a longer recording is drawn in."""
+
+
+class TimeAxis:
+    """Time axis of a recording: s since the first sample; the passes of a looped one follow each other.
+
+    Parameters
+    ----------
+    transient : Transient
+        The recording.
+    """
+
+    def __init__(self, transient: Transient) -> None:
+        t = transient.t
+        steps = np.diff(t)
+        self.loops = int((steps < 0).sum())
+        if self.loops:
+            forward = steps[steps > 0]
+            steps[steps < 0] = float(np.median(forward)) if len(forward) else 1.0
+            t = np.concatenate([[0.0], np.cumsum(steps)])
+        self.t: Array = t
+
+    @property
+    def label(self) -> str:
+        """Label of the axis, which says when passes were put one behind the other."""
+        return "time [s]" + (f", {self.loops + 1} passes one behind the other" if self.loops else "")
+
+
+@dataclass(frozen=True)
+class DrawnColumns:
+    """What of a recording is drawn: its samples, or stretches of time with all of their samples.
+
+    Parameters
+    ----------
+    t : array (P,)
+        Where each is drawn, s.
+    starts : array (P,) of int
+        First sample of each.
+    stop : int
+        End of the last one.
+    binned : bool
+        Whether they are stretches of time, not samples.
+    judged, alarm : array (P,) of bool
+        Whether any of its samples has a verdict, and an alarm.
+    after : array (P,) of bool
+        Whether something lies between it and the one before.
+    edges : array (P, 2)
+        Begin and end of each, s.
+    """
+
+    t: Array
+    starts: NDArray[np.intp]
+    stop: int
+    binned: bool
+    judged: Mask
+    alarm: Mask
+    after: Mask
+    edges: Array
+
+    @classmethod
+    def of(cls, verdicts: Verdicts, t: Array, span: tuple[float, float] | None, always: bool = False) -> DrawnColumns:
+        """Choose what is drawn of a recording.
+
+        Parameters
+        ----------
+        verdicts : Verdicts
+            The recording with its verdicts.
+        t : array (samples,)
+            Times, s, of its `TimeAxis`.
+        span : (float, float) or None
+            Begin and end of the part that is drawn, s; None for all of it.
+        always : bool, default False
+            Draw stretches of time even if every sample has room.
+
+        Returns
+        -------
+        DrawnColumns
+            Samples, or at most `PIXELS` stretches.
+        """
+        first, stop = 0, len(t)
+        if span is not None:
+            first, stop = int(np.searchsorted(t, span[0])), int(np.searchsorted(t, span[1], side="right"))
+        here = t[first:stop]
+        count = len(here)
+        broken = np.zeros(count, dtype=bool)
+        broken[1:] = np.diff(verdicts.transient.segment[first:stop]) != 0
+        if count <= 2 * PIXELS and not always:
+            starts = np.arange(first, stop)
+            before = np.concatenate([here[:1], here[:-1]])
+            judged, alarm = verdicts.judged[first:stop], verdicts.alarm[first:stop]
+            return cls(here, starts, stop, False, judged, alarm, broken, np.column_stack([before, here]))
+        low, high = (float(here[0]), float(here[-1])) if count else (0.0, 1.0)
+        cells = np.linspace(low, high if high > low else low + 1.0, min(PIXELS, max(count, 1)) + 1)
+        places = np.searchsorted(here, cells[:-1])
+        ends = np.append(places[1:], count)
+        filled = np.flatnonzero(ends > places)
+        starts = (places[filled] + first).astype(np.intp)
+        any_of = [np.logical_or.reduceat(a[:stop], starts) for a in (verdicts.judged, verdicts.alarm)]
+        centre = (cells[filled] + cells[filled + 1]) / 2
+        after = np.zeros(len(filled), dtype=bool)
+        after[1:] = np.diff(filled) > 1
+        return cls(
+            centre, starts, stop, True, any_of[0], any_of[1], after, np.column_stack([cells[filled], cells[filled + 1]])
+        )
+
+    def least(self, values: Array) -> Array:
+        """Least value of each.
+
+        Parameters
+        ----------
+        values : array (samples,)
+            One value per sample of the recording.
+
+        Returns
+        -------
+        array (P,)
+            NaN only if there is no other value.
+        """
+        return self._reduced(np.fmin, values)
+
+    def greatest(self, values: Array) -> Array:
+        """Greatest value of each.
+
+        Parameters
+        ----------
+        values : array (samples,)
+            One value per sample of the recording.
+
+        Returns
+        -------
+        array (P,)
+            NaN only if there is no other value.
+        """
+        return self._reduced(np.fmax, values)
+
+    def _reduced(self, which: np.ufunc, values: Array) -> Array:
+        if not self.binned:
+            return values[self.starts]
+        reduced: Array = which.reduceat(np.ascontiguousarray(values[: self.stop]), self.starts)
+        return reduced
+
+    def worst(self, verdicts: Verdicts, state: int, values: Array) -> tuple[Array, Array, Array]:
+        """The worst sample of each in which a state is violated.
+
+        Parameters
+        ----------
+        verdicts : Verdicts
+            The recording with its verdicts.
+        state : int
+            Position of the state.
+        values : array (samples,)
+            The state.
+
+        Returns
+        -------
+        t : array (v,)
+            Where each is drawn, s.
+        values : array (v,)
+            Value of the worst sample.
+        utilisation : array (v,)
+            Its utilisation.
+        """
+        flags, utilisation = verdicts.flags[:, state], verdicts.utilisation[:, state]
+        bad = np.flatnonzero(self.greatest(flags) == 1.0)
+        if not self.binned:
+            rows = self.starts[bad]
+        else:
+            ends = np.append(self.starts[1:], self.stop)
+            rows = np.array([_worst_row(flags, utilisation, self.starts[b], ends[b]) for b in bad], dtype=np.intp)
+        return self.t[bad], values[rows], utilisation[rows]
+
+    def broken(self, *values: Array) -> list[Array]:
+        """Times and values with NaN wherever something lies between.
+
+        Parameters
+        ----------
+        *values : array (P,)
+            What is drawn over the times.
+
+        Returns
+        -------
+        list of array
+            Times, then the values, each with the same NaN inserted.
+        """
+        at = np.flatnonzero(self.after)
+        return [np.insert(array, at, np.nan) for array in (self.t, *values)]
+
+    def alarms(self) -> list[tuple[float, float]]:
+        """Each stretch of alarm, from the verdict that raised it to the one that ended it.
+
+        Returns
+        -------
+        list of (float, float)
+            Begin and length, s.
+        """
+        if self.binned:
+            return self.spans(self.alarm)
+        runs = np.flatnonzero(np.diff(np.concatenate([[False], self.alarm, [False]]).astype(np.int8))).reshape(-1, 2)
+        return [(float(self.t[a]), float(self.t[min(b, len(self.t) - 1)] - self.t[a])) for a, b in runs]
+
+    def spans(self, which: Mask) -> list[tuple[float, float]]:
+        """Each run of what is marked.
+
+        Parameters
+        ----------
+        which : array (P,) of bool
+            What is marked.
+
+        Returns
+        -------
+        list of (float, float)
+            Begin and length, s.
+        """
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8))).reshape(-1, 2)
+        return [(float(self.edges[a, 0]), float(self.edges[b - 1, 1] - self.edges[a, 0])) for a, b in edges]
+
+
+def _worst_row(flags: Array, utilisation: Array, start: int, stop: int) -> int:
+    """The violated sample that lies farthest out."""
+    rows = np.flatnonzero(flags[start:stop] == 1.0) + start
+    return int(rows[np.argmax(np.abs(utilisation[rows]))])

@@ -1,0 +1,173 @@
+"""What `fit` prints: recordings, the model found, and what to look at next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.identification.diagnosis import remedies
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.reports.model_text import eigenvalues_text
+from uncertain_lti.reports.tables import number, table
+from uncertain_lti.sampling.reading import unused
+from uncertain_lti.sampling.transient import Transient
+
+
+def recording_text(transient: Transient) -> str:
+    """One recording: what was read, and what of it is not used.
+
+    Parameters
+    ----------
+    transient : Transient
+        The recording.
+
+    Returns
+    -------
+    str
+        One line.
+    """
+    usable = int(transient.usable.sum())
+    span = float(np.ptp(transient.t_ns)) * 1e-9 if len(transient) else 0.0
+    text = (
+        f"{transient.name}: {plural(len(transient), 'sample')} over {span:.4g} s, {plural(usable, 'usable transition')}"
+    )
+    left = unused(transient)
+    return f"{text} ({', '.join(left)})" if left else text
+
+
+def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
+    """Summary of a fit: widths beside what the states do, and what the user should know.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit`.
+    transients : sequence of Transient
+        What it was fitted to.
+
+    Returns
+    -------
+    str
+        A table in recorded units, and the notes of the fit.
+    """
+    facts = model.fit_summary
+    criterion = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}[facts["criterion"]]
+    steps = [t.transitions() for t in transients]
+    moves = np.vstack([s.x_next - s.x for s in steps])
+    states = np.vstack([s.x for s in steps])
+    rms, span = np.sqrt(np.mean(moves**2, axis=0)), np.ptp(states, axis=0)
+    rows = []
+    for i, signal in enumerate(model.signals.states):
+        rows.append(
+            [
+                signal.name + (f" [{signal.unit}]" if signal.unit else ""),
+                number(facts["mean_width_recorded"][i]),
+                number(facts["max_width_recorded"][i]),
+                number(rms[i]),
+                number(span[i]),
+                f"{facts['mean_width_recorded'][i] / span[i]:.2%}" if span[i] > 0 else "-",
+            ]
+        )
+    lines = [
+        f"criterion {criterion}; additive: {facts['additive']}; {plural(facts['transitions'], 'transition')}, "
+        f"{facts['violations']} outside, gap to the optimum {facts['gap']:.1e}",
+        table(("one-step envelope", "mean width", "largest", "rms step", "range", "width/range"), rows),
+        f"eigenvalues of A [1/s]: {eigenvalues_text(model)}",
+    ]
+    if "discarded" in facts:
+        gone, before = facts["discarded"], facts["with_discarded"]["mean_width_recorded"]
+        lines.append(
+            f"discarded {plural(len(gone), 'transition')} (mean width with them: {', '.join(map(number, before))}): "
+            + ", ".join(f"{d['file']} t = {d['t']:.4f} s" for d in gone[:20])
+            + (f" and {len(gone) - 20} more (in the model file)" if len(gone) > 20 else "")
+        )
+    return "\n".join(lines + [f"note: {message}" for message in facts["messages"]])
+
+
+def archive_text(model: UncertainLTI) -> str:
+    """Summary of a fit whose transitions were not all in memory.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit_archive`.
+
+    Returns
+    -------
+    str
+        A table in recorded units.
+    """
+    facts = model.fit_summary
+    rows = [
+        [s.name + (f" [{s.unit}]" if s.unit else ""), number(a), number(b)]
+        for s, a, b in zip(model.signals.states, facts["mean_width_recorded"], facts["max_width_recorded"], strict=True)
+    ]
+    return "\n".join(
+        [
+            f"criterion {facts['criterion']}; additive: {facts['additive']}; "
+            f"{plural(facts['transients'], 'recording')}, "
+            f"{plural(facts['transitions'], 'transition')}, {facts['violations']} outside, gap {facts['gap']:.1e}, "
+            f"{plural(facts['solver']['passes'], 'pass')}",
+            table(("one-step envelope", "mean width", "largest"), rows),
+            f"eigenvalues of A [1/s]: {eigenvalues_text(model)}",
+        ]
+    )
+
+
+WIDE = 0.3
+"""Mean width, as a share of the state's range, from which on an envelope says little."""
+
+
+def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -> str:
+    """What to look at after a fit: the worry that weighs most, and the commands that tell more.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit`.
+    file : str
+        Its file, as it would be typed.
+    left_out : dict or None
+        What `leave_out_with_fit` returned.
+
+    Returns
+    -------
+    str
+        Lines.
+    """
+    facts = model.fit_summary
+    span = model.domain.x_max - model.domain.x_min
+    share = np.asarray(facts["mean_width"]) / np.where(span > 0, span, np.inf)
+    widest = int(np.argmax(share))
+    inside = None if left_out is None else left_out.get("inside")
+    if share[widest] > WIDE:
+        worry = (
+            f"the bounds of '{model.state_names[widest]}' are {share[widest]:.0%} as wide as its range, so only gross "
+            f"faults would be seen: "
+        )
+        worry += (
+            remedies(facts.get("messages", []), facts["additive"], model.state_names[widest])
+            or "what moves it may be missing among the controls"
+        )
+    elif inside is not None and inside < 0.99:
+        worry = (
+            f"{1 - inside:.1%} of what was left out falls outside, so expect false alarms; record more of what the "
+            f"machine will do, or let validate --false-alarms find an alarm rule that stays quiet"
+        )
+    elif facts.get("messages"):
+        worry = facts["messages"][0]
+    elif facts["transients"] == 1:
+        worry = "one recording says nothing of another day; check the model on one that was not fitted"
+    else:
+        worry = ""
+    lines = [f"look first at: {worry}"] if worry else []
+    rows = [
+        (f"uncertain-lti check {file} BAG", "is a recording that was not fitted inside?"),
+        (f"uncertain-lti validate {file}", "how far to trust it; an alarm rule for a rate of false alarms"),
+        (f"uncertain-lti report {file} BAG", "may I rely on it, and what happened? a page with figures"),
+    ]
+    width = max(len(command) for command, _ in rows)
+    return "\n".join([*lines, "next:", *(f"  {command.ljust(width)}  {text}" for command, text in rows)])

@@ -1,0 +1,61 @@
+"""Plain data as JSON holds it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def numbers_of(value: Any, count: int) -> list[float] | None:
+    """Read numbers from a model file, in which anything may be written.
+
+    Parameters
+    ----------
+    value : object
+        What the file holds.
+    count : int
+        How many numbers are wanted.
+
+    Returns
+    -------
+    list of float or None
+        None if the value is not that.
+    """
+    good = isinstance(value, (list, tuple)) and len(value) == count and all(isinstance(v, (int, float)) for v in value)
+    return [float(v) for v in value] if good else None
+
+
+def list_of(value: Any) -> list[Any]:
+    """Read a list from a model file, in which anything may be written.
+
+    Parameters
+    ----------
+    value : object
+        What the file holds.
+
+    Returns
+    -------
+    list
+        Empty if the value is no list.
+    """
+    return list(value) if isinstance(value, (list, tuple)) else []
+
+
+def finite_data(value: Any) -> Any:
+    """Replace numbers that JSON has no text for.
+
+    Parameters
+    ----------
+    value : object
+        Plain data.
+
+    Returns
+    -------
+    object
+        The same with None for NaN and infinity.
+    """
+    if isinstance(value, dict):
+        return {key: finite_data(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite_data(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,87 @@
+"""Tables, numbers and names as a person reads them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Columns aligned with spaces; the first to the left, the others to the right.
+
+    Parameters
+    ----------
+    header : sequence of str
+        Names of the columns.
+    rows : iterable of sequence of str
+        Cells of each row, as many as `header` has.
+
+    Returns
+    -------
+    str
+        Lines, each indented by two spaces.
+    """
+    lines = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    return "\n".join(
+        "  "
+        + "  ".join(
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def number(value: float | None) -> str:
+    """Four digits, or a dash for nothing.
+
+    Parameters
+    ----------
+    value : float or None
+        The number; None or NaN for nothing.
+
+    Returns
+    -------
+    str
+        Four significant digits, or a dash.
+    """
+    return "-" if value is None or math.isnan(value) else f"{value:.4g}"
+
+
+def beyond(utilisation: float) -> str:
+    """A violated utilisation with as many digits as show that it is beyond -1 or 1.
+
+    Parameters
+    ----------
+    utilisation : float
+        Utilisation of a violated verdict, over 1 in magnitude.
+
+    Returns
+    -------
+    str
+        Three to nine digits, or `just beyond 1`.
+    """
+    for digits in range(3, 10):
+        text = f"{utilisation:.{digits}g}"
+        if abs(float(text)) > 1.0:
+            return text
+    return f"just beyond {math.copysign(1.0, utilisation):.0f}"
+
+
+def shortened(name: str, longest: int = 40) -> str:
+    """A name for a sentence, with its middle left out where it is long.
+
+    Parameters
+    ----------
+    name : str
+        Any name.
+    longest : int, default 40
+        Its length at most, in characters.
+
+    Returns
+    -------
+    str
+        The name, with an ellipsis where its middle is left out.
+    """
+    return name if len(name) <= longest else f"{name[: longest // 2]}…{name[len(name) - longest // 2 + 1 :]}"

@@ -1,0 +1,133 @@
+"""What `validate` prints, and `fit` of what it left out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.reports.tables import number, table
+
+
+def validation_text(data: dict[str, Any]) -> str:
+    """Summary of `Validation.to_dict()`, with the calibration if there is one, for a person.
+
+    Parameters
+    ----------
+    data : dict
+        Of `Validation.to_dict`; with the key `calibration` if there is one.
+
+    Returns
+    -------
+    str
+        Tables, intervals and notes.
+    """
+    what = "recording" if data["kind"] == "transients" else "block"
+    gap = f", {number(data['gap'])} s on both sides not fitted either" if data["kind"] == "blocks" else ""
+    condition = data.get("condition_short")  # files written before it was stored have none
+    under = f", {condition}" if condition else ""
+    lines = [
+        f"left out one {_unit(data)} at a time ({_how_many(data)}{gap}): {plural(data['verdicts'], 'verdict')}, "
+        f"{number(data['hours'])} h",
+        table(
+            ("left out", "inside", f"{what}s inside", "mean width", "largest", "fitted: mean width", "largest"),
+            [
+                [
+                    name + (f" [{s['unit']}]" if s["unit"] else ""),
+                    "-" if s["inside"] is None else f"{s['inside']:.3%}",
+                    f"{s['parts_inside']}/{data['parts']}",
+                    number(s["mean_width_left_out"]),
+                    number(s["max_width_left_out"]),
+                    number(s["mean_width_full"]),
+                    number(s["max_width_full"]),
+                ]
+                for name, s in data["states"].items()
+            ],
+        ),
+    ]
+    if data["inside"] is not None:
+        percent = f"{data['confidence']:.0%}"
+        low, high = data["inside_interval"]
+        lines.append(
+            f"inside all bounds: {data['inside']:.3%} of the verdicts "
+            f"({percent} interval {low:.3%} to {high:.3%}{under})"
+        )
+        low, high = data["parts_inside_interval"]
+        lines.append(
+            f"whole {what}s inside all bounds: {data['parts_inside']} of {data['parts']} "
+            f"({percent} interval {low:.1%} to {high:.1%}{under})"
+        )
+        if groups := data.get("groups"):
+            lines.append(f"whole groups inside all bounds: {groups['inside']} of {groups['count']}")
+        lines.append(
+            table(
+                ("alarm rule", "alarms", "per hour", f"{percent} interval{under}", "time in alarm"),
+                [
+                    [
+                        f"{a['violations']} of {a['window']}, margin {number(a['margin'])}",
+                        str(a["alarms"]),
+                        number(a["per_hour"]),
+                        _interval(*a["interval"]),
+                        f"{a['raised_share']:.3%}",
+                    ]
+                    for a in data["false_alarms"]
+                ],
+            )
+        )
+    if "condition" in data:
+        lines.append(data["condition"])
+    lines.append(data["scenario"]["words"])
+    if "calibration" in data:
+        lines.append(data["calibration"]["words"])
+        if warning := data["calibration"].get("warning"):  # files written before it was stored have none
+            lines.append(f"warning: {warning}")
+    return "\n".join(lines + [f"note: {note}" for note in data["notes"]])
+
+
+def left_out_text(data: dict[str, Any]) -> str:
+    """Short form of `validation_text`, one line, for a fit, with the hint that recordings may come in groups.
+
+    Parameters
+    ----------
+    data : dict
+        Of `leave_out_with_fit`.
+
+    Returns
+    -------
+    str
+        One or two lines.
+    """
+    if "not_done" in data:
+        return f"not validated, so how it does on other recordings is unknown: {data['not_done']}"
+    what = "recording" if data["kind"] == "transients" else "block"
+    ratio = max((s["left_out_to_full"] for s in data["states"].values()), default=math.nan)
+    alarm = data["false_alarms"][0]
+    inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} of the verdicts inside"
+    groups = data["groups"]
+    of = f"{groups['count']} at a time ({_how_many(data)})" if groups else f"{data['parts']} at a time"
+    line = (
+        f"left out one {_unit(data)} of {of}: {inside}, "
+        f"{plural(data['parts_inside'], f'whole {what}')}, widths at most {ratio:.3g} times those above; "
+        f"{number(alarm['per_hour'])} false alarms per hour ({_interval(*alarm['interval'])} "
+        f"{data['condition_short']}) at {alarm['violations']} of {alarm['window']}; more: uncertain-lti validate"
+    )
+    return f"{line}\nnote: {data['hint']}" if data["hint"] else line
+
+
+def _unit(data: dict[str, Any]) -> str:
+    """What was left out at a time."""
+    return "group" if data.get("groups") else "recording" if data["kind"] == "transients" else "block"
+
+
+def _how_many(data: dict[str, Any]) -> str:
+    """How many there are of it."""
+    parts = plural(data["parts"], "recording" if data["kind"] == "transients" else "block")
+    groups = data.get("groups")
+    return f"{parts} in {plural(groups['count'], 'group')}, by {groups['key']}" if groups else parts
+
+
+def _interval(low: float, high: float | None) -> str:
+    """A lower limit that is next to nothing is nothing; no upper limit is said so."""
+    if high is None:
+        return "unknown"
+    return f"{number(low if low > 1e-4 * high else 0.0)} to {number(high)}"
