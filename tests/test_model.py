@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
+from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.uncertain_lti import FORMAT, UncertainLTI
@@ -296,8 +297,9 @@ def models(draw: st.DrawFn) -> UncertainLTI:
     model = random_model(rng, n, m, additive=draw(st.booleans()))
     name = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
     names = draw(st.lists(name, min_size=n + m, max_size=n + m, unique=True))
-    number = st.floats(allow_nan=False, allow_infinity=False)
-    positive = st.floats(1e-300, 1e300)
+    number = st.floats(-LARGEST, LARGEST)
+    positive = st.floats(1 / LARGEST, LARGEST)
+    seconds = st.floats(1e-300, LONGEST_S)
     given = [
         Signal(
             names[i],
@@ -316,9 +318,9 @@ def models(draw: st.DrawFn) -> UncertainLTI:
         tuple(given[:n]),
         tuple(given[n:]),
         clock="/x",
-        max_gap=draw(positive),
+        max_gap=draw(seconds),
         min_step=draw(st.floats(0, 1)),
-        max_skew=draw(st.none() | positive),
+        max_skew=draw(st.none() | seconds),
         time={"/x": "header"} | ({"/u": "log"} if m else {}),
     )
     sampling = Sampling(

@@ -5,6 +5,35 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 
+LONGEST = 2000
+"""Letters of a sentence as it is shown."""
+
+
+def printable(text: str, limit: int = LONGEST) -> str:
+    """A text that came from outside, for a terminal: one line, no control characters, not too long.
+
+    Parameters
+    ----------
+    text : str
+        Holds names out of files.
+    limit : int, default LONGEST
+        Letters that are shown; of a longer text the beginning and the end.
+
+    Returns
+    -------
+    str
+        Control characters and what is no letter at all are escaped, as `\\x1b`.
+    """
+    text = _shortened(text, limit)
+    if text.isprintable():
+        return text
+    return _shortened("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text), limit)
+
+
+def _shortened(text: str, limit: int) -> str:
+    tail = limit // 3
+    return text if len(text) <= limit else f"{text[: limit - tail - 5]} ... {text[-tail:]}"
+
 
 def plural(count: object, word: str) -> str:
     """A count and its noun: 1 state, 2 states, 0 states; 1 pass, 2 passes.

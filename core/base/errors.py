@@ -1,8 +1,18 @@
 """Errors meant for a person: one sentence that names the file, topic or field, and the remedy."""
 
+from __future__ import annotations
+
+from uncertain_lti.base.english import printable
+
 
 class UncertainLTIError(Exception):
-    """Base of every error raised on purpose; the command line prints it without a traceback."""
+    """Base of every error raised on purpose; the command line prints it without a traceback.
+
+    Names in it may come from any file, so its text is one line without control characters.
+    """
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class BagError(UncertainLTIError):

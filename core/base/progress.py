@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import sys
@@ -10,8 +11,11 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, TextIO
 
+from uncertain_lti.base.english import printable
+
 _DELAY = 0.4  # s; what is done sooner shows no bar
 _REDRAW = 0.1  # s
+_LONGEST_LINE = 20_000  # letters of a result
 _COUNTED = re.compile(r"\b(\d+) of (\d+)\b")
 
 
@@ -33,7 +37,7 @@ class Progress:
 
     def __init__(self, quiet: bool = False, verbose: bool = False, stream: TextIO | None = None) -> None:
         self.quiet, self.verbose = quiet, verbose
-        self._stream = sys.stderr if stream is None else stream
+        self._stream = stream or sys.stderr or io.StringIO()  # a process may have none
         self._began = time.perf_counter()
         self._bars: list[Any] = []
 
@@ -59,7 +63,7 @@ class Progress:
             The remark, without `note:`.
         """
         if not self.quiet:
-            self._write(f"note: {text}")
+            self._write(f"note: {printable(text)}")
 
     def say(self, text: str) -> None:
         """Part of the result, on standard output, unless quiet; a bar stays below it.
@@ -74,9 +78,9 @@ class Progress:
         if any(not bar.disable for bar in self._bars):
             from tqdm import tqdm
 
-            tqdm.write(text, file=sys.stdout)
+            tqdm.write(_lines(text), file=sys.stdout)
         else:
-            print(text)
+            print(_lines(text))
 
     def detail(self, text: str) -> None:
         """A line for who asked to see the work.
@@ -87,7 +91,7 @@ class Progress:
             The line, without its time.
         """
         if self.verbose:
-            self._write(f"{time.perf_counter() - self._began:8.2f} s  {text}")
+            self._write(f"{time.perf_counter() - self._began:8.2f} s  {printable(text)}")
 
     def iterate(self, what: str, unit: str = "messages") -> Callable[[Iterable[object], int], Iterable[object]] | None:
         """Wrapper (iterable, total) -> iterable that shows how far it has come; None where nobody would see it.
@@ -146,7 +150,8 @@ class Progress:
                 if counted := _COUNTED.search(text):
                     bar.bar_format = "{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
                     bar.n, bar.total = int(counted[1]) - 1, int(counted[2])
-                bar.set_description_str(f"{what}: {text if len(text) <= 50 else f'{text[:47]}...'}")
+                shown = printable(text)
+                bar.set_description_str(f"{what}: {shown if len(shown) <= 50 else f'{shown[:47]}...'}")
 
             yield step
         self.detail(f"{what}: done in {time.perf_counter() - began:.2f} s")
@@ -180,3 +185,7 @@ class Progress:
             tqdm.write(text, file=self._stream)
         else:
             print(text, file=self._stream, flush=True)
+
+
+def _lines(text: str) -> str:
+    return "\n".join(printable(line, _LONGEST_LINE) for line in text.split("\n"))

@@ -16,8 +16,12 @@ from uncertain_lti.base.errors import ModelError
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
 
-DONE, ALARM, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
-"""Exit statuses: 1 means that the alarm was raised, and nothing else."""
+DONE, ALARM, BAD_INPUT, FAULT, INTERRUPTED, NOT_READ = 0, 1, 2, 70, 130, 141
+"""Exit statuses: 1 means that the alarm was raised, and nothing else.
+
+70 is a fault of the program itself. 141, as shells have it, says that the reader of the output went away before it was
+known whether there is an alarm.
+"""
 
 SILENT = "print errors only (and with --json the data): no summary, no notes, no progress"
 GROUP = (

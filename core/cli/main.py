@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import re
 import sys
+import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NoReturn
 
 from uncertain_lti import __version__
+from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli import check, fit, info, init, layout, report, reproduce, ros, topics, validate
-from uncertain_lti.cli.command import BAD_INPUT, DONE, INTERRUPTED, Command
+from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command
 
 COMMANDS: tuple[Command, ...] = (
     topics.COMMAND,
@@ -52,32 +56,85 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 130 interrupted.
+        Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input (also a disk that is full or a folder that
+        cannot be written), 70 a fault of the program, 130 interrupted, 141 the reader of the output went away before
+        it was known whether there is an alarm.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     command = next((a for a in given if not a.startswith("-")), "")
+    for stream in (sys.stdout, sys.stderr):  # a name that the terminal has no letters for ends nothing
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        try:
+            return _run(command, given)
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # what cannot be written is found while it can still be said
+    except BrokenPipeError:  # `| head` has read enough
+        _drop_output()
+        return NOT_READ if command in ("check", "report") else DONE
+    except OSError as error:
+        _drop_output()
+        return _refuse(
+            command, f"the output cannot be written ({error.strerror or error}); make room, or send it elsewhere"
+        )
+
+
+def _run(command: str, given: Sequence[str]) -> int:
+    """Run one command; raises OSError where its output cannot be written."""
     try:
         options = build_parser(command).parse_args(given)
         with Progress(getattr(options, "quiet", False), getattr(options, "verbose", False)) as options.progress:
             return int(options.run(options))
     except UncertainLTIError as error:
-        print(f"uncertain-lti {command}: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return _refuse(command, str(error))
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
+            return _fault(command)
+        return _refuse(command, f"the Python package {error.name} is not installed; {extra}")
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        if error.filename is None:
             raise
-        print(
-            f"uncertain-lti {command}: the Python package {error.name} is not installed; {extra}",
-            file=sys.stderr,
+        return _refuse(
+            command, f"{error.filename}: {error.strerror or error}; check the path, its permissions and the disk"
         )
-        return BAD_INPUT
-    except BrokenPipeError:  # `| head` has read enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return DONE
+    except MemoryError:
+        return _refuse(command, "there is not enough memory for this; give fewer or shorter recordings at a time")
     except KeyboardInterrupt:
-        print(f"uncertain-lti {command}: interrupted; no half-written file is left", file=sys.stderr)
+        _complain(command, "interrupted; no half-written file is left")
         return INTERRUPTED
+    except Exception:
+        return _fault(command)
+
+
+def _complain(command: str, text: str) -> None:
+    with suppress(OSError, AttributeError):  # nobody listens
+        print(f"uncertain-lti {command}: {printable(text)}".replace(" :", ":"), file=sys.stderr, flush=True)
+
+
+def _refuse(command: str, text: str) -> int:
+    _complain(command, text)
+    return BAD_INPUT
+
+
+def _fault(command: str) -> int:
+    """Print the traceback of what nobody expected; its exit status is not that of an alarm."""
+    with suppress(OSError, AttributeError):
+        traceback.print_exc()
+    _complain(
+        command, "this is a fault of the program, not of what it was given; please report it with the lines above"
+    )
+    return FAULT
+
+
+def _drop_output() -> None:
+    """Let the end of the process find nothing that it cannot write."""
+    with suppress(OSError, AttributeError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def build_parser(chosen: str = "") -> argparse.ArgumentParser:
@@ -96,7 +153,8 @@ def build_parser(chosen: str = "") -> argparse.ArgumentParser:
     parser = _Parser(
         prog="uncertain-lti",
         description="Fit an uncertain linear model to recorded transients, and tell when a machine leaves it.",
-        epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 130 interrupted by Ctrl-C.",
+        epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 70 a fault of this program, "
+        "130 interrupted by Ctrl-C.",
     )
     parser.add_argument("--version", action="version", version=f"uncertain-lti {__version__}")
     parsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import argparse
 
+from uncertain_lti.base.english import printable
 from uncertain_lti.cli.command import DONE, Command, print_json, print_notes
+
+_LONGEST_NAME = 200  # letters
+_LONGEST_LIST = 100_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,13 +75,14 @@ def run(options: argparse.Namespace) -> int:
         stamps: str = f.stamps
         if f.stamp_offset is not None and abs(f.stamp_offset) > 1.0:
             stamps += f", log {f.stamp_offset:+.0f} s"
-        rows.append([f.info.topic, f.info.type, str(f.info.count), number(f.rate), number(f.largest_gap), stamps])
+        name, kind = printable(f.info.topic, _LONGEST_NAME), printable(f.info.type, _LONGEST_NAME)
+        rows.append([name, kind, str(f.info.count), number(f.rate), number(f.largest_gap), stamps])
     print(table(("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps"), rows))
     for f in facts:
         if not f.info.readable or f.info.reason:
-            print(f"{f.info.topic}: {f.info.reason}")
+            print(printable(f"{printable(f.info.topic, _LONGEST_NAME)}: {f.info.reason}"))
         if f.fields:
-            print(f"{f.info.topic}: {', '.join(f.fields)}")
+            print(printable(f"{printable(f.info.topic, _LONGEST_NAME)}: {', '.join(f.fields)}", _LONGEST_LIST))
     return DONE
 
 

@@ -23,7 +23,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.sampling.operating_point import OperatingPoint
-from uncertain_lti.sampling.reading import load_signals, sample
+from uncertain_lti.sampling.reading import load_signals, sample, time_source
 from uncertain_lti.sampling.sampler import resolve
 from uncertain_lti.sampling.streams import read_stream
 from uncertain_lti.signals.signal_map import SignalMap
@@ -232,8 +232,8 @@ def _resolve(surveys: Sequence[Survey], signals: SignalMap, recordings: Sequence
                 )
     time: dict[str, str] = {}
     for topic in signals.topics:
-        stamped = 2 * sum(s.stamped[topic] for s in surveys) > sum(s.counted[topic] for s in surveys)
-        time[topic] = signals.time.get(topic) or ("header" if stamped else "log")
+        stamped, counted = sum(s.stamped[topic] for s in surveys), sum(s.counted[topic] for s in surveys)
+        time[topic] = time_source(signals, topic, stamped, counted)
     instants = {
         topic: [(s.header if time[topic] == "header" else s.log)[topic] for s in surveys]
         for topic in dict.fromkeys(s.topic for s in signals.states)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import reprlib
 from dataclasses import dataclass
 
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.limits import LARGEST
 
 LONGEST_WINDOW = 1_000_000
 """Verdicts that the alarm looks at, at most."""
@@ -30,5 +30,7 @@ class AlarmRule:
                 f"alarm: violations is {reprlib.repr(self.violations)} of window {reprlib.repr(self.window)}; it takes "
                 f"whole numbers, 1 <= violations <= window <= {LONGEST_WINDOW}"
             )
-        if not (math.isfinite(self.margin) and self.margin > 0):
-            raise ModelError(f"alarm: margin is {self.margin}; it must be a positive number")
+        if not 1 / LARGEST <= self.margin <= LARGEST:
+            raise ModelError(
+                f"alarm: margin is {self.margin}; it must be a positive number, {1 / LARGEST:g} to {LARGEST:g}"
+            )

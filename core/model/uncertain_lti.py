@@ -19,6 +19,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
+from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.sampling.operating_point import OperatingPoint
@@ -558,7 +559,7 @@ class UncertainLTI:
             if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
                 raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
         if "margin" in alarm:
-            alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False)
+            alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
         return cls(
             *(data[name] for name in ("A", "B", "dA", "dB")),
             *(data.get(name) for name in ("c", "dc", "v")),
@@ -624,6 +625,8 @@ def _array(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_widt
         raise ModelError(f"field '{name}' has shape {array.shape}; it must be {shape}")
     if not np.isfinite(array).all():
         raise ModelError(f"field '{name}' holds a number that is not finite")
+    if (np.abs(array) > LARGEST).any():
+        raise ModelError(f"field '{name}' holds a number above {LARGEST:g}, which the arithmetic cannot carry")
     if half_width and (array < 0).any():
         raise ModelError(f"field '{name}' holds a negative half-width")
     return array
@@ -651,7 +654,7 @@ def _text(value: Any, name: str) -> str:
     return value
 
 
-def _positive(value: Any, name: str, zero: bool = False, null: bool = True) -> float | None:
+def _positive(value: Any, name: str, zero: bool = False, null: bool = True, most: float = LONGEST_S) -> float | None:
     """A number that is positive, or not negative where zero is allowed; None for null where that is."""
     if value is None and null:
         return None
@@ -659,8 +662,9 @@ def _positive(value: Any, name: str, zero: bool = False, null: bool = True) -> f
         number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
     except OverflowError:
         number = math.nan
-    if not (0.0 < number < math.inf or (zero and number == 0.0)):
-        raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number")
+    if not (0.0 < number <= most or (zero and number == 0.0)):
+        limit = "" if math.isnan(number) or number <= most else f", at most {most:g}"
+        raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number{limit}")
     return number
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 
-from uncertain_lti.base.english import shortlist
+from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.proposal.candidates import Candidate, Source
 from uncertain_lti.proposal.quantities import longest_hold
 from uncertain_lti.recordings.recording import Recording
+
+_LONGEST_LINE = 1 << 20  # letters
 
 
 def signals_file(
@@ -89,7 +92,7 @@ def signals_file(
     left_out = _left_out(sources, {id(c) for c in [*states, *controls]})
     if left_out:
         lines += ["", "# Not proposed, and why:", *left_out]
-    return "\n".join(lines) + "\n"
+    return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
 
 
 def _far(offsets: Sequence[float]) -> bool:
@@ -102,7 +105,7 @@ def _quoted(text: str) -> str:
     return (
         text
         if plain and re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_./-]*", text)
-        else '"' + re.sub(r'(["\\])', r"\\\1", text) + '"'
+        else json.dumps(text, ensure_ascii=not text.isprintable())
     )
 
 

@@ -50,15 +50,40 @@ def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, 
     sources: dict[str, str] = {}
     for position, name in enumerate(signals.topics):
         stamps = np.concatenate([s.stamp[s.topic == position] for s in streams])
-        stamped = stamps.size > 0 and 2 * np.count_nonzero(stamps >= 0) > stamps.size
-        said = signals.time.get(name)
-        if said == "header" and not (stamps >= 0).any():
-            raise SignalError(
-                f"{signals.source}: topics: {name}: time is header, and no message has a stamp; "
-                f"write log, or leave it out"
-            )
-        sources[name] = said or ("header" if stamped else "log")
+        sources[name] = time_source(signals, name, int(np.count_nonzero(stamps >= 0)), stamps.size)
     return sources
+
+
+def time_source(signals: SignalMap, topic: str, stamped: int, counted: int) -> str:
+    """What counts as the time of a topic's messages: what the map says, else the stamp where most messages carry one.
+
+    Parameters
+    ----------
+    signals : SignalMap
+        The map.
+    topic : str
+        Name of the topic.
+    stamped : int
+        Messages with a stamp, over all recordings.
+    counted : int
+        All messages.
+
+    Returns
+    -------
+    str
+        `header` or `log`.
+
+    Raises
+    ------
+    SignalError
+        The map says header and no message has a stamp.
+    """
+    chosen = signals.time.get(topic)
+    if chosen == "header" and not stamped:
+        raise SignalError(
+            f"{signals.source}: topics: {topic}: time is header, and no message has a stamp; write log, or leave it out"
+        )
+    return chosen or ("header" if 2 * stamped > counted else "log")
 
 
 def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Transient:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.limits import LONGEST_S
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -646,7 +647,7 @@ def resolve(
             f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
             f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
         )
-    max_gap = signals.max_gap if signals.max_gap is not None else 2.5 * step * 1e-9
+    max_gap = signals.max_gap if signals.max_gap is not None else min(2.5 * step * 1e-9, LONGEST_S)
     return replace(
         signals,
         clock=clock,

@@ -17,6 +17,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
+from uncertain_lti.base.limits import LONGEST_S
 from uncertain_lti.sampling.sampler import Status, median_step_ns, to_ns
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -116,14 +117,16 @@ class Transient:
         self.counters = Counter(counters or {})
         self.sources = tuple(os.fspath(s) for s in sources)
         self.notes = tuple(notes)
-        if max_gap is not None and not max_gap > 0:
-            raise TransientError(f"{name}: max_gap is {max_gap}; it must be a positive number of seconds")
-        if not 0 <= min_step < math.inf:
-            raise TransientError(f"{name}: min_step is {min_step}; it must be 0 s or more")
+        if max_gap is not None and not (0 < max_gap <= LONGEST_S or max_gap == math.inf):
+            raise TransientError(
+                f"{name}: max_gap is {max_gap}; it must be a positive number of seconds up to {LONGEST_S:g}, or inf"
+            )
+        if not 0 <= min_step <= LONGEST_S:
+            raise TransientError(f"{name}: min_step is {min_step}; it must be 0 s or more, up to {LONGEST_S:g}")
         min_step_ns = to_ns(min_step)
         median = median_step_ns([t_ns], min_step_ns)
         if max_gap is None:
-            max_gap = 2.5 * median * 1e-9 if median else math.inf
+            max_gap = min(2.5 * median * 1e-9, LONGEST_S) if median else math.inf
         self.max_gap, self.min_step = float(max_gap), float(min_step)
         kept, self.segment = _segments(t_ns, to_ns(self.max_gap), min_step_ns, self.counters)
         self.t_ns = t_ns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import reprlib
 from collections.abc import Iterator, Mapping
@@ -10,6 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti.signals.file_values import checked_mapping, checked_number, kind_in_yaml, load_yaml
@@ -135,13 +135,19 @@ class SignalMap:
                 FieldPath(signal.field)
             except SignalError as error:
                 raise SignalError(f"{where}: {error}") from None
-            if signal.scale != "auto" and not (math.isfinite(signal.scale) and signal.scale > 0):
-                raise SignalError(f"{where}: scale is {signal.scale}; it must be a positive number or auto")
-            if signal.steady != "auto" and not math.isfinite(signal.steady):
-                raise SignalError(f"{where}: steady is {signal.steady}; it must be a finite number or auto")
-            if signal.max_hold is not None and not 0 <= signal.max_hold < math.inf:
+            if signal.scale != "auto" and not 1 / LARGEST <= signal.scale <= LARGEST:
                 raise SignalError(
-                    f"{where}: max_hold is {signal.max_hold}; it must be 0 s or more, or left out for no limit"
+                    f"{where}: scale is {signal.scale}; it must be a positive number or auto, {1 / LARGEST:g} to "
+                    f"{LARGEST:g}"
+                )
+            if signal.steady != "auto" and not -LARGEST <= signal.steady <= LARGEST:
+                raise SignalError(
+                    f"{where}: steady is {signal.steady}; it must be a finite number or auto, up to {LARGEST:g}"
+                )
+            if signal.max_hold is not None and not 0 <= signal.max_hold <= LONGEST_S:
+                raise SignalError(
+                    f"{where}: max_hold is {signal.max_hold}; it must be 0 s or more, up to {LONGEST_S:g}, or left out "
+                    f"for no limit"
                 )
             if not 0 <= signal.delay <= LONGEST_DELAY:
                 raise SignalError(
@@ -168,10 +174,14 @@ class SignalMap:
                 )
         for name in ("max_gap", "max_skew"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise SignalError(f"{self.source}: {name} is {value}; it must be a positive number of seconds")
-        if not (math.isfinite(self.min_step) and self.min_step >= 0):
-            raise SignalError(f"{self.source}: min_step is {self.min_step}; it must be 0 s or more")
+            if value is not None and not 0 < value <= LONGEST_S:
+                raise SignalError(
+                    f"{self.source}: {name} is {value}; it must be a positive number of seconds, at most {LONGEST_S:g}"
+                )
+        if not 0 <= self.min_step <= LONGEST_S:
+            raise SignalError(
+                f"{self.source}: min_step is {self.min_step}; it must be 0 s or more, up to {LONGEST_S:g}"
+            )
 
     def __len__(self) -> int:
         return len(self.states) + len(self.controls)

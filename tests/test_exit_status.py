@@ -1,0 +1,286 @@
+"""Exit status 1 means that the alarm was raised and nothing else, whatever goes wrong."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_writer import Message, Topic, cdr, header, write
+from engine_bag import SIGNALS, engine_bag
+
+from uncertain_lti import Transient, UncertainLTI
+from uncertain_lti.base.english import printable
+from uncertain_lti.base.errors import BagError, ModelError, SignalError, TransientError
+from uncertain_lti.cli.main import COMMANDS, main
+from uncertain_lti.identification.archive import fit_archive
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.sampling.reading import read_transients
+from uncertain_lti.signals.signal_map import SignalMap
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("engine")
+    (folder / "signals.yaml").write_text(SIGNALS)
+    engine_bag(folder / "run.mcap")
+    assert main([*fit_of(folder), "--output", str(folder / "m.model.json"), "--additive", "noise"]) == 0
+    return folder
+
+
+def fit_of(folder, signals="signals.yaml"):
+    return ["fit", str(folder / "run.mcap"), "--signals", str(folder / signals)]
+
+
+def commands(folder):
+    """A command line of every kind that ends by itself and prints."""
+    model, bag = str(folder / "m.model.json"), str(folder / "run.mcap")
+    return {
+        "topics": ["topics", bag],
+        "init": ["init", bag],
+        "fit": [*fit_of(folder), "--output", str(folder / "other.model.json")],
+        "check": ["check", model, bag],
+        "check --json": ["check", model, bag, "--json"],
+        "report": ["report", model, bag, "--json"],
+        "validate": ["validate", model, bag],
+        "info": ["info", model],
+        "info --json": ["info", model, "--json"],
+        "help": ["--help"],
+        "help of check": ["check", "--help"],
+    }
+
+
+def run(arguments, **options):
+    program = "import sys; from uncertain_lti.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    return subprocess.run([sys.executable, "-c", program, *arguments], text=True, timeout=300, **options)
+
+
+@pytest.mark.parametrize("what", ["topics", "check", "check --json", "info --json", "init"])
+def test_output_that_cannot_be_written(folder, what):
+    with open("/dev/full", "w") as full:
+        done = run(commands(folder)[what], stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 2
+    assert "cannot be written" in done.stderr and "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+def test_nobody_reads_what_is_said(folder):
+    with open("/dev/full", "w") as full:
+        assert run(["check", "nothing.model.json", "nothing.mcap"], stdout=full, stderr=full).returncode == 2
+    for what in ("check", "topics"):
+        closed = (
+            f"{sys.executable} -c 'import sys; from uncertain_lti.cli.main import main; sys.exit(main(sys.argv[1:]))'"
+        )
+        line = " ".join([closed, *commands(folder)[what]])
+        done = subprocess.run(["sh", "-c", f"{line} >&- 2>&-"], timeout=300)
+        assert done.returncode in (0, 2), what
+
+
+def test_a_reader_that_goes_away_leaves_the_alarm_unknown(folder):
+    """What `check` would have found is not known to be no alarm."""
+    for what, status in (("check", 141), ("topics", 0)):
+        read, wrote = os.pipe()
+        os.close(read)
+        done = run(commands(folder)[what], stdout=wrote, stderr=subprocess.PIPE)
+        os.close(wrote)
+        assert done.returncode == status and done.stderr == "", what
+
+
+def test_a_name_that_the_terminal_has_no_letters_for(tmp_path):
+    name = os.fsdecode(b"caf\xe9 \xe2\x88\x86.mcap")
+    topic = Topic("/größe")
+    write([topic], [Message("/größe", k * 10**9, b"\0\1\0\0" + bytes(8)) for k in range(5)]).save(tmp_path / name)
+    done = run(["topics", str(tmp_path / name)], capture_output=True, env={**os.environ, "PYTHONIOENCODING": "ascii"})
+    assert done.returncode == 0 and "gr\\xf6" in done.stdout
+
+
+@pytest.mark.parametrize("what", ["fit", "check", "report", "layout", "init"])
+def test_a_folder_that_cannot_be_written(folder, tmp_path, what):
+    """Written to as nobody in particular, since root may write anywhere."""
+    target = "/proc/nowhere"
+    model, bag = str(folder / "m.model.json"), str(folder / "run.mcap")
+    line = {
+        "fit": [*fit_of(folder), "--output", f"{target}.model.json"],
+        "check": ["check", model, bag, "--write", f"{target}.mcap"],
+        "report": ["report", model, bag, "--output", f"{target}.html"],
+        "layout": ["layout", model, "--foxglove", f"{target}.json"],
+        "init": ["init", bag, "--output", f"{target}.yaml"],
+    }[what]
+    done = run(line, capture_output=True)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr and target in done.stderr.splitlines()[-1]
+
+
+def test_a_fault_of_the_program_is_no_alarm(folder, monkeypatch, capsys):
+    from uncertain_lti.cli import check
+
+    def broken(name):
+        raise KeyError("nobody expected this")
+
+    monkeypatch.setattr(check, "load_model", broken)
+    assert main(commands(folder)["check"]) == 70
+    said = capsys.readouterr().err
+    assert "Traceback" in said and "fault of the program" in said.splitlines()[-1]
+    monkeypatch.setattr(check, "load_model", lambda name: bytearray(1 << 62))
+    assert main(commands(folder)["check"]) == 2
+    assert "not enough memory" in capsys.readouterr().err
+
+
+LINES = {
+    "max_gap: 1e308": ("max_gap", "max_gap: 1e308"),
+    "max_gap: 1e10": ("max_gap", "max_gap: 1e10"),
+    "min_step: 1e308": ("min_step", "min_step: 1e308"),
+    "steady": ("steady", "steady: 1e308"),
+    "negative steady": ("steady", "steady: -1e200"),
+    "scale": ("scale", "scale: 1e-320"),
+    "large scale": ("scale", "scale: 1e300"),
+    "max_hold": ("max_hold", "max_hold: 1e308"),
+}
+
+
+def signals_with(line):
+    """SIGNALS with one line more: of the map, of the last state or of the last control."""
+    import yaml
+
+    data = yaml.safe_load(SIGNALS)
+    extra = yaml.safe_load(line.replace("e308", ".0e+308").replace("e-320", ".0e-320").replace("1e", "1.0e+"))
+    ((key, value),) = extra.items()
+    place = data if key in ("max_gap", "min_step") else data["controls" if key == "max_hold" else "states"][-1]
+    place[key] = value
+    return yaml.safe_dump(data)
+
+
+@pytest.mark.parametrize("what", LINES)
+def test_numbers_that_the_arithmetic_cannot_carry_in_a_signals_file(folder, capsys, what):
+    key, line = LINES[what]
+    (folder / "large.yaml").write_text(signals_with(line))
+    assert main([*fit_of(folder, "large.yaml"), "--output", str(folder / "large.model.json")]) == 2
+    said = capsys.readouterr().err
+    assert key in said and said.count("\n") == 1 and not (folder / "large.model.json").exists()
+
+
+CHANGES = {
+    "A": lambda d: d["A"][0].__setitem__(0, 1e300),
+    "dA": lambda d: d["dA"][0].__setitem__(0, 1e200),
+    "v": lambda d: d["v"].__setitem__(0, 1e200),
+    "max_gap": lambda d: d["sampling"].__setitem__("max_gap", 1e308),
+    "dt_median": lambda d: d["sampling"].__setitem__("dt_median", 1e300),
+    "min_step": lambda d: d["sampling"].__setitem__("min_step", 1e300),
+    "scale": lambda d: d["states"][0].__setitem__("scale", 1e-320),
+    "steady": lambda d: d["states"][0].__setitem__("steady", 1e308),
+    "margin": lambda d: d["alarm"].__setitem__("margin", 1e308),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_numbers_that_the_arithmetic_cannot_carry_in_a_model_file(folder, capsys, what):
+    data = json.loads((folder / "m.model.json").read_text())
+    CHANGES[what](data)
+    (folder / "large.model.json").write_text(json.dumps(data))
+    with pytest.raises(ModelError, match=what):
+        UncertainLTI.load(folder / "large.model.json")
+    assert main(["check", str(folder / "large.model.json"), str(folder / "run.mcap")]) == 2
+    (folder / "large.model.json").unlink()
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_numbers_that_the_arithmetic_cannot_carry_in_python():
+    t, x = np.arange(3.0), np.zeros((3, 1))
+    for options in ({"max_gap": 1e308}, {"min_step": 1e308}):
+        with pytest.raises(TransientError):
+            Transient(t, x, np.zeros((3, 0)), **options)
+    with pytest.raises(ModelError):
+        AlarmRule(1, 1, 1e308)
+    assert Transient(t, x, np.zeros((3, 0)), max_gap=np.inf).max_gap == np.inf
+
+
+def joint_states(tmp_path, stamp):
+    """A recording of 20 messages whose stamp says this."""
+    kind = "sensor_msgs/msg/JointState"
+    empty = np.empty(0)
+    messages = [
+        Message("/x", 10**18 + k * 10**7, cdr(kind, header=header(stamp(k)), name=["a"], position=np.array([k % 5.0]),
+                                              velocity=empty, effort=empty))
+        for k in range(20)
+    ]  # fmt: skip
+    return write([Topic("/x", kind)], messages).save(tmp_path / "x.mcap")
+
+
+def test_the_stamp_as_time_where_there_is_none_is_refused_alike(tmp_path):
+    path = joint_states(tmp_path, lambda k: 0)
+    signals = SignalMap.from_dict(
+        {"states": [{"name": "x", "topic": "/x", "field": "position[0]"}], "topics": {"/x": {"time": "header"}}}
+    )
+    with pytest.raises(SignalError) as one:
+        read_transients([path], signals)
+    with pytest.raises(SignalError) as other:
+        fit_archive([path], signals, additive="noise", cache=tmp_path / "cache")
+    assert str(one.value) == str(other.value) and "time is header" in str(one.value)
+
+
+NASTY = "/a\x1b[31m\x1b]0;title\x07\n\r\u202eb\x9b" + "n" * 100_000
+
+
+def test_names_do_not_reach_the_terminal_as_they_stand(tmp_path, capsys):
+    """Escape sequences, line breaks, bidirectional marks, and 100 KB of it."""
+    float64 = b"\0\1\0\0" + bytes(8)
+    topics = [
+        Topic(NASTY),
+        Topic("/b", "p/msg/B", schema="not a schema\n"),
+        Topic("/c" + NASTY, schema_encoding="\x1b[2J"),
+    ]
+    messages = [Message(t.name, k * 10**9, float64) for t in topics for k in range(3)]
+    path = str(write(topics, messages).save(tmp_path / "n.mcap"))
+    (tmp_path / "s.yaml").write_text('states: [{name: x, topic: "/nothing", field: data}]')
+    lines = {
+        ("topics", path): 0,
+        ("init", path): 2,
+        ("fit", path, "--signals", str(tmp_path / "s.yaml"), "--output", str(tmp_path / "m.model.json")): 2,
+        ("check", "leibov2006", path): 2,
+        ("check", str(tmp_path / NASTY[1:9]), path): 2,
+    }
+    for line, status in lines.items():
+        assert main(list(line)) == status
+        said = capsys.readouterr()
+        for text in (said.out, said.err):
+            assert all(c.isprintable() or c == "\n" for c in text), line
+            assert max(map(len, text.split("\n"))) < 10_000, line
+        assert said.err.count("\n") <= 5, line
+    with pytest.raises(BagError) as error:
+        list(Bag(path).messages(["/nothing"]))
+    assert len(str(error.value)) <= 2000 and "\n" not in str(error.value)
+
+
+def test_a_proposed_file_holds_names_as_text(tmp_path, capsys):
+    """A name with a line break ends neither a comment nor a text of the proposed file."""
+    import yaml
+
+    name = '/a\nclock: /evil # \x1b"'
+    values = np.sin(np.arange(300) / 7.0)
+    names = (name, "/b\n#")
+    bodies = [b"\0\1\0\0" + np.float64(3 * value).tobytes() for value in values]
+    messages = [Message(t, k * 10**7, body) for k, body in enumerate(bodies) for t in names]
+    path = write([Topic(t) for t in names], messages).save(tmp_path / "n.mcap")
+    status = main(["init", str(path)])
+    said = capsys.readouterr()
+    assert status in (0, 2)
+    if status == 0:
+        data = yaml.safe_load(said.out)
+        assert data["clock"] in names and {s["topic"] for s in data["states"]} <= set(names)
+
+
+def test_a_sentence_is_one_short_line():
+    assert printable("a\x1b\n\u202e\udc80\tb") == "a\\x1b\\n\\u202e\\udc80\\tb"
+    assert printable("größe ∆ ±") == "größe ∆ ±"
+    long = printable("begin" + "x" * 10**6 + "remedy")
+    assert len(long) == 2000 and long.startswith("begin") and long.endswith("remedy")
+
+
+def test_every_command_says_the_exit_statuses():
+    assert {c.name for c in COMMANDS} >= {"check", "report", "fit", "topics"}
+    page = (Path(__file__).resolve().parents[1] / "docs" / "reference" / "commands.md").read_text()
+    for status in ("0 done", "1 the alarm", "2 bad usage", "70", "130", "141"):
+        assert status in page
