@@ -44,6 +44,7 @@ extras = {
         "packaging",
         "pytest",
         "pytest-timeout",
+        "pytest-xdist",
         "setuptools",
     ],  # fmt: skip
     "dev": ["mypy", "ruff", "types-PyYAML"],

@@ -1,15 +1,77 @@
-"""Fixtures that several test files share."""
+"""Fixtures that several test files share, and what holds for every test: loopback only, no process left behind."""
 
+import itertools
+import os
+import signal
+import threading
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from processes import adopt_orphans, children, end_children
 
 # A busy machine is no bug.
 settings.register_profile("here", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("here")
 
+# No test is heard beyond this machine, whoever started it. The number of the domain is for each test to take.
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+for name in ("ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER"):
+    os.environ.pop(name, None)
+
+# A shell starts what is to run in its background with SIGINT ignored, and all that this starts would inherit it.
+if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+adopt_orphans()
+
 ROOT = Path(__file__).resolve().parents[1]
+
+
+# What another numpy can change: values, layouts, conversions and their refusals.
+_NUMPY = """
+    bag cdr_arrays course fuzz interchange journal live mcap_batches model monitor operating_point reading sampler
+    sampler_arrays signals transient
+""".split()
+
+
+# Their fixtures cost more than their tests: side by side each worker would make them again.
+_TOGETHER = "archive html_report progress reproduce turbofan validation".split()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    # Half of the workers run tests that wait for processes of ROS 2, while the others compute.
+    waiting = itertools.cycle(range(max(1, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) // 2)))
+    for item in items:
+        stem = item.path.stem.removeprefix("test_")
+        if stem in _NUMPY:
+            item.add_marker("numpy")
+        if "world" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.xdist_group(f"ros {next(waiting)}"))
+        elif stem in _TOGETHER:
+            item.add_marker(pytest.mark.xdist_group(stem))
+
+
+_FAILED = pytest.StashKey[bool]()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    if report.failed:
+        item.stash[_FAILED] = True
+    return report
+
+
+@pytest.fixture(autouse=True)
+def no_process_outlives_its_test(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Set up before the other fixtures of a test, and so torn down after them."""
+    before = children()
+    yield
+    failed = request.node.stash.get(_FAILED, False)
+    left = end_children(before, patience=0.0 if failed else 60.0)
+    assert failed or not left, f"the test left processes behind: {'; '.join(left)}"
 
 
 @pytest.fixture(scope="session")

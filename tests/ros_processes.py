@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -21,6 +19,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from processes import own_domain
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
@@ -43,24 +42,6 @@ except UncertainLTIError as error:
     sys.exit(f"uncertain-lti: {{error}}")
 """
 _NODES = "import sys; from uncertain_lti_ros.{0} import main; sys.exit(main())"
-
-
-@contextmanager
-def own_domain() -> Iterator[int]:
-    """A ROS domain that no other test on this machine uses meanwhile."""
-    for number in random.sample(range(1, 101), 100):
-        lock = open(f"/tmp/uncertain-lti-test-domain-{number}", "w")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.close()
-            continue
-        try:
-            yield number
-        finally:
-            lock.close()
-        return
-    raise RuntimeError("every ROS domain is in use by a test")
 
 
 def until(condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> Any:

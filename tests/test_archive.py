@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -127,12 +128,18 @@ def test_bad_archives_are_refused(bags, tmp_path):
         fit_archive([still, control], rest, cache=tmp_path / "c")
 
 
-@pytest.fixture(scope="module")
-def cluster():
+@contextmanager
+def started_cluster():
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as local:
         with distributed.Client(local) as client:
             yield local, client
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    with started_cluster() as started:
+        yield started
 
 
 @pytest.mark.slow
@@ -164,10 +171,15 @@ def test_on_a_cluster_it_says_so_too(bags, cluster):
 
 
 @pytest.mark.slow
-def test_a_lost_worker_costs_time_and_nothing_else(bags, cluster):
+def test_a_lost_worker_costs_time_and_nothing_else(bags):
     signals, paths = bags
     model = fit(read_transients(paths, signals))
-    local, client = cluster
+    with started_cluster() as (local, client):
+        lose_a_worker(local, lambda: equal(fit_archive(paths, signals, client=client), model))
+
+
+def lose_a_worker(local, work):
+    """Do the work again and again until one of the cluster's workers has been killed meanwhile, and once more."""
     victim = next(iter(local.workers.values()))
     pid = victim.process.process.pid
     lost = threading.Event()
@@ -180,13 +192,12 @@ def test_a_lost_worker_costs_time_and_nothing_else(bags, cluster):
     killer = threading.Thread(target=kill)
     killer.start()
     for _ in range(50):  # until the kill has fallen into the middle of one of them
-        same = fit_archive(paths, signals, client=client)
-        equal(same, model)
+        work()
         if lost.is_set():
             break
     killer.join()
     assert lost.is_set()
-    equal(fit_archive(paths, signals, client=client), model)
+    work()
 
 
 @pytest.mark.slow

@@ -1,0 +1,98 @@
+"""What keeps tests apart: the processes of one are ended with it, and its ROS domain is its own meanwhile."""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_PR_SET_CHILD_SUBREAPER = 36
+_HELPERS = (b"multiprocessing.resource_tracker", b"multiprocessing.forkserver")  # live as long as who imports them
+
+
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """A ROS domain that no other test on this machine uses meanwhile."""
+    for number in random.sample(range(1, 101), 100):
+        try:
+            lock = open(f"/tmp/uncertain-lti-test-domain-{number}", "w")
+        except OSError:  # of another user
+            continue
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield number
+            return
+    raise RuntimeError("every ROS domain is in use by a test")
+
+
+def adopt_orphans() -> None:
+    """Have processes whose parent has ended become children of this one, and so findable; on Linux."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def children(parent: int | str = "self") -> set[int]:
+    """Direct children, those that ended and were not waited for included; empty when the process has gone."""
+    found: set[int] = set()
+    with suppress(OSError):
+        for task in Path(f"/proc/{parent}/task").iterdir():
+            with suppress(OSError):  # the thread has ended
+                found.update(map(int, (task / "children").read_text().split()))
+    return found
+
+
+def runs(pid: int) -> bool:
+    """Whether a process is there and has not ended; one that only waits to be waited for has ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in ("Z", "X")
+    except OSError:
+        return False
+
+
+def end_children(before: set[int], patience: float) -> list[str]:
+    """End the children that were not there before, with all their descendants.
+
+    Those that are about to end get `patience`, s, to do so. Returns the command lines of those that had to be ended.
+    """
+    deadline = time.monotonic() + patience
+    while (left := _strays(before)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    commands = [_command(pid).decode(errors="replace") for pid in left]
+    while left:
+        for pid in left:
+            _kill_tree(pid)
+        left = _strays(before)  # what their ends have orphaned
+    for pid in children() - before:
+        if not runs(pid):
+            with suppress(OSError):
+                os.waitpid(pid, os.WNOHANG)
+    return commands
+
+
+def _strays(before: set[int]) -> list[int]:
+    return [p for p in children() - before if runs(p) and not any(helper in _command(p) for helper in _HELPERS)]
+
+
+def _command(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").strip()
+    except OSError:
+        return b""
+
+
+def _kill_tree(pid: int) -> None:
+    below = children(pid)
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+    for child in below:
+        _kill_tree(child)
