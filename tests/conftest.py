@@ -1,11 +1,12 @@
 """Fixtures that several test files share, and what holds for every test: loopback only, no process left behind."""
 
-import itertools
 import os
 import signal
 import threading
+import zlib
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -39,18 +40,33 @@ _NUMPY = """
 # Their fixtures cost more than their tests: side by side each worker would make them again.
 _TOGETHER = "archive html_report progress reproduce turbofan validation".split()
 
+# They wait for processes of ROS 2 most of the time: half of the workers do, while the others compute.
+_WAITING = "live monitor_faults node_interface other_vendor play_record security_policy".split()
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    # Half of the workers run tests that wait for processes of ROS 2, while the others compute.
-    waiting = itertools.cycle(range(max(1, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) // 2)))
-    for item in items:
-        stem = item.path.stem.removeprefix("test_")
-        if stem in _NUMPY:
-            item.add_marker("numpy")
-        if "world" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.xdist_group(f"ros {next(waiting)}"))
-        elif stem in _TOGETHER:
-            item.add_marker(pytest.mark.xdist_group(stem))
+
+def stem(path: str) -> str:
+    return Path(path).stem.removeprefix("test_")
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    if stem(str(item.path)) in _NUMPY:
+        item.add_marker("numpy")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Scheduling(LoadScopeScheduling):
+        """Hand out tests one by one, but for those that share a fixture and those that wait."""
+
+        def _split_scope(self, nodeid: str) -> str:
+            file = stem(nodeid.partition("::")[0])
+            if file in _WAITING:
+                return f"waiting {zlib.crc32(nodeid.encode()) % max(1, self.numnodes // 2)}"
+            return file if file in _TOGETHER else nodeid
+
+    return Scheduling(config, log)
 
 
 _FAILED = pytest.StashKey[bool]()

@@ -131,7 +131,7 @@ def test_bad_archives_are_refused(bags, tmp_path):
 @contextmanager
 def started_cluster():
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as local:
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=":0") as local:
         with distributed.Client(local) as client:
             yield local, client
 

@@ -1,4 +1,4 @@
-"""Damage gives a clear error or a correct reading; `python tests/fuzz.py` tries ten thousand files and messages."""
+"""Damage gives a clear error or a correct reading; `python benchmarks/fuzz.py` tries ten thousand of each kind."""
 
 from __future__ import annotations
 
@@ -73,15 +73,18 @@ def test_whatever_goes_wrong_is_noticed(tmp_path: Path) -> None:
     program = tmp_path / "wrong.py"
     program.write_text("""
 import os, time, fuzz
-fuzz.LIMIT_S = 0.5
+fuzz.LIMIT_CPU_S, fuzz.LIMIT_S = 0.5, 5.0
 def wrong(rng, folder):
     kind = next(kinds)
     if kind == "raise":
         raise KeyError("nobody raised this on purpose")
     if kind == "die":
         os._exit(3)
+    if kind == "compute":
+        while True:
+            pass
     if kind == "hang":
-        time.sleep(60)
+        time.sleep(600)
     if kind == "ask for much":
         bytearray(fuzz.LIMIT_MEMORY + 1)
     return "read"
@@ -90,15 +93,17 @@ fuzz.KINDS["wrong"] = wrong
 if __name__ == "__main__":
     import sys
     seed = int(sys.argv[sys.argv.index("--seed") + 1])
-    kinds = iter(["fine", *["raise", "ask for much", "fine", "hang", "die", "fine"][seed:]])
+    kinds = iter(["fine", *["raise", "ask for much", "fine", "compute", "hang", "die", "fine"][seed:]])
     raise SystemExit(fuzz.main())
 """)
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", path)
-        outcome = fuzz.run("wrong", first=0, count=6, program=str(program))
+        outcome = fuzz.run("wrong", first=0, count=7, program=str(program))
     assert outcome.counts == {"read": 2}
     for failure, (seed, why) in zip(
-        outcome.failures, [(0, "KeyError"), (1, "MemoryError"), (3, "Timeout"), (4, "ended with 3")], strict=True
+        outcome.failures,
+        [(0, "KeyError"), (1, "MemoryError"), (3, "ended with -27"), (4, "Timeout"), (5, "ended with 3")],
+        strict=True,
     ):
         assert f"--seed {seed}:" in failure and why in failure

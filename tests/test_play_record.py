@@ -17,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti import Transient
-from uncertain_lti.cli.main import main as cli
+from uncertain_lti.cli.main import main
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, leibov2006, transient
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import define
@@ -380,7 +380,7 @@ def test_speeds_and_times_that_are_none_are_refused_in_words(text: str, capsys: 
         if text == "0" and "--wait=0" in arguments:
             continue
         with pytest.raises(SystemExit) as ended:
-            cli.main(arguments)
+            main(arguments)
         assert ended.value.code == 2 and says in capsys.readouterr().err
 
 

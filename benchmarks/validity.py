@@ -1,0 +1,125 @@
+"""Do the intervals of validation contain the truth as often as they promise? Studies on simulated plants, seeded.
+
+    ./run python benchmarks/validity.py                     # all studies with all their plants, about a minute
+    ./run python benchmarks/validity.py --plants 40         # as tests/test_validation.py has them
+    ./run python benchmarks/validity.py --only recordings
+
+Each plant is three nonlinear tanks whose coefficients are drawn within 20 %, with recordings of its own; the truth is
+what the very model that was validated does on fresh transients of the same plant. Half of the plants have sensor noise
+and the additive term. Exit status 1 when an interval for 90 % contains the truth in less than 87 % of the cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+if not any("uncertain_lti" in str(p) for p in sys.path):
+    sys.path.insert(0, str(ROOT / "tests" / "checkout"))
+
+from measure import table  # noqa: E402
+from tanks import DT, Tanks  # noqa: E402
+
+from uncertain_lti import UncertainLTI  # noqa: E402
+from uncertain_lti.model.alarm_rule import AlarmRule  # noqa: E402
+from uncertain_lti.validation.calibration import calibrate  # noqa: E402
+from uncertain_lti.validation.left_out import validate  # noqa: E402
+
+CONFIDENCE = 0.9
+LEAST = 0.87
+PLANTS = 200
+
+Held = dict[str, list[bool]]
+"""By promise: whether its interval contains the truth, for each plant that was given one."""
+
+
+def true_alarms(model: UncertainLTI, x: np.ndarray, u: np.ndarray, rule: AlarmRule) -> tuple[np.ndarray, np.ndarray]:
+    """Alarms on each fresh transient, (count,), and whether each transition leaves its bounds, (count, steps)."""
+    low, high = model.bounds(x[:, :-1], u[:, :-1], DT, margin=rule.margin)
+    left = ~((low <= x[:, 1:]) & (x[:, 1:] <= high)).all(axis=-1)
+    recent = np.cumsum(np.pad(left, ((0, 0), (rule.window, 0))), axis=1)
+    raised = recent[:, rule.window :] - recent[:, : -rule.window] >= rule.violations
+    return raised[:, 0] + (raised[:, 1:] & ~raised[:, :-1]).sum(axis=1), left
+
+
+def recordings(plants: Iterable[int]) -> Held:
+    """Recordings left out one at a time, 8 to 24 of them, both criteria; the truth on 250 fresh transients."""
+    held: Held = {}
+    for seed in plants:
+        rng = np.random.default_rng([seed, 1])
+        plant, noise = Tanks(seed, spread=0.2), 1e-3 * (seed % 2)
+        runs = plant.transients(int(rng.integers(8, 25)), seed, noise=noise)
+        validation = validate(
+            runs, criterion=("qp", "lp")[seed // 2 % 2], additive="noise" if noise else "none", confidence=CONFIDENCE
+        )
+        x, u = plant.arrays(250, 10_000 + seed, noise=noise)
+        hours = x.shape[0] * 100 * DT / 3600
+        data = validation.to_dict()
+        for entry in data["false_alarms"]:
+            rule = AlarmRule(entry["violations"], entry["window"])
+            alarms, left = true_alarms(validation.model, x, u, rule)
+            low, high = entry["interval"]
+            held.setdefault(f"alarms per hour, {rule.violations} of {rule.window}", []).append(
+                low <= alarms.sum() / hours <= high
+            )
+        low, high = data["inside_interval"]
+        held.setdefault("verdicts inside", []).append(low <= 1 - left.mean() <= high)
+        risk = left.any(axis=1).mean()
+        low, high = data["parts_inside_interval"]
+        held.setdefault("recordings wholly inside", []).append(low <= 1 - risk <= high)
+        if "interval" in data["scenario"]:
+            low, high = data["scenario"]["interval"]
+            held.setdefault("recordings that leave, by support", []).append(low <= risk <= high)
+        wish = rng.uniform(0.2, 1.0) / (100 * DT / 3600)
+        found = calibrate(validation, wish)
+        if found.alarm_rule is not None:
+            alarms, _ = true_alarms(validation.model, x, u, found.alarm_rule)
+            held.setdefault("calibrated alarm keeps to the wish", []).append(alarms.sum() / hours <= wish)
+    return held
+
+
+def blocks(plants: Iterable[int]) -> Held:
+    """Ten blocks of one recording of 1500 steps; the truth on more of the same, settled, 20 times 750 steps."""
+    held: Held = {}
+    for seed in plants:
+        plant, noise = Tanks(seed, spread=0.2), 1e-3 * (seed % 2)
+        (run,) = plant.transients(1, seed, steps=1500, noise=noise)
+        validation = validate(run, additive="noise" if noise else "none", confidence=CONFIDENCE)
+        x, u = plant.arrays(20, 10_000 + seed, steps=800, noise=noise)
+        x, u = x[:, 50:], u[:, 50:]
+        hours = 20 * 750 * DT / 3600
+        for entry in validation.to_dict()["false_alarms"]:
+            rule = AlarmRule(entry["violations"], entry["window"])
+            alarms, _ = true_alarms(validation.model, x, u, rule)
+            low, high = entry["interval"]
+            held.setdefault(f"alarms per hour, {rule.violations} of {rule.window}", []).append(
+                low <= alarms.sum() / hours <= high
+            )
+    return held
+
+
+STUDIES: dict[str, Callable[[Iterable[int]], Held]] = {"recordings": recordings, "blocks": blocks}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--plants", type=int, default=PLANTS, help="plants of each study")
+    parser.add_argument("--only", choices=list(STUDIES), help="this study alone")
+    options = parser.parse_args()
+    failed = False
+    for name in [options.only] if options.only else STUDIES:
+        held = STUDIES[name](range(options.plants))
+        rows = [[what, f"{np.mean(hits):.1%} of {len(hits)}"] for what, hits in held.items()]
+        table(f"{name}: {STUDIES[name].__doc__}", [f"{CONFIDENCE:.0%} interval of", "contains the truth"], rows)
+        failed |= any(np.mean(hits) < LEAST for hits in held.values())
+    return int(failed)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
