@@ -77,7 +77,7 @@ LAYOUTS = st.builds(
 MESSAGES = st.lists(
     st.tuples(
         st.sampled_from(["/a", "/b"]),
-        st.one_of(st.integers(0, 20), st.sampled_from([1_700_000_000 * SECOND, 2**64 - 1])),
+        st.one_of(st.integers(0, 20), st.sampled_from([1_700_000_000 * SECOND, 2**63 - 1])),
     ),
     max_size=60,
 ).map(lambda entries: [Message(topic, t, float64(i), t) for i, (topic, t) in enumerate(entries)])
@@ -111,7 +111,7 @@ def error_of(path: Path) -> str:
         bag = Bag(path)
         list(bag.messages(bag.topics))
     text = str(caught.value)
-    assert "\n" not in text and str(path) in text
+    assert "\n" not in text and str(path)[:1000] in text
     return text
 
 

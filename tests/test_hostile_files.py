@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 from bag_writer import (
+    Layout,
     Message,
     Topic,
     channel_record,
@@ -312,3 +313,36 @@ def by_the_library(path):
         except Exception:
             return None
     return [m.data for _, c, m in found if c.topic == "/a"]
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_log_times_past_64_bits_are_refused_where_they_enter(tmp_path, model, summary):
+    """Whatever reads the topic; what is on other topics is read, listed and copied as ever."""
+    late, other = Message("/late", 2**63, float64(0.0)), ramp("/a", range(0, 20 * STEP, STEP))
+    topics = [Topic("/late"), TOPIC]
+    path = write(topics, [*other, late], Layout("zstd", summary=summary)).save(tmp_path / "late.mcap")
+    for indexed in (False, True):
+        bag = Bag(path, indexed=indexed)
+        assert not bag.topics["/late"].readable and "past the year 2262" in bag.topics["/late"].reason
+        for read in (bag.messages, bag.raw_messages, bag.described):
+            with pytest.raises(BagError, match="late.mcap: a message has a log time of 9223372036854775808 ns"):
+                list(read(["/late"]))
+        assert len(list(bag.raw_messages(["/a"]))) == 20
+    assert {f.info.topic: f.rate for f in Bag(path).facts()} == {"/a": 1.0, "/late": None}
+    copy = tmp_path / "copy.mcap"
+    assert main(["topics", str(path)]) == 0
+    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
+    assert {(c[0], m[2]) for c, *m in ((m[0], *m) for m in held(copy, without=["/envelope"]).messages)} >= {
+        ("/late", 2**63)
+    }
+
+
+def test_messages_out_of_order_are_held_up_to_a_limit(tmp_path, monkeypatch):
+    """Every chunk has one message from before all others; before, everything was held, and sorted chunk after chunk."""
+    chunks = [DEFINED + message_record(1, 0, float64(-1.0)) + said(50, begin=1 + 50 * k) for k in range(200)]
+    path = save(tmp_path / "back.mcap", raw_file(*map(chunk_record, chunks), summary=b""))
+    times = [m.log_time_ns for m in Bag(path).raw_messages()]
+    assert times == sorted(times) and len(times) == 200 * 51
+    monkeypatch.setattr(bag_module, "_MOST_HELD", 100_000)
+    with pytest.raises(BagError, match="mcap sort"):
+        list(Bag(path).raw_messages())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import bisect
+import heapq
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -10,12 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.bag_arrays import read_columns
+from uncertain_lti.recordings.bag_arrays import in_reach, read_columns
 from uncertain_lti.recordings.bag_files import parts_of
 from uncertain_lti.recordings.bag_seams import not_one_recording
 from uncertain_lti.recordings.mcap_index import outline_or_scan
-from uncertain_lti.recordings.mcap_records import Block, Contents, count, messages, read_block, scan
+from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages, read_block, scan
 from uncertain_lti.recordings.message_types import define, lines_of, normal_name, undefined
 from uncertain_lti.recordings.raw_messages import RawMessage, RecordedChannel
 from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo
@@ -28,6 +29,10 @@ __all__ = ["Bag"]
 
 
 _MOST_LINES = 100_000  # of definitions that are read in one file
+_MOST_NAMES = 50  # of topics in an error
+_MOST_HELD = 1 << 30  # bytes
+_SIZE_OF_AN_ENTRY = 400  # bytes; in memory, with what Python puts around it
+_NEVER: tuple[int, ...] = (2**64,)
 _LEAST_LINES = 50  # that a definition counts for, however short it is
 
 
@@ -81,6 +86,7 @@ class Bag:
             why = self._warnings[0].removeprefix(f"{self.path}: ")
             raise BagError(f"{self.path}: no message can be read ({why}); record or copy it anew")
         self._channels = [_channels(part) for part in self._contents]
+        self._too_late: dict[str, int] = {}  # topics with log times that cannot be kept -> the last one
         self.topics: Mapping[str, TopicInfo] = self._topics()
 
     def walk(self) -> None:
@@ -183,7 +189,7 @@ class Bag:
     @property
     def warnings(self) -> list[str]:
         """What is missing or left out, each one sentence that begins with the file; grows while messages are read."""
-        return [*self._warnings, *self._undecoded.values()]
+        return [printable(warning) for warning in (*self._warnings, *self._undecoded.values())]
 
     def fields(self, type_name: str) -> Mapping[str, FieldType]:
         """Fields of a type that a readable topic has or uses.
@@ -291,7 +297,7 @@ class Bag:
         BagError
             The recording cannot be read any more.
         """
-        messages: Iterable[Any] = self.raw_messages()
+        messages: Iterable[Any] = self.raw_messages(topic for topic in self.topics if topic not in self._too_late)
         if progress is not None:
             messages = progress(messages, sum(info.count for info in self.topics.values()))
         return topic_facts(self.topics, messages)
@@ -312,7 +318,7 @@ class Bag:
         Raises
         ------
         BagError
-            A topic is not there; the sentence names those that are.
+            A topic is not there (the sentence names those that are), or has log times that cannot be kept.
         """
         self.walk()
         wanted = set(self.topics if topics is None else topics)
@@ -380,7 +386,11 @@ class Bag:
         of_kind = tallies[chosen]
         first = min((tally.first for tally in of_kind), default=None)
         last = max((tally.last for tally in of_kind), default=None)
-        return TopicInfo(topic, type_name, counts[chosen], encoding, not chosen[2], reason, first, last)
+        readable = not chosen[2]
+        if last is not None and last > LATEST:
+            self._too_late[topic] = last
+            readable, reason = False, f"a message has a log time of {last} ns, which is past the year 2262"
+        return TopicInfo(topic, type_name, counts[chosen], encoding, readable, reason, first, last)
 
     def _every_channel(self) -> Iterator[RecordedChannel]:
         return itertools.chain.from_iterable(channels.values() for channels in self._channels)
@@ -394,8 +404,10 @@ class Bag:
     def _require(self, topic: str, readable: bool = True) -> None:
         info = self.topics.get(topic)
         if info is None:
-            there = ", ".join(self.topics) or "none"
+            there = shortlist(list(self.topics), _MOST_NAMES) or "none"
             raise BagError(f"{self.path}: there is no topic {topic}; topics there: {there}")
+        if topic in self._too_late:
+            in_reach(self.path, self._too_late[topic])
         if readable and not info.readable:
             raise BagError(f"{self.path}: topic {topic} cannot be decoded: {info.reason}; choose another topic")
 
@@ -424,20 +436,37 @@ class Bag:
                 if not block.channels.isdisjoint(wanted):
                     blocks.append((block.start, part, number, block))
         blocks.sort(key=lambda entry: entry[:3])
-        pending: list[tuple[int, int, int, int, RawMessage]] = []
+        # What is pending of each block: place of its first message, size, and its messages, the first one last.
+        pending: list[tuple[tuple[int, ...], int, list[tuple[int, int, int, int, RawMessage]]]] = []
+        held = 0
         for position, (_, part, number, block) in enumerate(blocks):
             wanted = channels[part]
             records = read_block(self._contents[part].path, block)
+            found: list[tuple[int, int, int, int, RawMessage]] = []
             for key, log_time, publish_time, begin, end in messages(records):
                 if channel := wanted.get(key):
                     raw = RawMessage(log_time, publish_time, records[begin:end], channel)
-                    pending.append((log_time, part, number, begin, raw))
-            pending.sort()  # never compares messages: no two have the same place
-            following = blocks[position + 1][0] if position + 1 < len(blocks) else None
-            final = len(pending) if following is None else bisect.bisect_left(pending, (following,))
-            for entry in pending[:final]:
-                yield entry[4]
-            del pending[:final]
+                    found.append((log_time, part, number, begin, raw))
+            if found:
+                found.sort(reverse=True)  # never compares messages: no two have the same place
+                size = sum(len(entry[4].data) + _SIZE_OF_AN_ENTRY for entry in found)
+                heapq.heappush(pending, (found[-1][:4], size, found))
+                held += size
+            if held > _MOST_HELD and len(pending) > 1:
+                raise BagError(
+                    f"{self.path}: its messages are so far out of order that more than {_MOST_HELD >> 20} MiB of them "
+                    f"have to wait; put them in order with `mcap sort`"
+                )
+            following = (blocks[position + 1][0],) if position + 1 < len(blocks) else _NEVER
+            while pending and pending[0][0] < following:
+                _, size, found = heapq.heappop(pending)
+                limit = min(following, pending[0][0]) if pending else following
+                while found and found[-1] < limit:
+                    yield found.pop()[4]
+                if found:
+                    heapq.heappush(pending, (found[-1][:4], size, found))
+                else:
+                    held -= size
 
 
 def _of(channels: Mapping[int, RecordedChannel], topics: set[str], counted: bool = False) -> dict[int, RecordedChannel]:

@@ -15,13 +15,11 @@ from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.cdr_arrays import FieldReader, Messages
 from uncertain_lti.recordings.mcap_batches import Batch, IndexMismatchError, batches
-from uncertain_lti.recordings.mcap_records import Contents
+from uncertain_lti.recordings.mcap_records import LATEST, Contents
 from uncertain_lti.recordings.message_types import Definition
 from uncertain_lti.recordings.raw_messages import RecordedChannel
 from uncertain_lti.recordings.recording import Columns, Progress, TopicInfo
 from uncertain_lti.signals.field_path import FieldPath
-
-LATEST = 2**63 - 1  # ns; log times are kept with a sign
 
 
 @dataclass

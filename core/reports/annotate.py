@@ -25,7 +25,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.monitor.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of
-from uncertain_lti.recordings.mcap_records import Contents, scan
+from uncertain_lti.recordings.mcap_records import LATEST, Contents, scan
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
 from uncertain_lti.recordings.recording import Progress, Recording
@@ -202,7 +202,7 @@ def _weave(
     horizon = 0
     for part, renumbered in zip(contents, numbers, strict=True):
         for count, last in copier.copy(part, renumbered):
-            horizon = max(horizon, last)
+            horizon = min(max(horizon, last), LATEST)  # of other topics it may be anything
             said.until(horizon)
             yield count
     said.finish()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.english import meant
+from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
@@ -405,7 +405,7 @@ def no_topic(bag: Recording, topic: str) -> str:
     str
         The sentence.
     """
-    there = ", ".join(sorted(bag.topics)) or "none"
+    there = shortlist(sorted(bag.topics), 50) or "none"
     return f"{bag.path}: there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
 
 
