@@ -194,7 +194,7 @@ def test_every_odd_recording_gets_a_file_or_a_sentence(recordings, tmp_path, cap
         ("/joint_states", "sensor_msgs/msg/JointState", "state"),
         ("/joint_command", "sensor_msgs/msg/JointState", "control"),
         ("/motor/cmd/feedback", FLOAT64, "state"),
-        ("/desired_speed", FLOAT64, "wish"),
+        ("/desired_speed", FLOAT64, "reference"),
         ("/drive", "ackermann_msgs/msg/AckermannDriveStamped", "control"),
         ("/imu", "sensor_msgs/msg/Imu", "state"),
         ("/rosout", "rcl_interfaces/msg/Log", "apart"),

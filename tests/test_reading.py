@@ -613,7 +613,7 @@ def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path
     assert fitted.signals is not None
     model = model_of(fitted.signals)
     zero = save(tmp_path, {"/x": JOINT_STATE}, [("/x", k * MS, joint_state(0, [k])) for k in range(9)], "zero.mcap")
-    with pytest.raises(SignalError, match="zero.mcap: no message of /x has a stamp, and the model goes by them"):
+    with pytest.raises(SignalError, match="zero.mcap: no message of /x has a stamp, and the model uses them"):
         read_as_fitted(zero, model.signals)
     silent = save(tmp_path, {"/x": JOINT_STATE, "/y": FLOAT64}, [("/y", 1, float64(1.0))], "silent.mcap")
     with pytest.raises(BagError, match="silent.mcap: /x has no message, so nothing can be judged; record it"):

@@ -340,7 +340,7 @@ def test_csv_as_people_write_it(text: str | bytes, tmp_path: Path) -> None:
         ("t,x,u\n0,1,2\n1,2,3\n", {"states": ["y"]}, "there is no column 'y'; columns are t, x, u"),
         ("t,x,u\n0,1,2\n1,2,3\n", {"states": "x"}, "states is the text 'x'; give a list"),
         ("t,x,u\n0,1,2\n1,2,3\n", {"states": []}, "x has no column; give at least one state"),
-        ("t,x,u,x\n0,1,2,1\n1,2,3,7\n", {}, "column 'x' stands twice with different values; rename one"),
+        ("t,x,u,x\n0,1,2,1\n1,2,3,7\n", {}, "column 'x' is there twice with different values; rename one"),
         ("t,x,u\n1700000000000000000,1,2\n1700000001000000000,2,3\n", {}, r"t reaches 1.7e\+18 s; give seconds"),
         (b"t,x,u\n0,1,\x80\n", {}, "cannot be read as CSV"),
         (bytes(range(256)), {}, "cannot be read as CSV"),

@@ -22,7 +22,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Stream to a file that takes the place of `path` when the block ends without an error, and else is removed.
 
     Whatever ends the block early, Ctrl-C included, leaves what was there before. What is no file, such as /dev/null
-    or a pipe, is written to as it stands; a link goes on pointing where it does.
+    or a pipe, is written to in place; a link keeps pointing where it does.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def sha256(path: str | os.PathLike[str]) -> str:
 def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
     """Whether nothing is lost at this path when a file is written there that has such words in its first 500 bytes.
 
-    So it is where there is nothing yet, and where an older file of the same kind stands; of a folder it is not asked.
+    So it is where there is nothing yet, and where an older file of the same kind is; a folder is not looked at.
 
     Parameters
     ----------
@@ -124,19 +124,19 @@ def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
     return not head or holds in head
 
 
-def target(wish: str | os.PathLike[str], *, holds: bytes, kind: str, example: str) -> Path:
+def target(output: str | os.PathLike[str], *, holds: bytes, kind: str, example: str) -> Path:
     """Where a file of a kind goes, that holds such words (`may_replace`); an older one gives way, and nothing else.
 
     Parameters
     ----------
-    wish : path
+    output : path
         The path that was asked for.
     holds : bytes
         Words that every file of the kind has in its first 500 bytes.
     kind : str
         Name of the kind, for the error.
     example : str
-        File name that the error suggests when `wish` is a folder.
+        File name that the error suggests when `output` is a folder.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def target(wish: str | os.PathLike[str], *, holds: bytes, kind: str, example: st
     BagError
         Something else is there, or its folder is not.
     """
-    path = Path(wish)
+    path = Path(output)
     if not path.parent.is_dir():
         raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
     if path.is_dir():

@@ -11,7 +11,7 @@ MOST = 12
 
 
 def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]], below: Sequence[str] = ()) -> str:
-    """A plain table; every text is escaped. The first column stands to the left, the others to the right.
+    """A plain table; every text is escaped. The first column is aligned to the left, the others to the right.
 
     Parameters
     ----------

@@ -19,8 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders")
-    parser.add_argument("--violations", type=int, help="alarm: so many violations (default: the model's)")
-    parser.add_argument("--window", type=int, help="alarm: among so many last verdicts (default: the model's)")
+    parser.add_argument("--violations", type=int, help="alarm: number of violations (default: the model's)")
+    parser.add_argument(
+        "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"
+    )
     parser.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
     parser.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
     parser.add_argument(

@@ -196,5 +196,5 @@ COMMAND = Command(
     add_arguments,
     run,
     quiet=SILENT,
-    verbose="say every pass over the data, and what took how long",
+    verbose="report every scan of the data, and what took how long",
 )

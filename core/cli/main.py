@@ -152,7 +152,7 @@ def build_parser(chosen: str = "") -> argparse.ArgumentParser:
     """
     parser = _Parser(
         prog="uncertain-lti",
-        description="Fit an uncertain linear model to recorded transients, and tell when a machine leaves it.",
+        description="Fit an uncertain linear model to recorded transients, and report when a machine leaves it.",
         epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 70 a fault of this program, "
         "130 interrupted by Ctrl-C.",
     )

@@ -20,14 +20,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "bags", metavar="BAG", nargs="*", help="MCAP files and folders (default: those the model was fitted to)"
     )
-    parser.add_argument("--blocks", type=int, help="leave out blocks: so many per recording (a single one: 10)")
+    parser.add_argument("--blocks", type=int, help="leave out blocks: their number per recording (a single one: 10)")
     parser.add_argument(
         "--group", metavar="KEY", help=f"{GROUP}; default: that of the fit; none: single recordings all the same"
     )
-    parser.add_argument("--gap", type=float, help="s beside a left-out block that are not fitted either")
+    parser.add_argument("--gap", type=float, help="s before and after a left-out block that are not fitted either")
     parser.add_argument("--confidence", type=float, default=0.9, help="of every interval (default: 0.9)")
     parser.add_argument(
-        "--false-alarms", type=float, metavar="PER_HOUR", help="find the alarm rule that stays below so many per hour"
+        "--false-alarms", type=float, metavar="PER_HOUR", help="find the alarm rule that stays below this rate per hour"
     )
     parser.add_argument(
         "--output",
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     BagError
         The model does not name its recordings, or one cannot be read.
     FitError
-        The recordings do not give the model again, or no alarm rule keeps to the wish.
+        The recordings do not give the model again, or no alarm rule keeps to the rate.
     """
     from uncertain_lti import UncertainLTI
     from uncertain_lti.recordings.formats import group_recordings
@@ -114,7 +114,7 @@ def run(options: argparse.Namespace) -> int:
 
 COMMAND = Command(
     "validate",
-    "tell how far to trust a model, by leaving out what it was fitted to",
+    "estimate how far to trust a model, by leaving out what it was fitted to",
     add_arguments,
     run,
     quiet=SILENT,

@@ -81,7 +81,7 @@ def pulses(steps: int, controls: int, rng: np.random.Generator) -> Array:
 
 
 def transient(steps: int, seed: int, fault_at: int | None = None, start_ns: int = 0) -> Transient:
-    """One run of the plant from rest, every matrix element drawn anew inside its interval at each step.
+    """One run of the plant from rest, every matrix element drawn again inside its interval at each step.
 
     Leibov (2006), eq. (3): x_{k+1} = x_k + Δt (A_k x_k + B_k u_k) with A_k in A ± ΔA and B_k in B ± ΔB.
 

@@ -174,7 +174,7 @@ def reproduce(
     Returns
     -------
     dict
-        What stands in `reproduce.json`.
+        What is in `reproduce.json`.
 
     Raises
     ------
@@ -334,7 +334,7 @@ def width_text(cases: Sequence[Case]) -> str:
 
 
 def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
-    """Eigenvalues beside the published ones.
+    """Eigenvalues compared with the published ones.
 
     Parameters
     ----------
@@ -366,7 +366,7 @@ def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
 
 
 def matrix_text(model: UncertainLTI, name: str) -> str:
-    """A, B and their half-widths beside the published ones.
+    """A, B and their half-widths compared with the published ones.
 
     Parameters
     ----------
@@ -392,7 +392,7 @@ def matrix_text(model: UncertainLTI, name: str) -> str:
 
 
 def search_text(searches: Sequence[dict[str, Any]]) -> str:
-    """The paper's solver beside the exact one.
+    """The paper's solver compared with the exact one.
 
     Parameters
     ----------
@@ -413,11 +413,11 @@ def search_text(searches: Sequence[dict[str, Any]]) -> str:
         for s in searches
     ]  # fmt: skip
     header = ("identified from", "(10), exact", "direct search", "above", "exact [s]", "direct [s]", "ratio of times")
-    return "The paper's solver, direct search by golden section, beside the exact one\n" + table(header, rows)
+    return "The paper's solver, direct search by golden section, and the exact one\n" + table(header, rows)
 
 
 def check_figure(case: Case, path: str | os.PathLike[str]) -> None:
-    """The paper's figure: each state between the bounds; beside it the same relative to the bounds' centre.
+    """The paper's figure: each state between the bounds; next to it the same relative to the bounds' centre.
 
     Left, in recorded units, as the paper draws it; the bounds are so close there that right shows what they leave.
 

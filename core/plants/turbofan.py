@@ -511,7 +511,7 @@ class Engine:
 class GasPathSolver:
     """Newton's method for the gas path, started from the solution before.
 
-    The Jacobian is kept as long as it serves, and made anew by differences where convergence is slow. Where the step
+    The Jacobian is kept as long as it serves, and computed again by differences where convergence is slow. If the step
     from the last condition is too large, the condition is approached from the design point in several.
 
     Parameters

@@ -1,7 +1,7 @@
 """Performance of the turbofan's components: smooth analytical maps of compressors, turbines and the nozzle.
 
 The forms are the usual low-order ones (work coefficient over flow coefficient for a compressor, Stodola's ellipse for
-a turbine); their constants are chosen, not measured on any engine, and stand beside each field with the reason.
+a turbine); their constants are chosen, not measured on any engine, and each field has the reason in a comment.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ class Source:
     type : str
         Message type, `pkg/msg/Type`.
     role : str
-        `control`, `wish` (a reference of some controller), `state`, empty (unknown), `apart` (neither) or `guess` (a
+        `control`, `reference` (of some controller), `state`, empty (unknown), `apart` (neither) or `guess` (a
         control by its effect).
     stamped : bool
         Whether header stamps can be used.

@@ -51,7 +51,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[C
             pool += source.free
         else:
             source.reason = (
-                f"{source.rate:.3g} messages a second beside {main.rate:.3g} of {main.topic}"
+                f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}"
                 if source in shown
                 else "the controls do not show in it"
             )
@@ -114,10 +114,10 @@ def _one_element(
 
 
 def _strongest(steps: Steps, used: list[Candidate], most: int) -> list[Candidate]:
-    """At most so many controls, those that show most."""
+    """The controls that show most, up to a number."""
     if len(used) <= most or len(steps.X) < FEWEST:
         for candidate in used[most:]:
-            candidate.reason = "the recording is too short for so many controls"
+            candidate.reason = "the recording is too short for this many controls"
         return used[:most]
     n = steps.X.shape[1]
     strength = []
@@ -145,7 +145,7 @@ def _coupled(steps: Steps, pool: list[Candidate], most: int, pose: bool, driven:
     kept = [i for i in among if driven[i] > least][:most]
     if not kept:
         for candidate in pool[most:]:
-            candidate.reason = "the recording is too short for so many states"
+            candidate.reason = "the recording is too short for this many states"
         return pool[:most]
     while len(kept) < most and not pose:
         rest = [j for j in range(n) if j not in kept]

@@ -11,11 +11,11 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
 
 SHOWS = 20.0
-"""F statistic from which on something is said to show in the next step."""
+"""F statistic from which on something counts as visible in the next step."""
 
 
 FAINT = 5.0
-"""F statistic below which a control is said to show nowhere."""
+"""F statistic below which a control counts as visible nowhere."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Steps:
     def effect(self, on: Sequence[int], of: Sequence[int] | None = None, given: Sequence[int] | None = None) -> Array:
         """F statistic in the next step of some states: of the controls, or of other states.
 
-        Beside states `given` (default all), and beside the controls where these are not what is asked for.
+        Given the states `given` (default all), and the controls unless these are what is asked for.
 
         Parameters
         ----------
@@ -57,14 +57,14 @@ class Steps:
         """
         n, m = self.X.shape[1], self.U.shape[1]
         tested = list(range(n, n + m)) if of is None else list(of)
-        beside = [j for j in (range(n) if given is None else given) if j not in tested]
+        known = [j for j in (range(n) if given is None else given) if j not in tested]
         if of is not None:
-            beside += range(n, n + m)
+            known += range(n, n + m)
         Z, Y = np.hstack([self.X, self.U]), self.dX[:, list(on)]
-        freedom = len(Z) - len(beside) - len(tested) - 1
+        freedom = len(Z) - len(known) - len(tested) - 1
         if freedom < 5 or not tested:
             return np.zeros(len(on))
-        without, full = residual(Z[:, beside], Y), residual(Z[:, [*beside, *tested]], Y)
+        without, full = residual(Z[:, known], Y), residual(Z[:, [*known, *tested]], Y)
         floor = 1e-12 * (Y**2).sum(axis=0) + 1e-300
         gain = np.maximum(without - full, 0.0) / len(tested)
         return np.asarray(gain / ((full + floor) / freedom))

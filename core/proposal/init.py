@@ -43,7 +43,7 @@ class Proposal:
 def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = None) -> Proposal:
     """Suggest states and controls of a machine from recordings of it.
 
-    Topics are told apart by their names and types, and where these say nothing by what helps to predict what; of a
+    Topics are classified by their names and types, and if these say nothing by what helps to predict what; of a
     topic's numbers those are proposed that move, and in whose next step the controls show, or which help to predict
     such ones. Everything else is listed in comments with the reason.
 
@@ -70,8 +70,8 @@ def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = 
     sources = read_sources(bags, progress)
     controls, states = assign_roles(sources)
     if not states:
-        said = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])
-        raise BagError(f"{bags[0].path}: nothing in it looks like the state of a machine ({said or 'no topics'})")
+        reasons = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])
+        raise BagError(f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})")
     chosen, doubt = choose(states, controls)
     used = [c for s in controls for c in s.free]
     ready = [c for s in sources for c in s.candidates if c.ready]

@@ -14,7 +14,7 @@ from uncertain_lti.signals.signal_map import Signal
 
 
 def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> None:
-    """Steady states and scales by the rule for `auto`; the range where the magnitude is small beside it.
+    """Steady states and scales by the rule for `auto`; the range where the magnitude is small compared with it.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidat
 
 
 def set_own_scale(candidate: Candidate) -> None:
-    """Median and range, for one that stands in a comment.
+    """Median and range, for one in a comment.
 
     Parameters
     ----------

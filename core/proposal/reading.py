@@ -88,7 +88,7 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
 
 def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
     """Look at no more numbers than memory holds: commands first, then states, from the first field on."""
-    order = ("control", "state", "wish", "")
+    order = ("control", "state", "reference", "")
     left = MOST_VALUES
     for source in sorted((s for s in sources if s.candidates), key=lambda s: order.index(s.role)):
         count = max(1, sum(bag.topics[source.topic].count for bag in bags))
@@ -159,7 +159,7 @@ def _sift(source: Source) -> None:
         for candidate in source.candidates:
             of_base = candidate.path.startswith(f"{base}.") or candidate.path.endswith(f"({base})")
             if of_base and candidate.path.endswith(f"({base})") != is_rotation:
-                candidate.reason = "|"  # said by the other form of the same numbers; not worth a line
+                candidate.reason = "|"  # the other form of the same numbers has its line
     source.candidates = [c for c in source.candidates if c.reason != "|"]
     for candidate in source.candidates:
         if not candidate.reason:
@@ -193,7 +193,7 @@ def _judge(candidate: Candidate, source: Source) -> None:
 
 
 def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
-    """Never falls, and is a whole number or goes by the time of arrival."""
+    """Never falls, and is a whole number or follows the time of arrival."""
     good = np.isfinite(values)
     finite, t = values[good], (arrival[good] - arrival[0]) * 1e-9
     if len(finite) < 3 or (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):

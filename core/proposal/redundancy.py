@@ -51,8 +51,8 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     return [pool[i] for i in sorted(kept)]
 
 
-def _place(candidate: Candidate, beside: Candidate) -> str:
-    return candidate.path if candidate.topic == beside.topic else f"{candidate.topic} {candidate.path}"
+def _place(candidate: Candidate, other: Candidate) -> str:
+    return candidate.path if candidate.topic == other.topic else f"{candidate.topic} {candidate.path}"
 
 
 def _function(of: Array, values: Array) -> bool:
@@ -67,7 +67,7 @@ def _function(of: Array, values: Array) -> bool:
         share = float(rest.std() / b.std())
         memory = float(np.corrcoef(rest[1:], rest[:-1])[0, 1]) if rest.std() > 0 else 0.0
         moves = float(np.diff(b).std() / b.std())
-        if share < 0.02 or (share < 0.15 and memory < 0.3 and moves < 0.7):  # white beside what it follows
+        if share < 0.02 or (share < 0.15 and memory < 0.3 and moves < 0.7):  # white around what it follows
             return True
     return False
 
@@ -113,7 +113,7 @@ def drop_noise(
 
 
 def drop_idle_controls(steps: Steps, used: Sequence[Candidate]) -> None:
-    """Leave out controls that show nowhere beside the others, and those that move with another one.
+    """Leave out controls that show nowhere given the others, and those that move with another one.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from uncertain_lti.proposal.effects import SHOWS, explained
 _COMMAND = re.compile(r"(cmd|command|contr|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory)")
 
 
-_WISH = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$)")
+_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$)")
 
 
 _STATE = re.compile(
@@ -66,8 +66,8 @@ def role_by_name(topic: str, type_name: str) -> str:
     for text in (last, name, kind):
         if _ANSWER.search(text):
             return "state"
-        if _WISH.search(text):
-            return "wish"
+        if _REFERENCE.search(text):
+            return "reference"
         if _COMMAND.search(text):
             return "control"
         if text == last and kind == "twist" and text.endswith("vel"):
@@ -94,10 +94,10 @@ def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]
     """
     moving = [s for s in sources if s.free]
     controls = [s for s in moving if s.role == "control"]
-    wishes = [s for s in moving if s.role == "wish"]
+    references = [s for s in moving if s.role == "reference"]
     if not controls:
-        controls, wishes = wishes, []
-    for source in wishes:
+        controls, references = references, []
+    for source in references:
         source.reason = "a reference for some controller, and there is a command"
     states = [s for s in moving if s.role == "state"]
     unknown = [s for s in moving if s.role == ""]

@@ -62,11 +62,11 @@ def signals_file(
     if differ:
         lines += [
             "",
-            "# Their header stamps stand still, or not all go by one clock: times of arrival serve for all.",
+            "# Their header stamps do not move, or not all use one clock: times of arrival serve for all.",
             "topics:",
         ]
         lines += [f"  {_quoted(t)}: {{time: log}}" for t in topics]
-    lines += ["", "# steady: median over the longest stretch in which everything stands still; scale: the largest such"]
+    lines += ["", "# steady: median over the longest stretch in which nothing moves; scale: the largest such"]
     lines.append("# magnitude, or the range where that is small. Both in recorded units.")
     lines += [f"# Beware: {doubt}."] if doubt else []
     lines.append("states:")
@@ -77,7 +77,7 @@ def signals_file(
         if any(every[c.topic].role == "guess" for c in controls):
             lines.append("  # by correlation alone: nothing is called a command here")
         if any(c.delay for c in controls):
-            lines.append("  # delay: by so many samples the states follow later")
+            lines.append("  # delay: number of samples by which the states follow later")
         for candidate in controls:
             lines.append(_entry(candidate, *longest_hold(every[candidate.topic], clock)))
         for candidate in (c for s in sources for c in s.candidates if c.ready == "control"):

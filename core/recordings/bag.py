@@ -84,7 +84,7 @@ class Bag:
         self._warnings += damage
         if (damage or not self._contents) and not any(part.count for part in self._contents):
             why = self._warnings[0].removeprefix(f"{self.path}: ")
-            raise BagError(f"{self.path}: no message can be read ({why}); record or copy it anew")
+            raise BagError(f"{self.path}: no message can be read ({why}); record or copy it again")
         self._channels = [_channels(part) for part in self._contents]
         self._too_late: dict[str, int] = {}  # topics with log times that cannot be kept -> the last one
         self.topics: Mapping[str, TopicInfo] = self._topics()

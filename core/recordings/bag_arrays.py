@@ -161,7 +161,7 @@ def in_reach(path: Path, log_time: int) -> int:
     if log_time > LATEST:
         raise BagError(
             f"{path}: a message has a log time of {log_time} ns, which is past the year 2262; "
-            f"the recorder's clock was wrong, so record anew"
+            f"the recorder's clock was wrong, so record again"
         )
     return log_time
 

@@ -20,7 +20,7 @@ def group_bags(paths: Sequence[Path], indexed: bool = False) -> list[Bag]:
     A folder is one recording. Files are one recording each, except the parts of a split bag: files
     `<stem>_<i>.mcap` of one stem in one folder that either
 
-    - are listed together in the metadata.yaml beside them, or
+    - are listed together in the metadata.yaml of their folder, or
     - are numbered 0, 1, 2, ... without a hole, carry the same topics, and follow each other in log time
       without a break: each begins at most 1 s, or the longest pause inside one of them, after the one
       before ends, and overlaps it by no more than 10 % of the shorter (messages at a seam may be out of order).

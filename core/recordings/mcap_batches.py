@@ -36,7 +36,7 @@ _LOOK = 1 << 14  # bytes in which a walker looks for its first message
 _LIKE_A_MESSAGE = re.compile(rb"\x05.{4}\0{4}", re.DOTALL)
 _NEAR = 1 << 16  # bytes between blocks that are read along
 _FEW = 100  # messages in a block that one walker passes soon enough
-_EVERY = 16  # so many messages a walker passes, where an index says where they are
+_EVERY = 16  # messages that a walker passes, where an index says where they are
 _LONG_INDEX = 1 << 10  # bytes per channel from which on an index is faster than looking
 _CHANNEL_AT = RECORD.size
 _LOG_TIME_AT = RECORD.size + 6
@@ -163,7 +163,7 @@ def _loaded(
 
 
 def _begin(block: Block) -> int:
-    """Where the block begins in the file, with what stands before its records."""
+    """Where the block begins in the file, with what precedes its records."""
     return block.offset - block.unchecked
 
 
@@ -319,7 +319,7 @@ class _Loader:
             return False
 
     def _as_stated(self, block: Block, packed: memoryview, offset: int, records: memoryview) -> bool:
-        """Hold what stands before a block against it, and its records against their checksum."""
+        """Compare what precedes a block with it, and its records against their checksum."""
         head = packed[offset - block.unchecked : offset]
         checksum = int.from_bytes(head[_CHECKSUM_AT : _CHECKSUM_AT + 4], "little")
         name = block.compression.encode()

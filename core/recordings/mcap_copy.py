@@ -2,7 +2,7 @@
 
 Chunks go over as they are, compressed bytes included, as long as their numbers of schemas and channels are free in
 the copy. What `mcap_records.scan` could not read of a damaged file is not in the copy; messages outside chunks are put
-into chunks, because readers that go by the index see no others.
+into chunks, because readers that use the index see no others.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class _Source:
         self._stream.close()
 
     def at(self, place: int, size: int) -> bytes:
-        """So many bytes, or fewer at the end of the file."""
+        """This many bytes, or fewer at the end of the file."""
         pieces = []
         try:
             self._stream.seek(place)
@@ -63,7 +63,7 @@ class _Source:
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def all_at(self, place: int, size: int) -> bytes:
-        """So many bytes."""
+        """This many bytes."""
         data = self.at(place, size)
         if len(data) < size:
             raise self.changed()
@@ -144,13 +144,13 @@ class Copier:
                 return number
         return self._new_schema(name, encoding, data, 1)
 
-    def _new_schema(self, name: str, encoding: str, data: bytes, wish: int) -> int:
-        number = _free(self._schemas, wish)
+    def _new_schema(self, name: str, encoding: str, data: bytes, preferred: int) -> int:
+        number = _free(self._schemas, preferred)
         self._schemas[number] = (name, encoding, data)
         self._writer.declare_schema(number, name, encoding, data)
         return number
 
-    def channel(self, schema: int, topic: str, encoding: str, metadata: Mapping[str, str], wish: int = 1) -> int:
+    def channel(self, schema: int, topic: str, encoding: str, metadata: Mapping[str, str], preferred: int = 1) -> int:
         """Declare a new channel in the copy.
 
         Parameters
@@ -163,7 +163,7 @@ class Copier:
             Of its messages.
         metadata : mapping of str to str
             To be stored with it.
-        wish : int, default 1
+        preferred : int, default 1
             The number to take where it is free.
 
         Returns
@@ -171,7 +171,7 @@ class Copier:
         int
             The number.
         """
-        number = _free(self._channels, wish)
+        number = _free(self._channels, preferred)
         self._channels[number] = (schema, topic, encoding, dict(metadata))
         self._writer.declare_channel(number, *self._channels[number])
         return number
@@ -205,7 +205,7 @@ class Copier:
         for number, c in sorted(contents.channels.items()):
             entry = (schemas.get(c.schema_id, 0), c.topic, c.message_encoding, dict(c.metadata))
             same = before.get(self._key(entry))
-            channels[number] = same.pop(0) if same else self.channel(*entry, wish=number)
+            channels[number] = same.pop(0) if same else self.channel(*entry, preferred=number)
         return channels
 
     def copy(self, contents: Contents, channels: Mapping[int, int]) -> Iterator[tuple[int, int]]:
@@ -376,10 +376,10 @@ def _entry(channel: Channel) -> tuple[int, int, str, str, dict[str, str]]:
     return channel.id, channel.schema_id, channel.topic, channel.message_encoding, channel.metadata
 
 
-def _free(taken: Mapping[int, object], wish: int) -> int:
+def _free(taken: Mapping[int, object], preferred: int) -> int:
     """The number wished for, or the next one that is free."""
-    if wish not in taken:
-        return wish
+    if preferred not in taken:
+        return preferred
     number = max(taken) + 1
     if number >= 1 << 16:
         number = next(i for i in range(1, 1 << 16) if i not in taken)

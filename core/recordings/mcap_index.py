@@ -1,6 +1,6 @@
 """What the summary of a whole MCAP file says of its chunks: where messages are, before any of them is read.
 
-What is read by it afterwards is held against it (`mcap_batches`): the head of every chunk, its checksum, the
+What is read by it afterwards is compared with it (`mcap_batches`): the head of every chunk, its checksum, the
 number of messages of every channel. Where anything is not as stated, the file is walked instead
 (`mcap_records.scan`), so a damaged file reads the same either way. Damage to what is not read stays unseen.
 """

@@ -10,12 +10,12 @@ What counts when a file is not whole:
 - A chunk whose checksum or sizes are wrong, or that cannot be decompressed, is left out altogether: a number
   with a flipped bit does more harm than a gap.
 - A record whose length cannot be: reading goes on at the next chunk that the summary knows, if it does.
-- Sizes stated in the file never decide how much memory or time is taken. A record is held against the size of the
+- Sizes stated in the file never decide how much memory or time is taken. A record is compared with the size of the
   file before it is read; a chunk is decompressed piece by piece up to the size it states, at most 256 MiB; all
   chunks together give at most 1000 times the size of the file (or 1 GiB), and at most one record per byte of it (or
   2^20). What goes beyond is left out.
 
-Each of these is told in `Contents.warnings`.
+Each of these is reported in `Contents.warnings`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ FOOTER_SIZE = RECORD.size + 20
 PRIVATE = 0x80  # opcodes from here on mean something to their maker alone
 LATEST = 2**63 - 1  # ns; times are kept with a sign
 _CHUNK_AT = struct.Struct("<16xQ")  # in a chunk's index
-_FIRST_WARNINGS = 3  # of a kind that are told one by one
+_FIRST_WARNINGS = 3  # of a kind that are reported one by one
 _LEAST_RECORDS = 1 << 20
 _LEAST_INFLATED = 1 << 30
 _LARGEST_RATIO = 1000
@@ -74,7 +74,7 @@ def most_records(size: int) -> int:
     Returns
     -------
     int
-        At most so many.
+        At most this many.
     """
     return max(_LEAST_RECORDS, size)
 
@@ -90,7 +90,7 @@ def most_inflated(size: int) -> int:
     Returns
     -------
     int
-        At most so many.
+        At most this many.
     """
     return max(_LEAST_INFLATED, _LARGEST_RATIO * size)
 
@@ -393,7 +393,7 @@ class _Scanner:
         self.summary_schemas: dict[int, Schema] = {}
         self.summary_channels: dict[int, Channel] = {}
         self.known: list[int] = []  # where chunks begin that the summary knows
-        self.told = {"place": 0, "chunk": 0, "definition": 0}  # warnings of each kind
+        self.warned = {"place": 0, "chunk": 0, "definition": 0}  # warnings of each kind
         self.chunk_warnings: list[str] = []
         self.damaged = False
         self.odd_records = 0
@@ -424,7 +424,7 @@ class _Scanner:
             ("chunk", "left out for reasons like these"),
             ("definition", "that contradicts an earlier one"),
         ):
-            if (more := self.told[kind] - _FIRST_WARNINGS) > 0:
+            if (more := self.warned[kind] - _FIRST_WARNINGS) > 0:
                 found.warnings.append(f"{path}: {count(more, f'more {kind}')} {what}")
         if self.odd_records:
             found.warnings.append(
@@ -490,7 +490,7 @@ class _Scanner:
         if record and record.data_section_crc not in (0, self.sums) and not self.damaged:
             self.found.warnings.append(
                 f"{self.found.path}: the checksum of the file is wrong, so a number in it may be; "
-                f"copy it anew if you can"
+                f"copy it again if you can"
             )
 
     def _damage(self, position: int, following: int) -> None:
@@ -500,9 +500,9 @@ class _Scanner:
             self.found.warnings.append(f"{self.found.path}: damaged at byte {position}; {rest} left out")
 
     def _first(self, kind: str) -> bool:
-        """Whether a warning of this kind is one of the first, which are told one by one."""
-        self.told[kind] += 1
-        return self.told[kind] <= _FIRST_WARNINGS
+        """Whether a warning of this kind is one of the first, which are reported one by one."""
+        self.warned[kind] += 1
+        return self.warned[kind] <= _FIRST_WARNINGS
 
     def _bare(self, position: int, opcode: int, content: bytes) -> None:
         """A record outside chunks: continues the current block or begins one."""
@@ -582,7 +582,7 @@ class _Scanner:
             self._block(begin + data_begin, len(data), compression, end, tally, cut)
 
     def _leave_out(self, where: object, why: str, cut: bool = False) -> None:
-        if not cut:  # what little a cut leaves of a chunk's beginning is told with the cut
+        if not cut:  # what little a cut leaves of a chunk's beginning is reported with the cut
             self.damaged = True
             if self._first("chunk"):
                 path = self.found.path

@@ -38,7 +38,7 @@ def _record(opcode: int, body: bytes) -> bytes:
 
 
 def schema_record(number: int, name: str, encoding: str, data: bytes) -> bytes:
-    """A schema as it stands in a file.
+    """A schema as it is in a file.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def schema_record(number: int, name: str, encoding: str, data: bytes) -> bytes:
 
 
 def channel_record(number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
-    """A channel as it stands in a file.
+    """A channel as it is in a file.
 
     Parameters
     ----------

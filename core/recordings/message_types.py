@@ -132,7 +132,7 @@ class Definition:
         return message
 
     def _may_end(self, message: Any, left: int) -> bool:
-        """Whether so many bytes may be left behind a message: no more than `rclpy.serialization` leaves there.
+        """Whether this many bytes may be left behind a message: no more than `rclpy.serialization` leaves there.
 
         It reserves 4 for each empty sequence of 8-byte numbers, and so does every bag written through rosbag2_py.
         """
@@ -167,7 +167,7 @@ class Definition:
         return fields if "stamp" in fields and fields["stamp"].type_name == "builtin_interfaces/msg/Time" else {}
 
     def stamp_ns(self, data: bytes) -> int | None:
-        """`header_stamp_ns` of an encoded message, read from its first bytes where the header stands there.
+        """`header_stamp_ns` of an encoded message, read from its first bytes where the header is there.
 
         Parameters
         ----------
@@ -506,7 +506,7 @@ def _field_type(description: Any) -> FieldType:
 
 def _one_line(error: Exception, limit: int = 160) -> str:
     lines = str(error).splitlines()
-    if len(lines) > 3 and lines[0].startswith("Could not parse"):  # the text, the position, what stands there
+    if len(lines) > 3 and lines[0].startswith("Could not parse"):  # the text, the position, what is there
         return f"it cannot be parsed from '{lines[3].strip()[:40]}' on"
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= limit else text[:limit] + " ..."

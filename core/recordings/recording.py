@@ -61,7 +61,7 @@ class TopicFacts:
     largest_gap : float or None
         Longest log-time step, s; None where there is no step.
     fields : tuple of str
-        Paths that can be signals; `data[0..99]` stands for `data[0]` to `data[99]`.
+        Paths that can be signals; `data[0..99]` means `data[0]` to `data[99]`.
     stamps : {"none", "usable", "zero", "mixed"}
         Whether header stamps can be used.
     stamp_offset : float or None

@@ -28,9 +28,9 @@ def not_mcap(path: Path, head: bytes) -> BagError:
         To be raised.
     """
     if not head:
-        return BagError(f"{path}: the file is empty; record or copy it anew")
+        return BagError(f"{path}: the file is empty; record or copy it again")
     if MAGIC.startswith(head):
-        return BagError(f"{path}: cut after {len(head)} bytes, before any message; record or copy it anew")
+        return BagError(f"{path}: cut after {len(head)} bytes, before any message; record or copy it again")
     if head.startswith(b"version https://git-lfs"):
         return BagError(
             f"{path}: a Git LFS pointer, not the recording itself; fetch it with `git lfs pull` in its repository"
@@ -47,7 +47,7 @@ def not_mcap(path: Path, head: bytes) -> BagError:
             f"--dst {shlex.quote(path.stem + '_mcap')} --dst-storage mcap`"
         )
     if head.startswith(MAGIC[:5]):
-        return BagError(f"{path}: MCAP of another version ({head[5:6]!r}) or damaged in its first bytes; copy it anew")
+        return BagError(f"{path}: MCAP of another version ({head[5:6]!r}) or damaged in its first bytes; copy it again")
     if not head.strip(b"\0"):
         return BagError(f"{path}: begins with zeros only, as after a power cut; there is no recording in it")
     if known := kind_of(path):
@@ -57,7 +57,7 @@ def not_mcap(path: Path, head: bytes) -> BagError:
 
 
 def missing(path: Path) -> BagError:
-    """The error for a path that is not there; names the recordings beside it.
+    """The error for a path that is not there; names the recordings in the same folder.
 
     Parameters
     ----------
@@ -69,10 +69,10 @@ def missing(path: Path) -> BagError:
     BagError
         To be raised.
     """
-    beside: list[Path] = []
+    there: list[Path] = []
     if path.parent.is_dir():
-        beside = sorted((p for p in path.parent.iterdir() if p.suffix == ".mcap"), key=natural)
-    hint = f"; in {path.parent} there are {file_names(beside)}" if beside else "; check the path"
+        there = sorted((p for p in path.parent.iterdir() if p.suffix == ".mcap"), key=natural)
+    hint = f"; in {path.parent} there are {file_names(there)}" if there else "; check the path"
     return BagError(f"{path}: there is no such file or folder{hint}")
 
 
@@ -95,7 +95,7 @@ def os_error(path: Path, error: OSError) -> BagError:
         return BagError(f"{path}: no permission to read it; let its owner allow it with chmod +r")
     if isinstance(error, FileNotFoundError):
         return missing(path)
-    return BagError(f"{path}: cannot be read ({error.strerror or error}); check the disk or copy it anew")
+    return BagError(f"{path}: cannot be read ({error.strerror or error}); check the disk or copy it again")
 
 
 def sqlite_advice(path: Path, sources: list[Path], parts: Iterable[Path]) -> BagError:

@@ -1,4 +1,4 @@
-"""Annotated recordings: a copy of what was recorded, with what the monitor says of it on topics beside it.
+"""Annotated recordings: a copy of what was recorded, with the monitor's verdicts on topics of their own.
 
 The topics, types and bytes are those that the live node would have published had it listened; the log time of a
 verdict is that of the message which decided it. Everything recorded is in the copy unchanged: the bytes of messages,
@@ -62,14 +62,14 @@ class Annotated:
     notes: tuple[str, ...]
 
 
-def targets(wish: str | os.PathLike[str], bags: Sequence[Recording]) -> list[Path]:
+def targets(output: str | os.PathLike[str], bags: Sequence[Recording]) -> list[Path]:
     """Where annotated copies of these recordings go: a file `*.mcap` for one, any other path is a folder.
 
     In a folder, which is made, the copy of `run.mcap` is `run_annotated.mcap`.
 
     Parameters
     ----------
-    wish : path
+    output : path
         What the user named.
     bags : sequence of Recording
         The recordings.
@@ -84,7 +84,7 @@ def targets(wish: str | os.PathLike[str], bags: Sequence[Recording]) -> list[Pat
     BagError
         A file would take the place of another one or lie among the parts of a recording, or is one for several.
     """
-    path = Path(wish)
+    path = Path(output)
     if path.suffix == ".mcap" and not path.is_dir():
         if len(bags) > 1:
             raise BagError(
@@ -125,7 +125,7 @@ def annotate(
     rule: AlarmRule | None = None,
     progress: Progress | None = None,
 ) -> Annotated:
-    """Write a copy of a recording with the verdicts beside it; block by block, whatever its size.
+    """Write a copy of a recording with the verdicts added; block by block, whatever its size.
 
     Parameters
     ----------
@@ -177,11 +177,11 @@ def annotate(
                 for name, kind in TOPICS.items()
             }
             writer.metadata(METADATA, _about(contents, base, model, model_file, rule))
-            said = _Said(writer, VerdictRecords(model.state_names, channels), verdicts, decisions)
+            verdict_stream = _VerdictStream(writer, VerdictRecords(model.state_names, channels), verdicts, decisions)
             total = sum(part.count for part in contents)
-            counted: Iterable[object] = _weave(copier, contents, numbers, said)
+            counted: Iterable[object] = _weave(copier, contents, numbers, verdict_stream)
             if progress is not None:
-                counts = _weave(copier, contents, numbers, said)
+                counts = _weave(copier, contents, numbers, verdict_stream)
                 counted = progress(chain.from_iterable(repeat(None, count) for count in counts), total)
             for _ in counted:
                 pass
@@ -192,24 +192,24 @@ def annotate(
     notes = list(copier.notes)
     if base != NODE:
         notes.append(f"{output}: the recording has topics below {NODE}, so the verdicts are below {base}")
-    return Annotated(output, total, len(said), base, tuple(notes))
+    return Annotated(output, total, len(verdict_stream), base, tuple(notes))
 
 
 def _weave(
-    copier: Copier, contents: Sequence[Contents], numbers: Sequence[Mapping[int, int]], said: _Said
+    copier: Copier, contents: Sequence[Contents], numbers: Sequence[Mapping[int, int]], verdict_stream: _VerdictStream
 ) -> Iterator[int]:
     """Copy block after block, verdicts in between; yields the messages of each block."""
     horizon = 0
     for part, renumbered in zip(contents, numbers, strict=True):
         for count, last in copier.copy(part, renumbered):
             horizon = min(max(horizon, last), LATEST)  # of other topics it may be anything
-            said.until(horizon)
+            verdict_stream.until(horizon)
             yield count
-    said.finish()
+    verdict_stream.finish()
 
 
-class _Said:
-    """What is said of the clock messages, in the order of their decisions, written as the copy goes on."""
+class _VerdictStream:
+    """The verdicts on the clock messages, in the order of their decisions, written as the copy goes on."""
 
     def __init__(self, writer: McapWriter, records: VerdictRecords, verdicts: Verdicts, decisions: Decisions) -> None:
         self._writer, self._records, self._verdicts = writer, records, verdicts

@@ -18,7 +18,7 @@ from uncertain_lti.sampling.transient import Transient
 def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) -> dict[str, Any]:
     """Result of a check as plain data.
 
-    Counts, the first and the longest violation of each state, the spans in which the alarm was raised, widths beside
+    Counts, the first and the longest violation of each state, the spans in which the alarm was raised, widths and
     coverage; with samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no
     verdict).
 

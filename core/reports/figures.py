@@ -1,6 +1,6 @@
 """Figures of what was fitted and what was judged.
 
-Each function returns a matplotlib Figure; `save` writes it, Jupyter shows it. Colours are told apart by colour-blind
+Each function returns a matplotlib Figure; `save` writes it, Jupyter shows it. Colours are distinguished by colour-blind
 people as well (Okabe and Ito 2008; Blues, PuOr). Long recordings are drawn by pixel: in each stretch of time the
 least and the greatest value, and a mark wherever a single sample of it was violated.
 """
@@ -37,7 +37,7 @@ _WIDTH = 10.0  # inches
 _LONGEST_NAME = 34
 
 
-_MANY = 30  # names beside each other are written smaller from here on
+_MANY = 30  # names next to each other are written smaller from here on
 
 
 def envelope_figure(
@@ -169,7 +169,7 @@ def utilisation_figure(
 
 
 def matrices_figure(model: UncertainLTI) -> Any:
-    """A and B beside their half-widths ΔA and ΔB as heat maps with names, in 1/s of normalised quantities.
+    """A and B with their half-widths ΔA and ΔB as heat maps with names, in 1/s of normalised quantities.
 
     A dot marks an element whose half-width is greater than itself: its sign is not known. Columns c (drift) and
     v (noise, not multiplied by Δt) appear where the model has them.
@@ -236,7 +236,7 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
     """Which element contributes how much of the mean one-step width, per state, over the transitions of recordings.
 
     The width of state i is 2 (Δt (ΔA |x| + ΔB |u| + Δc) + v) X_i, eqs. (6)(7) with additive terms: each column is one
-    summand as a share of its mean; the width itself stands beside the names in recorded units.
+    summand as a share of its mean; the width itself is next to the names in recorded units.
 
     Parameters
     ----------
@@ -612,7 +612,7 @@ def _head(figure: Any, verdicts: Verdicts, handles: list[Any]) -> Any:
     judged = int(verdicts.judged.sum())
     total = figure.get_size_inches()[1]
     bad = int(verdicts.violated.sum())
-    said = (
+    outside_text = (
         f"{_count(bad)} violated ({100 * bad / judged:.3g} %)"
         if bad
         else "none violated"
@@ -621,7 +621,10 @@ def _head(figure: Any, verdicts: Verdicts, handles: list[Any]) -> Any:
     )
     name = _short(os.path.basename(verdicts.transient.name) or verdicts.transient.name, 60)
     figure.text(
-        0.1 / _WIDTH, 1 - 0.22 / total, f"{name}: {_count(judged)} verdict{'s' * (judged != 1)}, {said}", fontsize=9
+        0.1 / _WIDTH,
+        1 - 0.22 / total,
+        f"{name}: {_count(judged)} verdict{'s' * (judged != 1)}, {outside_text}",
+        fontsize=9,
     )
     figure.legend(
         handles=handles, loc="upper right", ncols=len(handles), fontsize=7, frameon=False, borderaxespad=0.1,

@@ -39,7 +39,7 @@ def recording_text(transient: Transient) -> str:
 
 
 def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
-    """Summary of a fit: widths beside what the states do, and what the user should know.
+    """Summary of a fit: widths compared with what the states do, and what the user should know.
 
     Parameters
     ----------

@@ -135,14 +135,14 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
     else:
         what, look = "Unknown", "care"
     order = sorted(happened, key=lambda h: ["alarm", "unknown", "violations", "quiet"].index(h["state"]))
-    told = "".join(
+    items = "".join(
         f"<li><b>{_text(os.path.basename(h['recording']) or h['recording'])}</b>: {_text(h['text'])}.</li>"
         for h in order[:5]
     )
     if len(order) > 5:
-        told += f'<li class="soft">and {len(order) - 5} more recordings <a href="#recordings">below</a></li>'
+        items += f'<li class="soft">and {len(order) - 5} more recordings <a href="#recordings">below</a></li>'
     if rely["answer"] == NO and look == "bad":
-        told += '<li class="soft">The model is not to be relied on: the machine may be well, and the model wrong.</li>'
+        items += '<li class="soft">The model is not to be relied on: the machine may be well, and the model wrong.</li>'
     rule = facts["rule"]
     return (
         f"<header><h1>{_text(name)}</h1>"
@@ -152,7 +152,7 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
         '</a><a href="#origin">Where it comes from</a></nav></header>\n'
         f'<div class="cards"><section class="card {tone[rely["answer"]]}"><h2>May I rely on it?</h2>'
         f'<p class="answer">{_ANSWER[rely["answer"]]}</p><ul>{listed}</ul></section>\n'
-        f'<section class="card {look}"><h2>What happened?</h2><p class="answer">{what}</p><ul>{told}</ul></section>'
+        f'<section class="card {look}"><h2>What happened?</h2><p class="answer">{what}</p><ul>{items}</ul></section>'
         "</div>"
     )
 
@@ -393,8 +393,8 @@ def _origin(facts: Mapping[str, Any]) -> str:
         for kind, group in (("state", model["states"]), ("control", model["controls"]))
         for s in group
     ]
-    said = {**model["fit"], "clock": model["clock"] or "-", "median step [s]": number(model["dt_median"])}
-    about = [[_text(key), _text(number(v) if isinstance(v, float) else v)] for key, v in said.items()]
+    origin = {**model["fit"], "clock": model["clock"] or "-", "median step [s]": number(model["dt_median"])}
+    about = [[_text(key), _text(number(v) if isinstance(v, float) else v)] for key, v in origin.items()]
     eigenvalues = ", ".join(f"{a:.4g}{b:+.4g}j" if b else f"{a:.4g}" for a, b in model["eigenvalues"])
     return "\n".join(
         [

@@ -18,7 +18,7 @@ from uncertain_lti.monitor.verdict_messages import NODE
 from uncertain_lti.signals.signal_map import Signal
 
 BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"
-"""Told apart by colour-blind people, on light and on dark ground (Okabe and Ito 2008)."""
+"""Distinguished by colour-blind people, on light and on dark ground (Okabe and Ito 2008)."""
 _PAGE = 6  # states that one page shows
 
 
@@ -142,11 +142,11 @@ def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
         numbers = f" {begin + 1} to {begin + len(page)}" if some else ""
         tabs.append((f"bounds{numbers}", plots))
         colours = _cycle(len(page))
-        said = [
+        flags_and_reasons = [
             (title, [(f"{base}/{topic}/{s.name}/position", c) for s, c in zip(page, colours, strict=True)])
             for topic, title in (("utilisation", "utilisation: -1 and 1 at the bounds"), ("flags", "1: violated"))
         ]
-        tabs.append((f"verdicts{numbers}", [*said, ("alarm", [(f"{base}/violation/data", VIOLATED)])]))
+        tabs.append((f"verdicts{numbers}", [*flags_and_reasons, ("alarm", [(f"{base}/violation/data", VIOLATED)])]))
     lines = [
         "<?xml version='1.0' encoding='UTF-8'?>",
         "<root>",

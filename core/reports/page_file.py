@@ -11,12 +11,12 @@ from uncertain_lti.base.files import target, whole_file
 from uncertain_lti.recordings.recording import Recording
 
 
-def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Recording]) -> Path | None:
+def page_target(output: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Recording]) -> Path | None:
     """Where the page goes; an older page gives way, a recording or the model never.
 
     Parameters
     ----------
-    wish : path or None
+    output : path or None
         What the user named; None for no page.
     model_file : str
         The model, which is never replaced.
@@ -26,16 +26,16 @@ def page_target(wish: str | os.PathLike[str] | None, model_file: str, bags: Sequ
     Returns
     -------
     Path or None
-        The path, or None without a wish.
+        The path, or None if none is asked for.
 
     Raises
     ------
     BagError
         The place is one of them, or its folder is not there.
     """
-    if wish is None:
+    if output is None:
         return None
-    path = Path(wish)
+    path = Path(output)
     for other in (Path(model_file), *(part for bag in bags for part in bag.parts)):
         if path.exists() and other.exists() and path.samefile(other):
             raise BagError(f"{path}: is what the report is about; choose another name")

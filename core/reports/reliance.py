@@ -90,7 +90,7 @@ def _reason(weight: str, about: str, text: str) -> dict[str, str]:
 
 def _fit_reasons(model: UncertainLTI) -> list[dict[str, str]]:
     messages = [str(message) for message in list_of(model.fit_summary.get("messages"))]
-    # of widths it is said below, from the recordings at hand too
+    # widths have a reason of their own below, from the recordings at hand too
     found = [_reason(CARE, "fit", message) for message in messages if not message.startswith("the bounds are over")]
     if not model.fit_summary:
         found.append(_reason(CARE, "fit", "the model file does not say how it was fitted"))
@@ -102,7 +102,7 @@ def _stability_reasons(model: UncertainLTI) -> list[dict[str, str]]:
     if model.sampling.dt_median is None or not math.isfinite(radius := model.spectral_radius()) or radius <= RUNS_AWAY:
         return []
     if any("spectral radius" in str(message) for message in list_of(model.fit_summary.get("messages"))):
-        return []  # the fit said so
+        return []  # the fit reports it
     text = f"the nominal model runs away: a deviation can grow {number(radius)} times in a step (spectral radius)"
     return [_reason(CARE, "stability", text)]
 

@@ -127,7 +127,7 @@ def _how_many(data: dict[str, Any]) -> str:
 
 
 def _interval(low: float, high: float | None) -> str:
-    """A lower limit that is next to nothing is nothing; no upper limit is said so."""
+    """A lower limit that is next to nothing is nothing; no upper limit is stated as such."""
     if high is None:
         return "unknown"
     return f"{number(low if low > 1e-4 * high else 0.0)} to {number(high)}"

@@ -283,7 +283,7 @@ def read_as_fitted(
     BagError
         The recording cannot be read, lacks a topic, or a topic has another type than in the fit.
     SignalError
-        The model names no topics (it was fitted to arrays) or does not say how they are sampled, or goes by stamps
+        The model names no topics (it was fitted to arrays) or does not say how they are sampled, or uses stamps
         that the recording lacks.
     """
     stream = _stream_for_model(recording, signals, progress)
@@ -352,7 +352,7 @@ def _stream_for_model(
     stamps = stream.stamp[stream.topic == signals.topics.index(signals.clock)]
     if signals.time[signals.clock] == "header" and not (stamps > 0).any():
         raise SignalError(
-            f"{bag.path}: no message of {signals.clock} has a stamp, and the model goes by them; fit it to such "
+            f"{bag.path}: no message of {signals.clock} has a stamp, and the model uses them; fit it to such "
             f"recordings, with time: log for that topic"
         )
     return stream

@@ -233,7 +233,7 @@ class Transient:
         time : str, optional
             Column with the instants: numbers in s, or time stamps. Default: the index.
         states : sequence of str
-            Columns. A name that stands twice is taken once if both columns are equal.
+            Columns. A name that is there twice is taken once if both columns are equal.
         controls : sequence of str
             Columns, likewise.
         **options : object
@@ -278,7 +278,7 @@ class Transient:
     ) -> Transient:
         """From a CSV file with one header line; empty cells are NaN.
 
-        A name that stands twice is taken once if both columns are equal.
+        A name that is there twice is taken once if both columns are equal.
 
         Parameters
         ----------
@@ -368,7 +368,7 @@ def _column(columns: Sequence[str], wanted: str, name: str, values: Any) -> int:
     for other in found[1:]:
         first, second = (np.asarray(values(i)) for i in (found[0], other))
         if not ((first == second) | ((first != first) & (second != second))).all():  # NaN in both is the same
-            raise TransientError(f"{name}: column '{wanted}' stands twice with different values; rename one")
+            raise TransientError(f"{name}: column '{wanted}' is there twice with different values; rename one")
     return found[0]
 
 

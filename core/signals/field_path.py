@@ -25,7 +25,7 @@ class FieldPath:
     Dotted attributes; `[3]` is an index, `[fan]` the position of `fan` in the `name` array of the message that
     holds the array (as in sensor_msgs/JointState), `["3"]` a name that looks like an index. Derived: roll,
     pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle
-    in rad (the sampler does the unwrapping, as it knows where a stream starts anew).
+    in rad (the sampler does the unwrapping, as it knows where a stream restarts).
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ class FieldPath:
                 names = parent.get("name")
                 if names is None or names.kind != "string" or names.array is None:
                     raise SignalError(
-                        f"{here}: '[{key}]' needs an array of strings called 'name' beside it; "
+                        f"{here}: '[{key}]' needs an array of strings called 'name' in the same message; "
                         f"give an index instead, for example [0]"
                     )
             current = replace(current, array=None)

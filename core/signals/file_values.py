@@ -39,7 +39,7 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
             node = yaml.compose(stream, Loader=yaml.SafeLoader)
         if repeated := _repeated_key(node):
             raise SignalError(
-                f"{path}: key '{repeated.value}' stands twice in one mapping, again at line "
+                f"{path}: key '{repeated.value}' is twice in one mapping, again at line "
                 f"{repeated.start_mark.line + 1}; keep one"
             )
         data = yaml.SafeLoader("").construct_document(node) if node else None
@@ -60,7 +60,7 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
 
 
 def _repeated_key(top: Any) -> Any:
-    """The first key node that stands twice in its mapping, of which YAML readers keep the last; None without any."""
+    """The first key node that is twice in its mapping, of which YAML readers keep the last; None without any."""
     waiting, seen = [top], set()
     while waiting:
         node = waiting.pop()

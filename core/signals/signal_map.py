@@ -308,10 +308,12 @@ class SignalMap:
         )
         time: dict[str, TimeSource] = {}
         for topic, options in checked_mapping(top.get("topics") or {}, f"{source}: topics", None).items():
-            said = checked_mapping(options, f"{source}: topics: {topic}", {"time"}).get("time")
-            if said not in ("header", "log"):
-                raise SignalError(f"{source}: topics: {topic}: time is {reprlib.repr(said)}; write header or log")
-            time[topic] = said
+            source_of_time = checked_mapping(options, f"{source}: topics: {topic}", {"time"}).get("time")
+            if source_of_time not in ("header", "log"):
+                raise SignalError(
+                    f"{source}: topics: {topic}: time is {reprlib.repr(source_of_time)}; write header or log"
+                )
+            time[topic] = source_of_time
         additive = top.get("additive")
         if additive not in (None, "none", "disturbance", "noise", "both"):
             raise SignalError(f"{source}: additive is {reprlib.repr(additive)}; write none, disturbance, noise or both")
