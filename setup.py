@@ -1,5 +1,7 @@
 """Metadata and layout of the package, read by pip and by colcon; tool settings are in pyproject.toml."""
 
+import runpy
+import sys
 from pathlib import Path
 from zlib import crc32
 
@@ -19,6 +21,39 @@ def share(folder: str) -> list[tuple[str, list[str]]]:
             relative = path.relative_to(ROOT)
             by_folder.setdefault(f"share/{NAME}/{relative.parent}", []).append(str(relative))
     return list(by_folder.items())
+
+
+def compiled() -> list[Extension]:
+    """The modules of the live chain as C extensions, from the files that run uncompiled; none without Cython 3.
+
+    Each is optional: without a C compiler or Python's headers, or where compiling fails, Python runs the same files.
+    Contraction of a * b + c is off, so that both give the same bits.
+    """
+    try:
+        from Cython import __version__
+        from Cython.Build import cythonize
+
+        if int(__version__.split(".")[0]) < 3:
+            return []
+        extensions = []
+        for dotted in runpy.run_path(str(ROOT / "core/base/compiled.py"))["MODULES"]:
+            room, name = dotted.split(".")
+            source = (ROOT / "core" / room / f"{name}.py").read_bytes()
+            copy = Path("build/compiled") / room / f"_{name}.py"
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            text = source + f"\nSOURCE = {crc32(source)}\n".encode()
+            if not copy.exists() or copy.read_bytes() != text:
+                copy.write_bytes(text)
+            arguments = ["-O3", "-ffp-contract=off"]
+            extensions.append(Extension(f"uncertain_lti.{room}._{name}", [str(copy)], extra_compile_args=arguments))
+        directives = {"language_level": 3, "boundscheck": True, "wraparound": True, "binding": True}
+        extensions = cythonize(extensions, compiler_directives=directives, quiet=True)
+    except Exception as error:  # a compiler of another kind fails in its own way, and must not end an installation
+        print(f"not compiled, so the live chain runs in Python: {error!r}", file=sys.stderr)
+        return []
+    for extension in extensions:
+        extension.optional = True  # cythonize drops it
+    return extensions
 
 
 extras = {
@@ -68,16 +103,7 @@ setup(
         *share("config"),
         *share("launch"),
     ],
-    # optional: without a C compiler and Python's headers the live node does in Python what is in there.
-    ext_modules=[
-        Extension(
-            f"{NAME}._course",
-            [f"{NAME}/_course.c"],
-            define_macros=[("SOURCE", str(crc32((ROOT / NAME / "_course.c").read_bytes())))],
-            extra_compile_args=["-O3", "-ffp-contract=off"],
-            optional=True,
-        )
-    ],
+    ext_modules=compiled(),
     zip_safe=False,
     install_requires=["lz4", "mcap", "numpy>=1.26", "PyYAML", "rosbags", "tqdm", "zstandard"],
     extras_require=extras,

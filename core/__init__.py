@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from uncertain_lti.identification import fit as fit
+    from uncertain_lti.model.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.model.uncertain_lti import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor as EnvelopeMonitor
-    from uncertain_lti.sampling.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.sampling.reading import read_transients as read_transients
     from uncertain_lti.sampling.transient import Transient as Transient
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "EnvelopeMonitor": "monitor.envelope_monitor",
-    "OperatingPoint": "sampling.operating_point",
+    "OperatingPoint": "model.operating_point",
     "SignalMap": "signals.signal_map",
     "Transient": "sampling.transient",
     "UncertainLTI": "model.uncertain_lti",

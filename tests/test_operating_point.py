@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from uncertain_lti.base.errors import TransientError
-from uncertain_lti.sampling.operating_point import (
+from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.sampling.steady_state import (
     STILL_BAND,
     STILL_SAMPLES,
-    OperatingPoint,
     resolve_auto,
     still_stretches,
 )

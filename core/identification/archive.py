@@ -20,9 +20,9 @@ from uncertain_lti.identification.problem import Additive, Columns, Problem, ass
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import InfeasibleError
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
-from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.reading import load_signals, sample, time_source
 from uncertain_lti.sampling.sampler import resolve
 from uncertain_lti.sampling.streams import read_stream

@@ -25,8 +25,8 @@ from scipy.optimize import golden
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 
 EXPONENTS = (8.0, 32.0, 128.0, 512.0, np.inf)

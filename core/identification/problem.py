@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.sampling.operating_point import OperatingPoint
+from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 
 Additive = Literal["none", "disturbance", "noise", "both"]

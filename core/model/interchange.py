@@ -14,11 +14,12 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
+from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 DRIFT = "drift"
 """Name of the input, to be held at 1, that carries the drift c of a model in a state-space system."""
-_MATRICES = ("A", "B", "dA", "dB", "c", "dc", "v")
+_VECTORS = tuple(name for name in ARRAYS if SHAPES[name].regressor == "1")
 
 
 def to_control(model: Any, dt: float | None = None, recorded: bool = False) -> Any:
@@ -146,8 +147,8 @@ def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
     point, sampling = model.operating_point, model.sampling
     # first, so that a file that was cut has nothing, or everything
     data: dict[str, Any] = {"model_json": json.dumps(model.to_dict())}
-    data |= {name: np.atleast_2d(getattr(model, name)) for name in _MATRICES}
-    for name in ("c", "dc", "v"):
+    data |= {name: np.atleast_2d(getattr(model, name)) for name in ARRAYS}
+    for name in _VECTORS:
         data[name] = data[name].T
     for name, values in (("x_steady", point.x_s), ("x_scale", point.X), ("u_steady", point.u_s), ("u_scale", point.U)):
         data[name] = values[:, None]
@@ -188,12 +189,12 @@ def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
     except Exception as error:  # a damaged file leads the reader anywhere
         text = (str(error).splitlines() or [type(error).__name__])[0]
         raise ModelError(f"{path}: is not a MATLAB file that can be read ({text}); write it anew") from None
-    for name in ("A", "B", "dA", "dB"):
+    for name in REQUIRED:
         if name not in data:
             raise ModelError(f"{path}: there is no variable '{name}'; a model needs A, B, dA and dB")
-    matrices = {name: _real(data[name], name, path) for name in _MATRICES if name in data}
+    matrices = {name: _real(data[name], name, path) for name in ARRAYS if name in data}
     n, m = len(matrices["A"]), matrices["B"].shape[1] if matrices["B"].size else 0
-    for name in ("c", "dc", "v"):
+    for name in _VECTORS:
         if name in matrices:
             matrices[name] = matrices[name].ravel()
     matrices["B"], matrices["dB"] = (
@@ -208,8 +209,7 @@ def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
         signals = SignalMap(
             _signals(data, "state", "x", n, path), _signals(data, "control", "u", m, path), source=os.fspath(path)
         )
-        given = [matrices.get(name) for name in ("c", "dc", "v")]
-        return model_class(*(matrices[name] for name in ("A", "B", "dA", "dB")), *given, signals=signals)
+        return model_class(**{name: matrices.get(name) for name in ARRAYS}, signals=signals)
     except (ValueError, LookupError) as error:
         raise ModelError(f"{path}: 'model_json' or the names are damaged ({error}); write the file anew") from None
     except (ModelError, SignalError) as error:

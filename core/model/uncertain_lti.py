@@ -6,9 +6,8 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,14 +20,16 @@ from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.bounds import centre_and_half, lower_of, upper_of
 from uncertain_lti.model.domain import Domain, Sampling
-from uncertain_lti.sampling.operating_point import OperatingPoint
+from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, regressors, tables
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 FORMAT = "uncertain-lti/1"
 MAX_FILE_BYTES = 64 * 2**20
-_BLOCK = 4096  # samples per block of the vectorised path: stays in the cache
+_BLOCK = 65536  # products per block of the vectorised path: they stay in the cache
 
 
 class UncertainLTI:
@@ -81,6 +82,11 @@ class UncertainLTI:
         fit_summary: Mapping[str, Any] | None = None,
         validation: Mapping[str, Any] | None = None,
     ) -> None:
+        self.dA: Array
+        self.dB: Array
+        self.c: Array
+        self.dc: Array
+        self.v: Array
         self.A = _array(A, "A", None)
         n = len(self.A) if self.A.ndim else 0
         if self.A.shape != (n, n) or n == 0:
@@ -91,13 +97,13 @@ class UncertainLTI:
         if self.B.ndim != 2 or self.B.shape[0] != n:
             raise ModelError(f"B has shape {self.B.shape}; it must have {plural(n, 'row')}, one per state")
         m = self.B.shape[1]
-        zeros = np.zeros(n)
-        self.dA = _array(dA, "dA", (n, n), half_width=True)
-        self.dB = _array(dB, "dB", (n, m), half_width=True)
-        self.c = _array(zeros if c is None else c, "c", (n,))
-        self.dc = _array(zeros if dc is None else dc, "dc", (n,), half_width=True)
-        self.v = _array(zeros if v is None else v, "v", (n,), half_width=True)
-        for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+        given: dict[str, Any] = {"dA": dA, "dB": dB, "c": c, "dc": dc, "v": v}
+        for name, value in given.items():
+            shape = SHAPES[name].shape(n, m)
+            half_width = name in HALF_WIDTHS
+            value = np.zeros(shape) if value is None and name not in REQUIRED else value
+            setattr(self, name, _array(value, name, shape, half_width))
+        for name in ARRAYS:
             getattr(self, name).flags.writeable = False
         if signals is None:
             signals = SignalMap(
@@ -118,12 +124,8 @@ class UncertainLTI:
         self.alarm_rule = alarm_rule or AlarmRule()
         self.fit_summary = dict(fit_summary or {})
         self.validation = dict(validation or {})
-        # columns, contiguous: the verdict arithmetic walks over them in this order and no other
-        self._nominal = [np.ascontiguousarray(col) for col in np.hstack([self.A, self.B]).T]
-        self._spread = [np.ascontiguousarray(col) for col in np.hstack([self.dA, self.dB]).T]
-        self._both = np.stack([self._nominal, self._spread], axis=1)  # (n + m, 2, n): a step of the walk per row
-        self._then = np.stack([self.c, self.dc])
-        self._sum = _sum_of_rows(self._both.shape)
+        self.tables = tables({name: getattr(self, name) for name in ARRAYS})
+        self._block = max(1, _BLOCK // (n * (n + m + 1)))
 
     @property
     def n(self) -> int:
@@ -192,50 +194,31 @@ class UncertainLTI:
         if x.shape[-1:] != (self.n,) or u.shape[-1:] != (self.m,):
             raise ModelError(f"x has shape {x.shape} and u {u.shape}; they must end in {self.n} and {self.m}")
         lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1], dt.shape)
-        if not lead:
-            return self.one_centre_and_half(np.concatenate((x, u)), float(dt))
         count = math.prod(lead)  # not -1: that says nothing where there are no controls
         flat_x = np.broadcast_to(x, (*lead, self.n)).reshape(count, self.n)
         flat_u = np.broadcast_to(u, (*lead, self.m)).reshape(count, self.m)
-        flat_dt = np.broadcast_to(dt, lead).reshape(count)
         centre, half = np.empty((self.n, count)), np.empty((self.n, count))
-        for start in range(0, count, _BLOCK):
-            part = slice(start, start + _BLOCK)
-            z = np.vstack([flat_x[part].T, flat_u[part].T])
-            self.columns_centre_and_half(z, flat_dt[part], centre[:, part], half[:, part])
+        self.columns_centre_and_half(
+            np.vstack([flat_x.T, flat_u.T]), np.broadcast_to(dt, lead).reshape(count), centre, half
+        )
         return centre.T.reshape(*lead, self.n), half.T.reshape(*lead, self.n)
 
-    # Both paths below do the same operations on each element in the same order (and never BLAS, whose order
-    # depends on shapes), so one sample and a million give the same bits.
-
-    def one_centre_and_half(self, z: Array, dt: float) -> tuple[Array, Array]:
-        """`centre_and_half` for one sample z = [x; u] (n + m,)."""
-        factors = np.empty((len(z), 2, 1))
-        factors[:, 0, 0] = z
-        np.abs(z, out=factors[:, 1, 0])
-        total = self._sum(self._both * factors)
-        total += self._then
-        total *= dt
-        rate, half = total
-        rate += z[: len(rate)]
-        half += self.v
-        return rate, half
-
     def columns_centre_and_half(self, z: Array, dt: Array, centre: Array, half: Array) -> None:
-        """`centre_and_half` for samples in columns, into given arrays: z (n + m, K), dt (K,), centre, half (n, K)."""
-        size = np.abs(z)
-        product = np.empty(centre.shape)
-        np.multiply(z[0], self._nominal[0][:, None], out=centre)
-        np.multiply(size[0], self._spread[0][:, None], out=half)
-        for j in range(1, self.n + self.m):
-            centre += np.multiply(z[j], self._nominal[j][:, None], out=product)
-            half += np.multiply(size[j], self._spread[j][:, None], out=product)
-        centre += self.c[:, None]
-        half += self.dc[:, None]
-        centre *= dt
-        half *= dt
-        centre += z[: self.n]  # x + Δt (...), to the bit: addition commutes
-        half += self.v[:, None]
+        """`centre_and_half` of samples in columns, into given arrays.
+
+        Parameters
+        ----------
+        z : array (n + m, K)
+            Normalised [x; u].
+        dt : array (K,)
+            s.
+        centre, half : array (n, K)
+            Take the result.
+        """
+        for start in range(0, len(dt), self._block):
+            part = slice(start, start + self._block)
+            phi = regressors(z[: self.n, part], z[self.n :, part])
+            centre[:, part], half[:, part] = centre_and_half(*self.tables, phi, dt[part])
 
     def bounds(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0) -> tuple[Array, Array]:
         """One-step bounds, Leibov (2006), eqs. (6)(7) with the additive terms.
@@ -262,8 +245,7 @@ class UncertainLTI:
             Shapes do not fit.
         """
         centre, half = self.centre_and_half(x, u, dt)
-        half = half * margin
-        return centre - half, centre + half
+        return np.asarray(lower_of(centre, half, margin)), np.asarray(upper_of(centre, half, margin))
 
     # --- the nominal model on its own ---
 
@@ -351,8 +333,7 @@ class UncertainLTI:
         arguments = {
             name: getattr(self, name)
             for name in (
-                "A", "B", "dA", "dB", "c", "dc", "v", "signals", "sampling", "domain", "alarm_rule", "fit_summary",
-                "validation",
+                *ARRAYS, "signals", "sampling", "domain", "alarm_rule", "fit_summary", "validation"
             )
         }  # fmt: skip
         return UncertainLTI(**{**arguments, **changes})
@@ -418,7 +399,7 @@ class UncertainLTI:
                 "min_step": s.min_step,
                 "max_skew": s.max_skew,
             },
-            **{name: getattr(self, name).tolist() for name in ("A", "B", "dA", "dB", "c", "dc", "v")},
+            **{name: getattr(self, name).tolist() for name in ARRAYS},
             "domain": {
                 name: [v if math.isfinite(v) else None for v in getattr(self.domain, name).tolist()]
                 for name in ("x_min", "x_max", "u_min", "u_max")
@@ -503,10 +484,9 @@ class UncertainLTI:
                 f"or use the version that wrote it"
             )
         known = {
-            "format", "states", "controls", "sampling", "A", "B", "dA", "dB", "c", "dc", "v",
-            "domain", "alarm", "fit", "validation",
+            "format", "states", "controls", "sampling", *ARRAYS, "domain", "alarm", "fit", "validation",
         }  # fmt: skip
-        for name in ("states", "controls", "sampling", "A", "B", "dA", "dB"):
+        for name in ("states", "controls", "sampling", *REQUIRED):
             if name not in data:
                 raise ModelError(f"field '{name}' is missing; fit the model again")
         for name in data:
@@ -560,9 +540,9 @@ class UncertainLTI:
                 raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
         if "margin" in alarm:
             alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
+        arrays: dict[str, Any] = {name: data.get(name) for name in ARRAYS}
         return cls(
-            *(data[name] for name in ("A", "B", "dA", "dB")),
-            *(data.get(name) for name in ("c", "dc", "v")),
+            **arrays,
             signals=signals,
             sampling=sampling,
             domain=domain,
@@ -570,30 +550,6 @@ class UncertainLTI:
             fit_summary=_object(data.get("fit", {}), "fit"),
             validation=_object(data.get("validation", {}), "validation"),
         )
-
-
-@cache
-def _sum_of_rows(shape: tuple[int, ...]) -> Callable[[Array], Array]:
-    """Sum over the first axis, row after row.
-
-    `add.reduce` does it in this order and is several times faster than `add.accumulate`, which is defined to; as its
-    order is nowhere stated, it is tried on this shape first.
-    """
-    rows = np.random.default_rng(0).normal(size=shape)
-    in_order = rows[0].copy()
-    for row in rows[1:]:
-        in_order += row
-    if np.add.reduce(rows, axis=0).tobytes() == in_order.tobytes():
-        return _reduced
-    return _accumulated
-
-
-def _reduced(rows: Array) -> Array:
-    return np.asarray(np.add.reduce(rows, axis=0))
-
-
-def _accumulated(rows: Array) -> Array:
-    return np.asarray(np.add.accumulate(rows, axis=0)[-1])
 
 
 def _sampling(signals: SignalMap) -> Sampling:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import operator
 import struct
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -18,14 +16,26 @@ from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.bounds import (
+    FLAGS,
+    LOWER,
+    UPPER,
+    UTILISATION,
+    Judge,
+    Judgement,
+    contained,
+    lower_of,
+    upper_of,
+    utilisation_of,
+)
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.operating_point import OperatingPoint
+from uncertain_lti.monitor.alarm import AlarmWindow, raised
 from uncertain_lti.sampling.sampler import Status, Step
 from uncertain_lti.sampling.transient import Transient
 
 NUMBERS = ("flags", "lower", "upper", "state", "utilisation")
 """What a verdict says of each state."""
-_SMALL = 150  # elements of [A B] up to which plain floats are faster than arrays
+_OF_JUDGEMENT = {"lower": LOWER, "upper": UPPER, "utilisation": UTILISATION, "flags": FLAGS}
 
 
 class Verdict:
@@ -41,10 +51,11 @@ class Verdict:
 
     __slots__ = ("t_ns", "arrival_ns", "status", "outside_domain", "alarm", "_after", "_judgement")
 
-    def __init__(self, step: Step, outside_domain: bool, alarm: bool, judgement: _Floats | _Arrays | None) -> None:
+    def __init__(self, step: Step, alarm: bool, judgement: Judgement | None) -> None:
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, step.status
         self._after = step.after
-        self.outside_domain, self.alarm = outside_domain, alarm
+        self.outside_domain = judgement is not None and judgement.outside_domain
+        self.alarm = alarm
         self._judgement = judgement
 
     def __repr__(self) -> str:
@@ -75,15 +86,16 @@ class Verdict:
             return list(self._after)
         if self._judgement is None:
             return [math.nan] * len(self._after)
-        found = getattr(self._judgement, name)()
-        return found if isinstance(found, list) else list[float](found.tolist())
+        return list[float](self._judgement.numbers(_OF_JUDGEMENT[name]).tolist())
 
     def packed(self, name: str) -> bytes:
         """The same as little-endian doubles."""
         found = self._after
         if name != "state":
-            found = [math.nan] * len(found) if self._judgement is None else getattr(self._judgement, name)()
-        return _packer(len(found))(*found) if isinstance(found, list) else bytes(np.asarray(found, "<f8").tobytes())
+            if self._judgement is not None:
+                return bytes(self._judgement.numbers(_OF_JUDGEMENT[name]).tobytes())
+            found = [math.nan] * len(found)
+        return _packer(len(found))(*found)
 
     @property
     def flags(self) -> Array:
@@ -114,62 +126,6 @@ class Verdict:
 @cache
 def _packer(n: int) -> Callable[..., bytes]:
     return struct.Struct(f"<{n}d").pack
-
-
-class _Floats:
-    """Centre, half-width, bounds and sample of one verdict, normalised, n each; where the sample is inside."""
-
-    __slots__ = ("point", "centre", "half", "low", "high", "x_next", "inside", "contained")
-
-    def __init__(self, point: list[tuple[float, float]], x_next: list[float]) -> None:
-        self.point, self.x_next = point, x_next
-        self.centre, self.half, self.low, self.high = list[float](), list[float](), list[float](), list[float]()
-        self.inside: list[bool] = []
-        self.contained = True
-
-    def contained_or(self, uncounted: NDArray[np.bool_]) -> bool:
-        return all(map(operator.or_, self.inside, uncounted.tolist()))
-
-    def flags(self) -> list[float]:
-        return [0.0 if inside else 1.0 for inside in self.inside]
-
-    def lower(self) -> list[float]:
-        return [steady + scale * value for (steady, scale), value in zip(self.point, self.low, strict=True)]
-
-    def upper(self) -> list[float]:
-        return [steady + scale * value for (steady, scale), value in zip(self.point, self.high, strict=True)]
-
-    def utilisation(self) -> list[float]:
-        return [_ratio(x - c, half) for x, c, half in zip(self.x_next, self.centre, self.half, strict=True)]
-
-
-class _Arrays:
-    """The same as arrays (n,)."""
-
-    __slots__ = ("point", "centre", "half", "low", "high", "x_next", "inside", "contained")
-
-    def __init__(
-        self, point: OperatingPoint, centre: Array, half: Array, low: Array, high: Array, x_next: Array
-    ) -> None:
-        self.point, self.centre, self.half = point, centre, half
-        self.low, self.high, self.x_next = low, high, x_next
-        self.inside = (low <= x_next) & (x_next <= high)
-        self.contained = bool(self.inside.all())
-
-    def contained_or(self, uncounted: NDArray[np.bool_]) -> bool:
-        return bool((self.inside | uncounted).all())
-
-    def flags(self) -> Array:
-        return np.subtract(1.0, self.inside, dtype=np.float64)
-
-    def lower(self) -> Array:
-        return self.point.recorded_x(self.low)
-
-    def upper(self) -> Array:
-        return self.point.recorded_x(self.high)
-
-    def utilisation(self) -> Array:
-        return _utilisation(self.x_next - self.centre, self.half)
 
 
 @dataclass(frozen=True, repr=False)
@@ -266,26 +222,17 @@ class EnvelopeMonitor:
         if len(self.masked) == len(names):
             raise ModelError("every state of the model is masked; leave at least one that can raise the alarm")
         self._counted = np.array([name not in masked for name in names])
-        self._uncounted, self._all_count = ~self._counted, not self.masked
         point, domain = model.operating_point, model.domain
-        # z(t_k) = [x; u] and x_next beside each other, as both are normalised alike
-        self._steady = np.concatenate((point.x_s, point.u_s, point.x_s))
-        self._scale = np.concatenate((point.X, point.U, point.X))
-        self._least = np.concatenate((domain.x_min, domain.u_min))
-        self._greatest = np.concatenate((domain.x_max, domain.u_max))
-        self._limited = bool(np.isfinite(self._least).any() or np.isfinite(self._greatest).any())
-        size = model.n + model.m
-        self._small = model.n * size <= _SMALL
-        self._point = list(zip(self._steady[:size].tolist(), self._scale[:size].tolist(), strict=True))
-        self._point_x = self._point[: model.n]
-        self._limits = list(zip(self._least.tolist(), self._greatest.tolist(), strict=True))
-        self._rows = [
-            (a[0], d[0], list(zip(a[1:], d[1:], strict=True)), c, dc, v)
-            for a, d, c, dc, v in zip(*(row.tolist() for row in self.rows), strict=True)
-        ]
-        self.alarm = False
-        self._recent: deque[bool] = deque()
-        self._violations = 0  # among the recent verdicts
+        self._judge = Judge(
+            *model.tables,
+            np.concatenate((point.x_s, point.u_s)),
+            np.concatenate((point.X, point.U)),
+            np.concatenate((domain.x_min, domain.u_min)),
+            np.concatenate((domain.x_max, domain.u_max)),
+            self.rule.margin,
+            self._counted,
+        )
+        self._window = AlarmWindow(self.rule)
 
     def __repr__(self) -> str:
         rule = self.rule
@@ -294,11 +241,14 @@ class EnvelopeMonitor:
             f"EnvelopeMonitor({self.model!r}; alarm {rule.violations} of {rule.window}, margin {rule.margin:g}{masked})"
         )
 
+    @property
+    def alarm(self) -> bool:
+        """The alarm after the last verdict."""
+        return self._window.alarm
+
     def reset(self) -> None:
         """Forget the recent verdicts and the alarm."""
-        self._recent.clear()
-        self._violations = 0
-        self.alarm = False
+        self._window.reset()
 
     def predict(self, x: ArrayLike, u: ArrayLike, dt: float) -> tuple[Array, Array]:
         """Bounds (lower, upper), each (n,), one step of dt s after x (n,), u (m,); all in recorded units."""
@@ -312,95 +262,26 @@ class EnvelopeMonitor:
 
     def look(self, step: Step) -> Verdict:
         """Verdict on a complete step that counts nowhere."""
-        judgement, outside = self._by_floats(step) if self._small else self._by_arrays(step)
-        return Verdict(step, outside, self.alarm, judgement)
-
-    @property
-    def window(self) -> bytes:
-        """The verdicts that the alarm looks at, oldest first; 1 for a violation that counts."""
-        return bytes(self._recent)
-
-    def go_on(self, window: bytes) -> None:
-        """The verdicts that the alarm looks at were given elsewhere, and the alarm has not turned."""
-        self._recent = deque(map(bool, window))
-        self._violations = sum(window)
-
-    @property
-    def counted(self) -> bytes:
-        """Of each state whether its violations count for the alarm (n,)."""
-        return self._counted.tobytes()
-
-    @property
-    def rows(self) -> tuple[Array, Array, Array, Array, Array]:
-        """[A B], [dA dB] (n, n + m), c, dc, v (n,) as the bounds take them."""
-        model = self.model
-        return np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB]), model.c, model.dc, model.v
-
-    @property
-    def point(self) -> tuple[Array, Array, Array, Array]:
-        """Steady values, scales, and the least and greatest normalised values seen in the fit, of [x; u] (n + m,)."""
-        size = self.model.n + self.model.m
-        return self._steady[:size], self._scale[:size], self._least, self._greatest
+        return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
     def judge(self, step: Step, armed: bool = True) -> Verdict:
         """Verdict on one step of the sampler.
 
-        armed: whether it may count for the alarm; otherwise there is none, and the window starts anew.
+        Parameters
+        ----------
+        step : Step
+        armed : bool
+            Whether it may count for the alarm; otherwise there is none, and the window is empty afterwards.
         """
+        window = self._window
         if step.status is Status.RESET or not armed:
-            self.reset()
+            window.reset()
         if step.status is not Status.OK:
-            return Verdict(step, False, self.alarm, None)
-        judgement, outside = self._by_floats(step) if self._small else self._by_arrays(step)
+            return Verdict(step, window.alarm, None)
+        judgement = self._judge.judge(step.before, step.after, step.dt)
         if armed:
-            self._count(not (judgement.contained if self._all_count else judgement.contained_or(self._uncounted)))
-        return Verdict(step, outside, self.alarm, judgement)
-
-    # The two below, and `_judge`, do the same operations on each element in the same order, for the same bits.
-
-    def _by_arrays(self, step: Step) -> tuple[_Arrays, bool]:
-        n, margin = self.model.n, self.rule.margin
-        normalised = (np.array([*step.before, *step.after], dtype=np.float64) - self._steady) / self._scale
-        z = normalised[:-n]
-        centre, half = self.model.one_centre_and_half(z, step.dt)
-        judged = half if margin == 1.0 else half * margin
-        outside = self._limited and bool(((z < self._least) | (z > self._greatest)).any())
-        point = self.model.operating_point
-        return _Arrays(point, centre, half, centre - judged, centre + judged, normalised[-n:]), outside
-
-    def _by_floats(self, step: Step) -> tuple[_Floats, bool]:
-        margin, dt, point = self.rule.margin, step.dt, self._point
-        z = [(value - steady) / scale for value, (steady, scale) in zip(step.before, point, strict=True)]
-        x_next = [(value - steady) / scale for value, (steady, scale) in zip(step.after, point, strict=False)]
-        size = [abs(value) for value in z]
-        (z0, *z_others), (s0, *s_others) = z, size
-        found = _Floats(self._point_x, x_next)
-        for x, after, (a0, d0, others, c, dc, v) in zip(z, x_next, self._rows, strict=False):
-            rate, spread = a0 * z0, d0 * s0
-            for (a, d), zj, sj in zip(others, z_others, s_others, strict=True):
-                rate += a * zj
-                spread += d * sj
-            centre, half = (rate + c) * dt + x, (spread + dc) * dt + v
-            judged = half if margin == 1.0 else half * margin
-            low, high = centre - judged, centre + judged
-            inside = low <= after <= high
-            found.contained &= inside
-            found.centre.append(centre)
-            found.half.append(half)
-            found.low.append(low)
-            found.high.append(high)
-            found.inside.append(inside)
-        return found, self._limited and any(
-            value < least or value > most for value, (least, most) in zip(z, self._limits, strict=True)
-        )
-
-    def _count(self, violated: bool) -> None:
-        recent = self._recent
-        if len(recent) == self.rule.window:
-            self._violations -= recent.popleft()
-        recent.append(violated)
-        self._violations += violated
-        self.alarm = self._violations >= self.rule.violations
+            window.push(judgement.violation)
+        return Verdict(step, window.alarm, judgement)
 
     def check(self, transient: Transient) -> Verdicts:
         """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.
@@ -425,7 +306,7 @@ class EnvelopeMonitor:
         judged, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         x, u = point.normalise_x(steps.x), point.normalise_u(steps.u)
         x_next = point.normalise_x(steps.x_next)
-        flags[arrival], low, high, utilisation[arrival] = self._judge(x, u, steps.dt, x_next)
+        flags[arrival], low, high, utilisation[arrival] = self._judge_all(x, u, steps.dt, x_next)
         lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
         judged[arrival] = True
         outside[arrival] = model.domain.outside(x, u)
@@ -433,35 +314,14 @@ class EnvelopeMonitor:
         alarm = np.zeros(count, dtype=bool)
         resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
         for start, stop in zip([0, *resets], [*resets, count], strict=True):
-            alarm[start:stop] = self._m_of_n(judged[start:stop], violated[start:stop])
+            after = raised(violated[start:stop][judged[start:stop]], self.rule)
+            held = np.concatenate([[False], after])  # without a verdict the last one stands
+            alarm[start:stop] = held[np.cumsum(judged[start:stop])]
         return Verdicts(transient, flags, lower, upper, utilisation, judged, outside, alarm)
 
-    def _judge(self, x: Array, u: Array, dt: Array | np.float64, x_next: Array) -> tuple[Array, Array, Array, Array]:
-        """flags, lower, upper (normalised), utilisation of transitions (..., n), (..., m), (...), (..., n)."""
+    def _judge_all(self, x: Array, u: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array]:
+        """flags, lower, upper (normalised), utilisation of transitions (K, n), (K, m), (K,), (K, n)."""
         centre, half = self.model.centre_and_half(x, u, dt)
-        judged_half = half * self.rule.margin
-        lower, upper = centre - judged_half, centre + judged_half
-        inside = (lower <= x_next) & (x_next <= upper)
-        flags = np.where(inside, 0.0, 1.0)
-        return flags, lower, upper, _utilisation(x_next - centre, half)
-
-    def _m_of_n(self, judged: NDArray[np.bool_], violated: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        total = np.concatenate([[0], np.cumsum(violated[judged])])
-        ends = np.arange(1, len(total))
-        recent = total[ends] - total[np.maximum(ends - self.rule.window, 0)]
-        raised = np.concatenate([[False], recent >= self.rule.violations])
-        held: NDArray[np.bool_] = raised[np.cumsum(judged)]  # without a verdict the last one stands
-        return held
-
-
-def _ratio(difference: float, half: float) -> float:
-    if difference == 0.0:
-        return 0.0
-    if half == 0.0:
-        return math.copysign(math.inf, difference) if difference == difference else difference
-    return difference / half
-
-
-def _utilisation(difference: Array, half: Array) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return np.where(difference == 0.0, 0.0, difference / half)
+        lower, upper = lower_of(centre, half, self.rule.margin), upper_of(centre, half, self.rule.margin)
+        flags = np.where(contained(lower, x_next, upper), 0.0, 1.0)
+        return flags, np.asarray(lower), np.asarray(upper), np.asarray(utilisation_of(x_next - centre, half))

@@ -10,9 +10,9 @@ from scipy.optimize import root
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import UncertainLTIError
+from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.plants.turbofan import Engine, GasPath, GasPathSolver, Health, engine
 from uncertain_lti.plants.turbofan_components import T_STANDARD
-from uncertain_lti.sampling.operating_point import OperatingPoint
 
 IDLE, MAXIMUM = 12.0, 68.0
 """Power-lever angle, deg."""

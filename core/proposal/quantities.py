@@ -9,7 +9,7 @@ import numpy as np
 
 from uncertain_lti.proposal.candidates import Candidate, Source
 from uncertain_lti.proposal.effects import held
-from uncertain_lti.sampling.operating_point import resolve_auto
+from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.signal_map import Signal
 
 

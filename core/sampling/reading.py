@@ -15,10 +15,10 @@ from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
-from uncertain_lti.sampling.operating_point import resolve_auto
 from uncertain_lti.sampling.reading_processes import processes_for, read_streams
 from uncertain_lti.sampling.sampler import Sampler, Status, resolve
 from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, sample_arrays
+from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.sampling.streams import Stream, check_paths, read_stream
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath
@@ -186,7 +186,7 @@ def read_transients(
     """Read recordings as transients, all cut by one resolved signal map.
 
     What the map leaves open is resolved over all recordings together: time sources, clock, max_gap, message types,
-    and `auto` steady states and scales (rules: `SignalMap`, `operating_point.resolve_auto`). The resolved map is
+    and `auto` steady states and scales (rules: `SignalMap`, `steady_state.resolve_auto`). The resolved map is
     `transient.signals`.
 
     Parameters

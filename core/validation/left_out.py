@@ -17,9 +17,9 @@ from uncertain_lti.base.html_table import html_table, name_with_unit, number_tex
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.sampling.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.intervals import (

@@ -1,0 +1,43 @@
+"""What `import cython` gives where Cython is absent: decorators and types that do nothing.
+
+Modules of the live chain are typed Python: they run as they are, and are compiled where a compiler is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+_T = TypeVar("_T")
+
+compiled = False
+
+
+def _same(thing: _T) -> _T:
+    return thing
+
+
+def _decorator(*_: Any, **__: Any) -> Callable[[_T], _T]:
+    return _same
+
+
+cclass = cfunc = inline = final = _same
+locals = returns = exceptval = boundscheck = wraparound = cdivision = initializedcheck = freelist = _decorator
+
+
+def declare(type: Any = None, value: Any = None, **_: Any) -> Any:
+    """The value."""
+    return value
+
+
+def cast(type: Any, value: Any, **_: Any) -> Any:
+    """The value."""
+    return value
+
+
+class _Type:
+    def __getitem__(self, _: Any) -> _Type:
+        return self
+
+
+double = longlong = int = bint = uchar = char = Py_ssize_t = p_double = p_uchar = _Type()

@@ -1,0 +1,402 @@
+"""One-step bounds, Leibov (2006), eqs. (6)-(9): the arithmetic of every verdict, offline and live.
+
+With phi = [x; u; 1], psi = |phi| and the terms of the model side by side (`terms`), for each state
+
+    centre = x + dt * (Theta phi)
+    half   = dt * (Delta psi) + v
+    lower  = centre - half * margin,   upper = centre + half * margin
+
+and a sample is contained if lower <= x_next <= upper. Every sum goes from the first column to the last, whether one
+sample is judged or a million, compiled or not, so all of them give the same bits.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+try:
+    import cython
+except ImportError:  # Cython is not needed to run
+    from uncertain_lti.base import uncompiled as cython
+
+import numpy as np
+
+from uncertain_lti.base.compiled import use_twin
+
+# The functions below are the equations. Uncompiled they take arrays and numbers alike, compiled they take doubles.
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def normalised(value: cython.double, steady: cython.double, scale: cython.double) -> cython.double:
+    """Deviation from the steady state, without dimension."""
+    return (value - steady) / scale
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def recorded(value: cython.double, steady: cython.double, scale: cython.double) -> cython.double:
+    """Deviation in recorded units: the inverse of `normalised`."""
+    return steady + scale * value
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def centre_of(x: cython.double, dt: cython.double, rate: cython.double) -> cython.double:
+    """Centre of the bounds one step after x, where Theta phi = rate."""
+    return rate * dt + x
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def half_of(dt: cython.double, spread: cython.double, v: cython.double) -> cython.double:
+    """Half-width of the bounds, where Delta psi = spread."""
+    return spread * dt + v
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def lower_of(centre: cython.double, half: cython.double, margin: cython.double) -> cython.double:
+    """Eq. (6) with a margin."""
+    return centre - half * margin
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def upper_of(centre: cython.double, half: cython.double, margin: cython.double) -> cython.double:
+    """Eq. (7) with a margin."""
+    return centre + half * margin
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def contained(lower: cython.double, x_next: cython.double, upper: cython.double) -> cython.bint:
+    """Eqs. (8)(9)."""
+    return (lower <= x_next) & (x_next <= upper)
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def outside(z: cython.double, least: cython.double, greatest: cython.double) -> cython.bint:
+    """Whether a value lies outside the range that the fit saw."""
+    return (z < least) | (z > greatest)
+
+
+@cython.cfunc
+@cython.exceptval(check=False)
+@cython.cdivision(True)
+def utilisation_of(difference: cython.double, half: cython.double) -> cython.double:
+    """(x_next - centre) / half; where half is 0, 0 for no difference and otherwise infinite with its sign."""
+    if cython.compiled:
+        return 0.0 if difference == 0.0 else difference / half  # as C divides
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return np.where(difference == 0.0, 0.0, difference / half)
+
+
+def ordered_sum(weights: Any, values: Any) -> Any:
+    """Sum of weights * values over the first axis, from the first element to the last.
+
+    No BLAS, whose order depends on shapes. Compiled code has the same sum in `Judge._ordered_sums`.
+
+    Parameters
+    ----------
+    weights, values : array (p, ...)
+        That can be multiplied with each other.
+
+    Returns
+    -------
+    array (...)
+    """
+    products = np.multiply(weights, values, order="C")  # the layout decides the order of the sum
+    return _sum_of_rows(products.shape)(products)
+
+
+@cache
+def _sum_of_rows(shape: tuple[int, ...]) -> Callable[[Any], Any]:
+    """Sum over the first axis, row after row.
+
+    `add.reduce` does it in this order and is several times faster than `add.accumulate`, which is defined to; as its
+    order is nowhere stated, it is tried on this shape first.
+    """
+    rng = np.random.default_rng(0)
+    for _ in range(20):  # where the sums are few, another order may give the same bits by chance
+        rows = rng.normal(size=shape)
+        in_order = rows[0].copy()
+        for row in rows[1:]:
+            in_order += row
+        if np.add.reduce(rows, axis=0).tobytes() != in_order.tobytes():
+            return _accumulated
+    return _reduced
+
+
+def _reduced(rows: Any) -> Any:
+    return np.add.reduce(rows, axis=0)
+
+
+def _accumulated(rows: Any) -> Any:
+    return np.add.accumulate(rows, axis=0)[-1]
+
+
+def centre_and_half(theta: Any, delta: Any, v: Any, phi: Any, dt: Any) -> tuple[Any, Any]:
+    """Centre and half-width of the bounds of K samples at once.
+
+    Parameters
+    ----------
+    theta, delta : array (n, p)
+        Nominal elements and half-widths of the rates, 1/s.
+    v : array (n,)
+        Half-width that dt does not multiply.
+    phi : array (p, K)
+        Regressors, the states first.
+    dt : array (K,)
+        s.
+
+    Returns
+    -------
+    centre, half : array (n, K)
+    """
+    columns = phi[:, None, :]
+    rate = ordered_sum(np.ascontiguousarray(theta.T)[:, :, None], columns)
+    spread = ordered_sum(np.ascontiguousarray(delta.T)[:, :, None], np.abs(columns))
+    return centre_of(phi[: len(v)], dt, rate), half_of(dt, spread, v[:, None])
+
+
+LOWER, UPPER, UTILISATION, FLAGS = range(4)
+"""What a `Judgement` holds of each state."""
+
+
+@cython.cclass
+class Judgement:
+    """What the bounds say of one transition.
+
+    Attributes
+    ----------
+    contained : bool
+        Every state is within its bounds.
+    violation : bool
+        Some state whose violations count is not.
+    outside_domain : bool
+        x_k or u_k lies outside the ranges that the fit saw.
+    """
+
+    contained = cython.declare(cython.bint, visibility="readonly")
+    violation = cython.declare(cython.bint, visibility="readonly")
+    outside_domain = cython.declare(cython.bint, visibility="readonly")
+    _values = cython.declare(object)
+
+    def __init__(self, values: Any, contained: bool, violation: bool, outside_domain: bool) -> None:
+        self._values = values
+        self.contained, self.violation, self.outside_domain = contained, violation, outside_domain
+
+    def numbers(self, which: int) -> Any:
+        """Lower or upper bound (recorded units), utilisation, or flag (0 contained, 1 violated) of each state.
+
+        Parameters
+        ----------
+        which : int
+            `LOWER`, `UPPER`, `UTILISATION` or `FLAGS`.
+
+        Returns
+        -------
+        buffer of doubles (n,)
+        """
+        if cython.compiled:
+            n = len(self._values) // 4
+            return self._values[which * n : which * n + n]
+        centre, half, lower, upper, x_next, inside, steady, scale = self._values
+        if which == LOWER:
+            return recorded(lower, steady, scale)
+        if which == UPPER:
+            return recorded(upper, steady, scale)
+        if which == UTILISATION:
+            return utilisation_of(x_next - centre, half)
+        return np.subtract(1.0, inside, dtype=np.float64)
+
+
+@cython.cclass
+class Judge:
+    """Judges one transition after another by the bounds of one model.
+
+    Parameters
+    ----------
+    theta, delta : array (n, p)
+        Nominal elements and half-widths of the rates, for phi = [x; u; 1] (`terms.tables`), 1/s.
+    v : array (n,)
+        Half-width that dt does not multiply.
+    steady, scale : array (n + m,)
+        Operating point of [x; u].
+    least, greatest : array (n + m,)
+        Normalised ranges of [x; u] that the fit saw.
+    margin : float
+        Multiplies the half-widths.
+    counted : array of bool (n,)
+        States whose violations count.
+    """
+
+    n: cython.Py_ssize_t
+    size: cython.Py_ssize_t
+    p: cython.Py_ssize_t
+    margin: cython.double
+    _theta: cython.double[::1]  # column after column, as the sums walk
+    _delta: cython.double[::1]
+    _v: cython.double[::1]
+    _steady: cython.double[::1]
+    _scale: cython.double[::1]
+    _least: cython.double[::1]
+    _greatest: cython.double[::1]
+    _counted: cython.uchar[::1]
+    _phi: cython.double[::1]
+    _rate: cython.double[::1]
+    _spread: cython.double[::1]
+    _blank = cython.declare(object)
+
+    def __init__(
+        self,
+        theta: Any,
+        delta: Any,
+        v: Any,
+        steady: Any,
+        scale: Any,
+        least: Any,
+        greatest: Any,
+        margin: float,
+        counted: Any,
+    ) -> None:
+        self.n, self.p = theta.shape
+        self.size = len(steady)
+        self.margin = margin
+        if delta.shape != theta.shape or len(v) != self.n or len(counted) != self.n or self.p < self.size:
+            raise ValueError("the terms do not fit one another")
+        if not len(scale) == len(least) == len(greatest) == self.size >= self.n:
+            raise ValueError("the operating point or the domain does not fit the terms")
+        one = np.ones(self.p)  # beyond z the regressors are 1
+        if cython.compiled:
+            self._theta, self._delta = array("d", theta.T.tobytes()), array("d", delta.T.tobytes())
+            self._v, self._steady, self._scale = _doubles(v), _doubles(steady), _doubles(scale)
+            self._least, self._greatest = _doubles(least), _doubles(greatest)
+            self._counted = bytearray(np.asarray(counted, dtype=np.uint8).tobytes())
+            self._phi = _doubles(one)
+            self._rate, self._spread = _doubles(np.zeros(self.n)), _doubles(np.zeros(self.n))
+            self._blank = array("d", bytes(32 * self.n))
+        else:
+            self._both = np.ascontiguousarray(np.stack([theta.T, delta.T], axis=1))  # (p, 2, n)
+            self._phi = np.stack([one, one])[:, :, None].transpose(1, 0, 2).copy()  # (p, 2, 1): phi and psi
+            self._v, self._least, self._greatest = v, least, greatest
+            # z_k and x_{k+1} side by side, as both are normalised alike
+            self._steady = np.concatenate([steady, steady[: self.n]])
+            self._scale = np.concatenate([scale, scale[: self.n]])
+            self._uncounted = ~np.asarray(counted, dtype=bool)
+
+    def judge(self, before: Sequence[float], after: Sequence[float], dt: cython.double) -> Judgement:
+        """Judge one transition.
+
+        Parameters
+        ----------
+        before : sequence of float (n + m,)
+            x_k and u_k, recorded units.
+        after : sequence of float (n,)
+            x_{k+1}, recorded units.
+        dt : float
+            s.
+        """
+        if len(before) != self.size or len(after) != self.n:
+            raise ValueError(f"{len(before)} and {len(after)} values for {self.size} and {self.n} signals")
+        if cython.compiled:
+            return self._one(before, after, dt)
+        n = self.n
+        z = normalised(np.array([*before, *after], dtype=np.float64), self._steady, self._scale)
+        z, x_next = z[:-n], z[-n:]
+        self._phi[: len(z), 0, 0] = z
+        np.abs(z, out=self._phi[: len(z), 1, 0])
+        rate, spread = ordered_sum(self._both, self._phi)
+        centre, half = centre_of(z[:n], dt, rate), half_of(dt, spread, self._v)
+        lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)
+        inside = contained(lower, x_next, upper)
+        values = centre, half, lower, upper, x_next, inside, self._steady[:n], self._scale[:n]
+        every = bool(inside.all())
+        violation = not every and not bool((inside | self._uncounted).all())
+        return Judgement(values, every, violation, bool(outside(z, self._least, self._greatest).any()))
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    def _one(self, before: Any, after: Any, dt: cython.double) -> Judgement:
+        n: cython.Py_ssize_t = self.n
+        i: cython.Py_ssize_t
+        z: cython.double
+        left: cython.bint = False
+        every: cython.bint = True
+        violation: cython.bint = False
+        for i in range(self.size):
+            z = before[i]
+            self._phi[i] = z = normalised(z, self._steady[i], self._scale[i])
+            left = left or outside(z, self._least[i], self._greatest[i])
+        self._ordered_sums()
+        blank = array("d", self._blank)
+        values: cython.double[::1] = blank
+        x_next: cython.double
+        centre: cython.double
+        half: cython.double
+        lower: cython.double
+        upper: cython.double
+        inside: cython.bint
+        for i in range(n):
+            x_next = after[i]
+            x_next = normalised(x_next, self._steady[i], self._scale[i])
+            centre, half = centre_of(self._phi[i], dt, self._rate[i]), half_of(dt, self._spread[i], self._v[i])
+            lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)
+            inside = contained(lower, x_next, upper)
+            if not inside:
+                every = False
+                violation = violation or self._counted[i]
+            values[i] = recorded(lower, self._steady[i], self._scale[i])
+            values[n + i] = recorded(upper, self._steady[i], self._scale[i])
+            values[2 * n + i] = utilisation_of(x_next - centre, half)
+            values[3 * n + i] = not inside
+        return Judgement(blank, every, violation, left)
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _ordered_sums(self) -> cython.void:
+        """`ordered_sum` of Theta phi and Delta |phi|: columns from first to last, the rows of one beside each other."""
+        n: cython.Py_ssize_t = self.n
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        value: cython.double
+        size: cython.double
+        rate: cython.p_double = cython.address(self._rate[0])
+        spread: cython.p_double = cython.address(self._spread[0])
+        theta: cython.p_double = cython.address(self._theta[0])
+        delta: cython.p_double = cython.address(self._delta[0])
+        for j in range(self.p):
+            value = self._phi[j]
+            size = abs(value)
+            if j == 0:
+                for i in range(n):
+                    rate[i] = theta[i] * value
+                    spread[i] = delta[i] * size
+            else:
+                for i in range(n):
+                    rate[i] += theta[j * n + i] * value
+                    spread[i] += delta[j * n + i] * size
+
+
+def _doubles(values: Any) -> Any:
+    return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+if not cython.compiled:
+    use_twin(globals(), ("Judge", "Judgement"))

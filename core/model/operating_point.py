@@ -1,0 +1,156 @@
+"""OperatingPoint: the steady state and scales that make recorded quantities dimensionless deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.errors import TransientError
+from uncertain_lti.model.bounds import normalised, recorded
+from uncertain_lti.signals.signal_map import Signal
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Steady state and scales, in recorded units.
+
+    x_i = (x_i^a - x_i^s) / X_i and u_j = (u_j^a - u_j^s) / U_j, with ^a what is recorded and ^s the steady state
+    (Leibov 2006; docs/theory.md).
+
+    Parameters
+    ----------
+    x_s : array (n,)
+        Steady state of the states.
+    u_s : array (m,)
+        Steady state of the controls.
+    X : array (n,)
+        Positive scales of the states.
+    U : array (m,)
+        Positive scales of the controls.
+
+    Raises
+    ------
+    TransientError
+        Shapes differ, a number is not finite, or a scale is not positive.
+    """
+
+    x_s: Array
+    u_s: Array
+    X: Array
+    U: Array
+
+    def __post_init__(self) -> None:
+        for name in ("x_s", "u_s", "X", "U"):
+            value = np.array(getattr(self, name), dtype=np.float64, ndmin=1)
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+            if value.ndim != 1 or not np.isfinite(value).all():
+                raise TransientError(f"operating point: {name} must be a vector of finite numbers")
+        for steady, scale in (("x_s", "X"), ("u_s", "U")):
+            if getattr(self, steady).shape != getattr(self, scale).shape:
+                raise TransientError(f"operating point: {steady} and {scale} differ in length")
+            if not (getattr(self, scale) > 0).all():
+                raise TransientError(f"operating point: every scale in {scale} must be positive")
+
+    @classmethod
+    def identity(cls, n: int, m: int) -> OperatingPoint:
+        """Values used as they are.
+
+        Parameters
+        ----------
+        n : int
+            Number of states.
+        m : int
+            Number of controls.
+
+        Returns
+        -------
+        OperatingPoint
+            Steady states 0, scales 1.
+        """
+        return cls(np.zeros(n), np.zeros(m), np.ones(n), np.ones(m))
+
+    @classmethod
+    def of(cls, states: Sequence[Signal], controls: Sequence[Signal]) -> OperatingPoint:
+        """From signals whose steady and scale are numbers.
+
+        Parameters
+        ----------
+        states : sequence of Signal
+            In the order of x.
+        controls : sequence of Signal
+            In the order of u.
+
+        Returns
+        -------
+        OperatingPoint
+            Their steady states and scales.
+
+        Raises
+        ------
+        TransientError
+            A steady state or a scale is still `auto`, or not what `OperatingPoint` takes.
+        """
+
+        def numbers(signals: Sequence[Signal], which: str) -> Array:
+            values = [getattr(s, which) for s in signals]
+            if "auto" in values:
+                name = signals[values.index("auto")].name
+                raise TransientError(f"signal '{name}': {which} is auto and not resolved; give a number")
+            return np.array(values, dtype=np.float64)
+
+        return cls(
+            numbers(states, "steady"),
+            numbers(controls, "steady"),
+            numbers(states, "scale"),
+            numbers(controls, "scale"),
+        )
+
+    def normalise_x(self, x: ArrayLike) -> Array:
+        """States as deviations.
+
+        Parameters
+        ----------
+        x : array (..., n)
+            Recorded units.
+
+        Returns
+        -------
+        array (..., n)
+            Dimensionless.
+        """
+        return np.asarray(normalised(np.asarray(x, dtype=np.float64), self.x_s, self.X))
+
+    def normalise_u(self, u: ArrayLike) -> Array:
+        """Controls as deviations.
+
+        Parameters
+        ----------
+        u : array (..., m)
+            Recorded units.
+
+        Returns
+        -------
+        array (..., m)
+            Dimensionless.
+        """
+        return np.asarray(normalised(np.asarray(u, dtype=np.float64), self.u_s, self.U))
+
+    def recorded_x(self, x: ArrayLike) -> Array:
+        """State deviations in recorded units.
+
+        Parameters
+        ----------
+        x : array (..., n)
+            Dimensionless.
+
+        Returns
+        -------
+        array (..., n)
+            Recorded units.
+        """
+        return np.asarray(recorded(np.asarray(x, dtype=np.float64), self.x_s, self.X))

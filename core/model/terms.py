@@ -1,0 +1,116 @@
+"""Terms of the uncertain model, in one table: name, shape, regressor, and where the width goes.
+
+The model is linear in every term. With phi the regressors of the nominal elements and psi those of the half-widths,
+
+    centre = x + dt * (sum of nominal * phi)
+    half   = dt * (sum of half-widths * psi), plus those that dt does not multiply
+
+Programmes, bounds, model file, monitor and reports take the terms from `TERMS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Term:
+    """One term: nominal elements and half-widths on one regressor.
+
+    Parameters
+    ----------
+    nominal : str
+        Name of the nominal elements; empty if there are none.
+    half : str
+        Name of their half-widths, all >= 0.
+    regressor : {"x", "u", "1"}
+        What the elements multiply: the state, the control, or 1. The half-widths multiply its absolute value.
+    times_dt : bool
+        Whether the term is a rate (1/s), which the step multiplies.
+    required : bool
+        Whether a model must state it; otherwise it is 0 by default.
+    meaning : str
+        In words.
+    """
+
+    nominal: str
+    half: str
+    regressor: Literal["x", "u", "1"]
+    times_dt: bool
+    required: bool
+    meaning: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its arrays, nominal elements first."""
+        return (self.nominal, self.half) if self.nominal else (self.half,)
+
+    def shape(self, n: int, m: int) -> tuple[int, ...]:
+        """Shape of its arrays for n states and m controls: (n, n), (n, m) or (n,)."""
+        return {"x": (n, n), "u": (n, m), "1": (n,)}[self.regressor]
+
+
+TERMS = (
+    Term("A", "dA", "x", True, True, "state matrix"),
+    Term("B", "dB", "u", True, True, "control matrix"),
+    Term("c", "dc", "1", True, False, "drift"),
+    Term("", "v", "1", False, False, "measurement noise"),
+)
+"""Every term, in the order in which the bounds sum their columns."""
+
+_RATES = tuple(term for term in TERMS if term.times_dt)
+HALF_WIDTHS = tuple(term.half for term in TERMS)
+"""Names of the half-widths."""
+REQUIRED = tuple(name for k in (0, 1) for t in TERMS if t.required for name in t.names[k : k + 1])
+"""Names of what a model must state, nominal elements first: A, B, dA, dB."""
+ARRAYS = (*REQUIRED, *(name for term in TERMS if not term.required for name in term.names))
+"""Names of all arrays of a model, in the order of its file and of its constructor."""
+SHAPES = {name: term for term in TERMS for name in term.names}
+"""The term of each array."""
+
+
+def regressors(x: Array, u: Array) -> Array:
+    """phi of the terms that the step multiplies: [x; u; 1].
+
+    Parameters
+    ----------
+    x : array (n, ...)
+    u : array (m, ...)
+
+    Returns
+    -------
+    array (n + m + 1, ...)
+        psi is its absolute value.
+    """
+    one = np.ones((1, *x.shape[1:]))
+    return np.concatenate([{"x": x, "u": u, "1": one}[term.regressor] for term in _RATES])
+
+
+def tables(arrays: dict[str, Array]) -> tuple[Array, Array, Array]:
+    """Nominal elements and half-widths of the rates side by side, and what dt does not multiply.
+
+    Parameters
+    ----------
+    arrays : dict
+        Of each of `ARRAYS` its values.
+
+    Returns
+    -------
+    nominal, half : array (n, n + m + 1)
+        One column for each of `regressors`.
+    noise : array (n,)
+        Sum of the half-widths of the other terms.
+    """
+
+    def side_by_side(which: str) -> Array:
+        columns = [arrays[getattr(term, which)] for term in _RATES]
+        return np.hstack([column.reshape(len(column), -1) for column in columns])
+
+    others = [arrays[term.half] for term in TERMS if not term.times_dt]
+    return side_by_side("nominal"), side_by_side("half"), np.sum(others, axis=0) if len(others) > 1 else others[0]
