@@ -20,7 +20,7 @@ from conftest import ROOT
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.monitor.envelope_monitor import Verdict
-from uncertain_lti.sampling.sampler import Status
+from uncertain_lti.sampling.status import Status
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 

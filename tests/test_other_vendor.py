@@ -17,7 +17,7 @@ from ros_processes import World, open_world
 from test_live import by_hand, header_bag, offline, saved
 
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.sampling.sampler import Status
+from uncertain_lti.sampling.status import Status
 
 # Cyclone DDS on loopback, where multicast may be missing: the peer is named.
 _CONFIGURATION = """<CycloneDDS><Domain><General>

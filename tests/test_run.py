@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from uncertain_lti.base import compiled
+
 ROOT = Path(__file__).resolve().parent.parent
 VERSION = "{}.{}".format(*sys.version_info)
 
@@ -16,6 +18,13 @@ pytestmark = pytest.mark.skipif(
     (platform.system(), platform.machine()) != ("Linux", "x86_64"),
     reason="the rclpy wheels are for x86_64 Linux",
 )
+
+COMPILED = ["core/base/compiled.py", *(f"core/{name.replace('.', '/')}.py" for name in compiled.MODULES)]
+
+
+def test_what_is_compiled_makes_the_environment_anew_when_it_changes():
+    text = (ROOT / "run").read_text()
+    assert all(name in text for name in COMPILED)
 
 
 @pytest.fixture
@@ -25,8 +34,9 @@ def run(tmp_path):
     checkout.mkdir()
     for name in ("run", "setup.py", "pyproject.toml", "constraints.txt"):
         shutil.copy(ROOT / name, checkout)
-    (checkout / "uncertain_lti_ros").mkdir()
-    shutil.copy(ROOT / "uncertain_lti_ros" / "_course.c", checkout / "uncertain_lti_ros")
+    for name in COMPILED:
+        (checkout / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, checkout / name)
     bin = tmp_path / "bin"
     bin.mkdir()
     for tool in "bash cat cksum dirname env grep rm sed tail uname".split():

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import TransientError
-from uncertain_lti.sampling.sampler import Sampler, Status
+from uncertain_lti.sampling.sampler import Sampler
+from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 

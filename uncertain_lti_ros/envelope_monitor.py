@@ -30,6 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from uncertain_lti.base.compiled import why_not
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Condition
@@ -41,7 +42,6 @@ from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TRUE
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti_ros.arguments import declare, run_node
-from uncertain_lti_ros.course import Course, why_not
 from uncertain_lti_ros.messages import definition, live_fields, message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
@@ -62,8 +62,6 @@ _NOTE = 0.05  # s between two looks for what the log should say
 _OUTPUT_DEPTH = 1000
 _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 _LOGGED = 5.0  # s between two log entries on unexpected errors
-_WORTH = 4  # samples taken by compiled code that are worth handing everything over to it once
-_MOST_TRIES = 8.0
 _MIB = 1 << 20
 _NAN = float("nan")
 
@@ -78,8 +76,7 @@ _type_fields = cache(live_fields)
 class _Output:
     """One topic of the node, and how many listen to it; takes serialised messages."""
 
-    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile, changed: Callable[[], None]) -> None:
-        self._changed = changed
+    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
         events = PublisherEventCallbacks(matched=self._matched)
         self.publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
         self.listeners = 0
@@ -88,7 +85,6 @@ class _Output:
 
     def _matched(self, event: Any) -> None:
         self.listeners = event.current_count
-        self._changed()
 
     def look(self) -> None:
         """Ask how many listen; events tell as well, and sooner."""
@@ -132,8 +128,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._clock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
         self._simulated = self._clock.ros_time_is_active
         self._largest = round(self._real("largest_message") * _MIB)
-        self._course: Course | None = None
-        self._tries = 0.0  # to let compiled code go on before the next tick
         self._recent: Recent | None = None  # kept while snapshots can be asked for
         self._album: Album | None = None
         self._snapshot_due: float | None = None
@@ -197,7 +191,6 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Make what the new values ask for, or say why not; it takes its place in `_on_have_set`."""
-        self._settle()
         given = {p.name: p.value for p in parameters}
         changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
         self._candidate = None
@@ -292,9 +285,9 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._reason = ""
         qos = QoSProfile(depth=_OUTPUT_DEPTH)
         for name in VECTORS:
-            self._outputs[name] = _Output(self, JointState, name, qos, self._settle)
+            self._outputs[name] = _Output(self, JointState, name, qos)
         beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=self._real("heartbeat")))
-        self._outputs["violation"] = _Output(self, Bool, "violation", beat, self._settle)
+        self._outputs["violation"] = _Output(self, Bool, "violation", beat)
         self._prepare_outputs()
         self.get_logger().info(f"configured with {Path(path).name}: {self.watch.model}")
         if self.watch.model.sampling.dt_median is None:
@@ -420,30 +413,18 @@ class EnvelopeMonitorNode(LifecycleNode):
                 )  # fmt: skip
 
     def _unsubscribe(self) -> None:
-        self._settle()
         self.active = False
         for subscription in self._inputs.values():
             subscription.destroy()
         self._inputs.clear()
 
     def _on_message(self, topic: str, data: bytes) -> None:
+        if not self.active or self.watch is None:
+            return
         try:
-            if self._course is not None and self._course.began and self._pass_by(topic, data):
-                return
-            self._settle()
-            if not self.active or self.watch is None:
-                return
             self._take(self.watch, topic, data)
         except Exception as error:
-            self._settle()
             self._note_failed_message(topic, error)
-        else:
-            if self._tries >= 1.0 and topic == self.watch.sampler.clock:
-                self._tries -= 1.0
-                try:
-                    self._go_on()
-                except Exception as error:  # the message is dealt with
-                    self.note_failure("between messages", error)
 
     def _note_failed_message(self, topic: str, error: Exception) -> None:
         self.note_failure(f"on a message of {topic}", error)
@@ -451,7 +432,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.watch.failed()
 
     def _take(self, watch: Watch, topic: str, data: bytes) -> None:
-        # The clock's own call makes three objects; without simulated time it says the same.
         arrival = self._arrival()
         now = time.monotonic()
         alarms, alarm = watch.alarms, watch.alarm
@@ -502,64 +482,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         for send, message in messages:
             send(message)
 
-    # --- messages that come in order and complete ---
-
     def _arrival(self) -> int:
-        """The time at which a message comes, ns."""
+        """The time at which a message comes, ns; the clock's own call makes three objects."""
         nanoseconds: int = self._clock.now().nanoseconds if self._simulated else time.time_ns()
         return nanoseconds
-
-    def _pass_by(self, topic: str, data: bytes) -> bool:
-        """Take a message of the enable condition's own topic that says what is known, beside compiled code at work."""
-        assert self.watch is not None
-        now = time.monotonic()
-        try:
-            arrival = self._arrival()
-            if not self.watch.tells_nothing_new(topic, data, now):
-                return False
-        except Exception:  # the watch meets the same error
-            return False
-        if self._recent is not None:
-            self._count()  # what came before it
-            self._recent.add(Entry(now, arrival, topic, data, (), self.watch.alarm))
-        return True
-
-    def _go_on(self) -> None:
-        """Let compiled code take the messages where that is possible."""
-        watch = self.watch
-        if watch is None or not self.active or why_not() or not Course.can(watch):
-            return
-        if self._course is None or self._course.watch is not watch or self._course.monitor is not watch.monitor:
-            self._course = Course(watch, self._plain, self._marked)
-        if not self._course.began:
-            sends = {name: output.send for name, output in self._outputs.items() if output.listeners}
-            now = self._now if self._simulated else None
-            if self._course.resume(sends, now, self._recent is not None):
-                for topic, take in self._course.take.items():
-                    self._inputs[topic].shortcut = take
-
-    def _now(self) -> int:
-        now: int = self._clock.now().nanoseconds
-        return now
-
-    def _count(self) -> None:
-        """Note what compiled code has counted."""
-        if self._course is not None and self._course.began:
-            self._published = max(self._published, self._course.count())
-            if self._recent is not None:
-                for entry in self._course.entries():
-                    self._recent.add(entry)
-
-    def _settle(self) -> None:
-        """Have the watch stand where compiled code has come to, and go on by itself."""
-        if self._course is None or not self._course.began:
-            return
-        for subscription in self._inputs.values():
-            subscription.shortcut = None
-        self._count()
-        self._tries = min(_MOST_TRIES, self._tries + self._course.taken / _WORTH)
-        if (error := self._course.settle()) is not None:
-            self._note_failed_message(self._course.watch.sampler.clock, error)
 
     def _beat(self) -> None:
         assert self.watch is not None
@@ -571,7 +497,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _on_tick(self) -> None:
         self._look_at_clock()
         tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_album, self._keep_journal
-        for task in (self._count, *tasks, self._go_on):
+        for task in tasks:
             try:
                 task()
             except Exception as error:
@@ -579,7 +505,6 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _look_at_clock(self) -> None:
         if self._simulated != self._clock.ros_time_is_active:
-            self._settle()
             self._simulated = self._clock.ros_time_is_active
 
     def _keep_beating(self) -> None:
@@ -590,7 +515,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = time.monotonic()
         if now - self._looked < _LOOK and not any(s.look_soon for s in self._inputs.values()):
             return
-        self._settle()
         self._looked = now
         for subscription in self._inputs.values():
             subscription.look()
@@ -697,7 +621,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         return problems
 
     def _report(self) -> None:
-        self._settle()
         now = self._reported = time.monotonic()
         if self.watch is not None and self.active:
             reports = self.watch.report(now, self._real("state_timeout"), self._problems())
@@ -750,7 +673,6 @@ class EnvelopeMonitorNode(LifecycleNode):
     ) -> Trigger.Response:
         """Answer a call; what is refused is told, and what nobody foresaw as well."""
         try:
-            self._settle()
             serve(response)
         except UncertainLTIError as error:
             response.success, response.message = False, str(error)

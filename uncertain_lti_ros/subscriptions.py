@@ -86,8 +86,6 @@ class MatchedSubscription:
 
     Attributes
     ----------
-    shortcut : callable or None
-        Asked before the callback; where it returns True the message is dealt with.
     received, lost, late : int
         Messages that came, those that the middleware says were lost, and deadlines missed by publishers.
     publishers : int
@@ -112,7 +110,6 @@ class MatchedSubscription:
         self.received = self.lost = self.late = self.publishers = 0
         self.problems: list[str] = []
         self.look_soon = False
-        self.shortcut: Callable[[Any], bool] | None = None
         self._subscription: Subscription | None = None
         self.look()
 
@@ -164,8 +161,7 @@ class MatchedSubscription:
 
     def _take(self, message: Any) -> None:
         self.received += 1
-        if (shortcut := self.shortcut) is None or not shortcut(message):
-            self._callback(message)
+        self._callback(message)
 
     def _changed(self, _: Any) -> None:
         self.look_soon = True  # the owner looks from a timer: a subscription is not destroyed in its own callback

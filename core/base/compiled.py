@@ -15,7 +15,10 @@ from types import ModuleType
 from typing import Any
 from zlib import crc32
 
-MODULES = ("model.bounds",)
+MODULES = (
+    "model.bounds",
+    "sampling.sampler",
+)
 """Modules that have a twin where they were compiled; setup.py builds them."""
 SWITCH = "UNCERTAIN_LTI_PURE_PYTHON"
 """Environment variable that, when it is set, keeps every twin out of use."""

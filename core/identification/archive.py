@@ -24,7 +24,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.sampling.reading import load_signals, sample, time_source
-from uncertain_lti.sampling.sampler import resolve
+from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.streams import read_stream
 from uncertain_lti.signals.signal_map import SignalMap
 

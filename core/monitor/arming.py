@@ -15,8 +15,6 @@ _OPERATORS: Mapping[str, Callable[[float, float], bool]] = {
 }  # fmt: skip
 _TEXT = re.compile(r"\s*(?P<topic>[~/\w]+)\s+(?P<field>.+?)\s*(?P<operator>==|!=|<=|>=|<|>)\s*(?P<value>\S+)\s*")
 _WORDS = {"true": 1.0, "false": 0.0}
-NEVER = 2**63 - 1
-"""ns; later than any sample."""
 
 
 @dataclass(frozen=True)
@@ -114,14 +112,6 @@ class Arming:
         if self._from is None:
             self._from = t_ns + self._grace
         return t_ns >= self._from
-
-    @property
-    def counts_from(self) -> int | None:
-        """The instant from which verdicts count, until something is learnt or time jumps back; `NEVER` for none.
-
-        None where the next sample decides it.
-        """
-        return self._from if self.on else NEVER
 
     def why_off(self) -> str:
         """What keeps alarms off, in words; empty where they are on."""

@@ -30,7 +30,8 @@ from uncertain_lti.model.bounds import (
 )
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import AlarmWindow, raised
-from uncertain_lti.sampling.sampler import Status, Step
+from uncertain_lti.sampling.sampler import Step
+from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 
 NUMBERS = ("flags", "lower", "upper", "state", "utilisation")

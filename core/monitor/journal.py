@@ -10,7 +10,7 @@ from typing import Any
 from uncertain_lti.base.english import plural
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.session import OK, WARN, WHY, Watch
-from uncertain_lti.sampling.sampler import Status
+from uncertain_lti.sampling.status import Status
 
 _BURST, _REFILL = 6, 10.0  # lines on one matter at once, and s until there is one more
 _SHOWN = 5  # states that one line names

@@ -12,8 +12,10 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Arming, Condition
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
-from uncertain_lti.recordings.message_reader import MessageReader, Plan, UnreadableError
-from uncertain_lti.sampling.sampler import Sampler, Status, all_finite, to_ns
+from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
+from uncertain_lti.sampling.instants import to_ns
+from uncertain_lti.sampling.sampler import Sampler, all_finite
+from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
 
@@ -226,7 +228,7 @@ class Watch:
             clocks = topic in (self.sampler.clock, other.sampler.clock)
             if clocks or not alike or theirs.time.get(topic) != mine.time[topic]:
                 continue
-            for (stamp, arrival), values in other.sampler.kept(topic):
+            for stamp, arrival, values in other.sampler.kept(topic):
                 self.sampler.push(topic, arrival, stamp or None, [values[fields[field]] for field in wanted])
         if other.enable_type and not self.enable_type and other.arming.said_on(self.arming.condition) is not None:
             self.found_enable_type(other.enable_type)
@@ -324,61 +326,6 @@ class Watch:
             verdicts.append(verdict)
             self._count(verdict, before, now)
         return verdicts, sampler.counters["samples"] > samples
-
-    def plan(self, topic: str) -> Plan | None:
-        """Where the numbers of a topic's messages stand, as far as that is known and simple."""
-        return self._readers[topic].plan
-
-    @property
-    def plan_of_condition(self) -> Plan | None:
-        """The same for the field of the enable condition."""
-        return self._reads_condition.plan if self._reads_condition is not None else None
-
-    def tells_nothing_new(self, topic: str, data: bytes, now: float) -> bool:
-        """Take a message that the enable condition alone wants; False, and it is not taken, where that may change."""
-        condition, reader = self.arming.condition, self._reads_condition
-        if condition is None or reader is None or topic in self._readers:
-            return False
-        try:
-            (value,) = reader.read(data)[1]
-        except UnreadableError:
-            return False
-        if condition.holds(value) is not self.arming.on:
-            return False
-        self.arming.learn(value)
-        self.received[topic] += 1
-        self._heard[topic] = now
-        return True
-
-    def have_been_judged(
-        self,
-        count: int,
-        outside_domain: int,
-        violations: Sequence[int],
-        judged: float,
-        topics: Mapping[str, tuple[int, float]],
-    ) -> None:
-        """So many samples were judged elsewhere, the last one at `judged`, and the alarm has not turned.
-
-        violations: of each state (n,). topics: messages that came on each topic, and when the last one did.
-        """
-        for topic, (received, heard) in topics.items():
-            if received:
-                self.received[topic] += received
-                self._heard[topic] = heard
-                self._readers[topic].fitted(received)
-                if topic == self.enable_topic and self._reads_condition is not None:
-                    self._reads_condition.fitted(received)
-        if count:
-            self.sampler.counters["samples"] += count
-            self._judged = judged
-            self.verdicts += count
-            self._period.verdicts += count
-            self._period.outside += outside_domain
-            for i, violated in enumerate(violations):
-                if violated:
-                    self.violations[i] += violated
-                    self._period.violations[i] += violated
 
     def _learn_condition(self, topic: str, data: bytes) -> None:
         assert self._reads_condition is not None

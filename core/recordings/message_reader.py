@@ -12,8 +12,6 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
 from typing import Any
 
 from uncertain_lti.signals.field_path import FieldPath
@@ -44,21 +42,6 @@ class _UnfitError(Exception):
     """This message, or this type, has to be decoded."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Where stamp and numbers stand in messages of one length.
-
-    A message is of the kind where each of its bytes under mask is that of want. stamp: where sec and nanosec begin,
-    -1 without a header. values: of each value its places, (offset, code of struct) of each number, and what makes a
-    value of these numbers; None where there is but one, which is the value.
-    """
-
-    mask: bytes
-    want: bytes
-    stamp: int
-    values: tuple[tuple[tuple[tuple[int, str], ...], Callable[[Sequence[float]], float] | None], ...]
-
-
 class MessageReader:
     """Stamp and values of the messages of one topic.
 
@@ -86,11 +69,6 @@ class MessageReader:
         self._fields, self._decode = type_fields, decode
         self._layouts: list[_Layout] = []
         self._budget = _BUDGET
-
-    @property
-    def plan(self) -> Plan | None:
-        """Where the numbers of the messages stand that look like the last one; None where that is not so simple."""
-        return self._layouts[0].plan if self._layouts else None
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]]:
         """Header stamp in ns (None without a header, or where it is zero) and one value per path.
@@ -124,10 +102,6 @@ class MessageReader:
             self._budget -= _LAYOUT
             self._learn(data, stamp, values)
         return stamp, values
-
-    def fitted(self, count: int) -> None:
-        """So many messages fitted `plan` elsewhere."""
-        self._budget = min(_BUDGET, self._budget + count)
 
     def _left(self, data: bytes) -> int:
         """Bytes behind a message beyond those that senders leave there; 0 where that is not known.
@@ -206,7 +180,6 @@ class _Layout:
             raise _UnfitError
         self._shape = _shape(data, [(0, 2), *walk.shape])
         places = [place for want in every for place in want.places]
-        self._places = [want.places for want in every]
         order = sorted(set(places))
         self._unpack = _struct(order).unpack_from
         where = {place: i for i, place in enumerate(order)}
@@ -217,25 +190,6 @@ class _Layout:
         self._computed: list[tuple[FieldFunction | None, list[str] | None, int]] = [
             (want.path.function, want.names, len(want.places)) for want in wants
         ]
-
-    @cached_property
-    def plan(self) -> Plan | None:
-        """None where a value has no place, or a computed one is made of whole numbers."""
-        values, stamp = [], -1
-        for places, (function, names, _) in zip(self._places[self._first :], self._computed, strict=True):
-            plain = len(places) == 1 if function is None else all(code in "fd" for _, code in places)
-            if not plain:
-                return None
-            values.append((tuple(places), None if function is None else partial(_compute, function, names)))
-        if self._stamped:
-            (stamp, seconds), nanoseconds = self._places[0][0], self._places[1][0]
-            if seconds != "i" or nanoseconds != (stamp + 4, "I"):
-                return None
-        mask, want = bytearray(self._size), bytearray(self._size)
-        for start, stop, under, wanted in self._shape:
-            mask[start:stop] = under.to_bytes(stop - start, "little")
-            want[start:stop] = wanted.to_bytes(stop - start, "little")
-        return Plan(bytes(mask), bytes(want), stamp, tuple(values))
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]] | None:
         """Stamp and values; None where the message looks otherwise."""

@@ -16,8 +16,10 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.sampling.reading_processes import processes_for, read_streams
-from uncertain_lti.sampling.sampler import Sampler, Status, resolve
+from uncertain_lti.sampling.resolve import resolve
+from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, sample_arrays
+from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.sampling.streams import Stream, check_paths, read_stream
 from uncertain_lti.sampling.transient import Transient

@@ -17,7 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES, Status, to_ns
+from uncertain_lti.sampling.instants import to_ns
+from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES
+from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap
 

@@ -18,7 +18,8 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LONGEST_S
-from uncertain_lti.sampling.sampler import Status, median_step_ns, to_ns
+from uncertain_lti.sampling.instants import median_step_ns, to_ns
+from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import SignalMap
 
 

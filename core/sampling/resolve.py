@@ -1,0 +1,59 @@
+"""What a signals file leaves open of the sampling, resolved over all recordings: clock, max_gap, time sources."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.limits import LONGEST_S
+from uncertain_lti.sampling.instants import median_step_ns, to_ns
+from uncertain_lti.signals.signal_map import SignalMap
+
+
+def resolve(
+    signals: SignalMap,
+    instants: Mapping[str, Sequence[NDArray[np.int64]]],
+    time: Mapping[str, str],
+) -> SignalMap:
+    """Fill in clock, max_gap and time sources by the stated rules.
+
+    Parameters
+    ----------
+    signals : SignalMap
+    instants : mapping
+        Per topic the instants of its messages in each recording, (messages,) ns, by that topic's time source.
+    time : mapping
+        Per topic `header` or `log`.
+
+    Raises
+    ------
+    SignalError
+        The clock has fewer than two distinct instants, or max_skew is given and no state is on another topic.
+    """
+    if signals.max_skew is not None and len({s.topic for s in signals.states}) == 1:
+        raise SignalError(
+            f"{signals.source}: max_skew limits the age of states from another topic than the clock, and all states "
+            f"are on {signals.states[0].topic}; leave it out (the age of a control is limited by max_hold)"
+        )
+    min_step_ns = to_ns(signals.min_step)
+    medians = {t: median_step_ns(instants[t], min_step_ns) for t in dict.fromkeys(s.topic for s in signals.states)}
+    clock = signals.clock or max(medians, key=lambda t: medians[t] or 0)
+    step = medians[clock]
+    if step is None:
+        count = sum(len(i) for i in instants[clock])
+        raise SignalError(
+            f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
+            f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
+        )
+    max_gap = signals.max_gap if signals.max_gap is not None else min(2.5 * step * 1e-9, LONGEST_S)
+    return replace(
+        signals,
+        clock=clock,
+        max_gap=max_gap,
+        time={t: "header" if time[t] == "header" else "log" for t in signals.topics},
+    )

@@ -1,0 +1,29 @@
+"""Status: what became of one clock message."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Status(StrEnum):
+    """What became of one clock message."""
+
+    OK = "ok"  # the transition that ends in this sample can be judged
+    FIRST = "first"  # first sample of a recording
+    RESET = "reset"  # time stepped back by more than max_gap: first sample of a new segment
+    GAP = "gap"  # the step is longer than max_gap: first sample of a new segment
+    MISSING = "missing"  # a signal at either end is missing, stale, NaN or infinite
+    EQUAL = "equal stamp"  # dropped: the instant of the sample before
+    SHORT = "short step"  # dropped: less than min_step after the sample before
+    LATE = "late"  # dropped: at most max_gap before the sample before
+    UNSTAMPED = "no stamp"  # dropped: header time is wanted and the stamp is zero
+
+    @property
+    def dropped(self) -> bool:
+        """The message made no sample."""
+        return self in (Status.EQUAL, Status.SHORT, Status.LATE, Status.UNSTAMPED)
+
+    @property
+    def opens_segment(self) -> bool:
+        """The sample has no predecessor."""
+        return self in (Status.FIRST, Status.RESET, Status.GAP)
