@@ -63,6 +63,11 @@ def uncompiled(name: str) -> ModuleType:
     ----------
     name : str
         One of `MODULES`.
+
+    Returns
+    -------
+    module
+        A new one each time.
     """
     found = import_module(f"uncertain_lti.{name}")
     spec = spec_from_file_location(f"{found.__name__}_uncompiled", found.__file__)

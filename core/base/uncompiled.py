@@ -26,12 +26,22 @@ locals = returns = exceptval = boundscheck = wraparound = cdivision = initialize
 
 
 def declare(type: Any = None, value: Any = None, **_: Any) -> Any:
-    """The value."""
-    return value
+    """Declare a variable or an attribute.
 
+    Parameters
+    ----------
+    type : Any
+        Its C type, which counts only when compiled.
+    value : Any
+        Its value.
+    **_ : Any
+        Whether it can be read from Python, likewise.
 
-def cast(type: Any, value: Any, **_: Any) -> Any:
-    """The value."""
+    Returns
+    -------
+    Any
+        The value.
+    """
     return value
 
 

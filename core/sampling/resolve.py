@@ -25,10 +25,16 @@ def resolve(
     Parameters
     ----------
     signals : SignalMap
+        What it states is kept.
     instants : mapping
         Per topic the instants of its messages in each recording, (messages,) ns, by that topic's time source.
     time : mapping
         Per topic `header` or `log`.
+
+    Returns
+    -------
+    SignalMap
+        The same with clock, max_gap and every time source.
 
     Raises
     ------
