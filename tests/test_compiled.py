@@ -31,6 +31,7 @@ from test_sampler import Sent, cases
 
 from uncertain_lti import SignalMap, UncertainLTI
 from uncertain_lti.base import compiled
+from uncertain_lti.base.limits import LONGEST_S
 from uncertain_lti.model import bounds
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
@@ -469,9 +470,9 @@ def test_durations_without_end_are_as_good_as_others(ros: None, tmp_path: Path, 
     model = saved(tmp_path / "model.json", 3, rng)
     content = json.loads((tmp_path / "model.json").read_text())
     if name == "max_hold":
-        content["controls"][0][name] = 1e10
+        content["controls"][0][name] = LONGEST_S
     else:
-        content["sampling"][name] = 1e10
+        content["sampling"][name] = LONGEST_S
     (tmp_path / "model.json").write_text(json.dumps(content))
     node = same(tmp_path / "model.json", with_ticks(stream(model, rng, 60, 0.0), rng, 0.1))
     assert not node._failures
