@@ -1,6 +1,6 @@
 """Do the intervals of validation contain the truth as often as they promise? Studies on simulated plants, seeded.
 
-    ./run python benchmarks/validity.py                     # all studies with all their plants, about a minute
+    ./run python benchmarks/validity.py                     # all studies with all their plants, some minutes
     ./run python benchmarks/validity.py --plants 40         # as tests/test_validation.py has them
     ./run python benchmarks/validity.py --only recordings
 
@@ -12,6 +12,7 @@ and the additive term. Exit status 1 when an interval for 90 % contains the trut
 from __future__ import annotations
 
 import argparse
+import copy
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -34,6 +35,8 @@ from uncertain_lti.validation.left_out import validate  # noqa: E402
 CONFIDENCE = 0.9
 LEAST = 0.87
 PLANTS = 200
+IN_VAIN = "one recording at a time, in vain"
+"""Beginning of what is shown not to hold."""
 
 Held = dict[str, list[bool]]
 """By promise: whether its interval contains the truth, for each plant that was given one."""
@@ -104,7 +107,44 @@ def blocks(plants: Iterable[int]) -> Held:
     return held
 
 
-STUDIES: dict[str, Callable[[Iterable[int]], Held]] = {"recordings": recordings, "blocks": blocks}
+def variant(plant: Tanks, rng: np.random.Generator, spread: float) -> Tanks:
+    """The same machine on another day."""
+    other = copy.copy(plant)
+    other.c = plant.c * (1 + spread * rng.uniform(-1, 1, 3))
+    return other
+
+
+def groups(plants: Iterable[int]) -> Held:
+    """12 recordings of 3 machine-days, left out by day and, in vain, one at a time; the truth on 50 fresh days."""
+    held: Held = {}
+    for seed in plants:
+        rng = np.random.default_rng([seed, 5])
+        base = Tanks(seed, spread=0.2)
+        runs = [r for g in range(3) for r in variant(base, rng, 0.1).transients(4, 100 * seed + g, noise=1e-3)]
+        days = [variant(base, rng, 0.1).arrays(5, 500_000 + 100 * seed + i, noise=1e-3) for i in range(50)]
+        x, u = (np.concatenate(arrays) for arrays in zip(*days, strict=True))
+        hours, wish = len(x) * 100 * DT / 3600, rng.uniform(0.2, 1.0) / (100 * DT / 3600)
+        for name, by in (("by day", [g for g in range(3) for _ in range(4)]), (IN_VAIN, None)):
+            validation = validate(runs, criterion=("qp", "lp")[seed % 2], additive="noise", groups=by)
+            data = validation.to_dict()
+            for entry in data["false_alarms"]:
+                alarms, left = true_alarms(validation.model, x, u, AlarmRule(entry["violations"], entry["window"]))
+                low, high = entry["interval"]
+                held.setdefault(f"{name}: alarms per hour", []).append(low <= alarms.sum() / hours <= (high or np.inf))
+            low, high = data["inside_interval"]
+            held.setdefault(f"{name}: verdicts inside", []).append(low <= 1 - left.mean() <= high)
+            found = calibrate(validation, wish)
+            if found.alarm_rule is not None:
+                alarms, _ = true_alarms(validation.model, x, u, found.alarm_rule)
+                held.setdefault(f"{name}: calibrated alarm keeps to the wish", []).append(alarms.sum() / hours <= wish)
+    return held
+
+
+STUDIES: dict[str, Callable[[Iterable[int]], Held]] = {
+    "recordings": recordings,
+    "blocks": blocks,
+    "groups": groups,
+}
 
 
 def main() -> int:
@@ -117,7 +157,7 @@ def main() -> int:
         held = STUDIES[name](range(options.plants))
         rows = [[what, f"{np.mean(hits):.1%} of {len(hits)}"] for what, hits in held.items()]
         table(f"{name}: {STUDIES[name].__doc__}", [f"{CONFIDENCE:.0%} interval of", "contains the truth"], rows)
-        failed |= any(np.mean(hits) < LEAST for hits in held.values())
+        failed |= any(np.mean(hits) < LEAST for what, hits in held.items() if not what.startswith(IN_VAIN))
     return int(failed)
 
 

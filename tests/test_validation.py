@@ -1,6 +1,5 @@
 """Validation: what it counts is what happens, and its intervals contain the truth as often as they say."""
 
-import copy
 import json
 import time
 from fractions import Fraction
@@ -261,18 +260,11 @@ def test_discards_are_counted_as_recordings():
 # --- groups ---
 
 
-def variant(plant, rng, spread):
-    """The same machine on another day."""
-    other = copy.copy(plant)
-    other.c = plant.c * (1 + spread * rng.uniform(-1, 1, 3))
-    return other
-
-
 @pytest.fixture(scope="module")
 def days():
     """Three machine-days of four recordings each, and their names."""
     rng = np.random.default_rng(2)
-    runs = [r for g in range(3) for r in variant(Tanks(), rng, 0.05).transients(4, 50 + g, noise=1e-3)]
+    runs = [r for g in range(3) for r in validity.variant(Tanks(), rng, 0.05).transients(4, 50 + g, noise=1e-3)]
     return runs, [f"day {g}" for g in range(3) for _ in range(4)]
 
 
@@ -423,10 +415,14 @@ def test_detection_of_a_stated_fault_is_that_of_a_monitor(validation, runs):
 def test_intervals_contain_the_truth_as_often_as_they_say(study):
     """The first 40 plants of `benchmarks/validity.py`: as few would fail by chance once in a hundred."""
     held = validity.STUDIES[study](range(40))
-    assert min(len(hits) for hits in held.values()) >= 15
-    for what, hits in held.items():
+    assert min(len(hits) for hits in held.values()) >= 10
+    vain = {what: hits for what, hits in held.items() if what.startswith(validity.IN_VAIN)}
+    for what in held.keys() - vain.keys():
+        hits = held[what]
         least = stats.binom.ppf(0.01, len(hits), validity.CONFIDENCE)
         assert sum(hits) >= least, f"{what}: the 90 % interval holds in {sum(hits)} of {len(hits)} only"
+    # so the warning is needed
+    assert all(np.mean(hits) < 0.8 for what, hits in vain.items() if "calibrated" not in what), vain
 
 
 def test_a_bound_that_counts_samples_would_not_hold():
