@@ -110,11 +110,11 @@ def million(scale):
                     [f"{noise:g}", additive, criterion, f"{peer:.3f} s", f"{ours:.3f} s", f"{ours / peer:.2f}"]
                     + [
                         str(model.fit_summary["solver"]["passes"]),
-                        f"{model.fit_summary['gap']:.0e}",
+                        f"{model.fit_summary['optimality_gap']:.0e}",
                         str(outside(problem, model)),
                     ]
                 )
-    header = ["noise", "additive", "criterion", "lstsq", "ours", "ratio", "passes", "gap", "outside"]
+    header = ["noise", "additive", "criterion", "lstsq", "ours", "ratio", "passes", "optimality gap", "outside"]
     table(f"{N} transitions of the published matrices, n = 5, m = 4, all rows", header, rows)
     # what a user of `fit` waits for besides: recordings into arrays, and the messages in words
     x, u, x_next = drawn(N)
@@ -189,8 +189,10 @@ def large(scale):
     rows = []
     for criterion in ("qp", "lp"):
         ours, model = best(lambda c=criterion: solve(problem, c), 1)
-        rows.append([criterion, f"{ours:.1f} s", f"{model.fit_summary['gap']:.0e}", str(outside(problem, model))])
-    table(f"{N} transitions, n = 50, m = 10", ["criterion", "ours", "gap", "outside"], rows)
+        rows.append(
+            [criterion, f"{ours:.1f} s", f"{model.fit_summary['optimality_gap']:.0e}", str(outside(problem, model))]
+        )
+    table(f"{N} transitions, n = 50, m = 10", ["criterion", "ours", "optimality gap", "outside"], rows)
 
 
 def coupled(scale):
@@ -201,8 +203,8 @@ def coupled(scale):
     weights = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(5)
     problem = problem_of(*drawn(N), weights=weights)
     ours, model = best(lambda: solve(problem, "qp"), 1)
-    rows = [[f"{ours:.2f} s", f"{model.fit_summary['gap']:.0e}", str(outside(problem, model))]]
-    table(f"{N} transitions, n = 5, m = 4, full W(t_k)", ["ours", "gap", "outside"], rows)
+    rows = [[f"{ours:.2f} s", f"{model.fit_summary['optimality_gap']:.0e}", str(outside(problem, model))]]
+    table(f"{N} transitions, n = 5, m = 4, full W(t_k)", ["ours", "optimality gap", "outside"], rows)
 
 
 def growth(scale):
@@ -276,7 +278,7 @@ def disk_fit(folder, N, parts):
             elements = max(np.abs(getattr(model, name) - getattr(known, name)).max() for name in ("A", "B", "dA", "dB"))
             rows.append(
                 [where, criterion, f"{took:.1f} s", str(model.fit_summary["solver"]["passes"]), f"{peak:.0f} MiB"]
-                + [f"{model.fit_summary['gap']:.0e}", str(count), f"{objective:.0e}", f"{elements:.0e}"]
+                + [f"{model.fit_summary['optimality_gap']:.0e}", str(count), f"{objective:.0e}", f"{elements:.0e}"]
             )
 
     fitted("on disk", Fleet([partition]))
@@ -286,7 +288,7 @@ def disk_fit(folder, N, parts):
         z[:, part], x_next[:, part] = block.z, block.x_next
     origin = np.zeros(N, dtype=np.intp)
     fitted("in memory", Fleet.of(Problem(z, x_next, np.full(N, DT), origin, origin, np.ones(5), partition.columns)))
-    header = ["arrays", "criterion", "ours", "passes", "peak memory", "gap", "outside"]
+    header = ["arrays", "criterion", "ours", "passes", "peak memory", "optimality gap", "outside"]
     table(f"{N} transitions, n = 5, m = 4", [*header, "objective differs", "elements differ"], rows)
 
 

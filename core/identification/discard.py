@@ -12,7 +12,7 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.identification.working_set import TOLERANCE, Row, WorkingSet
+from uncertain_lti.identification.working_set import Row, WorkingSet
 
 _ACTIVE = 1e-7
 """Slack, in scaled units, below which a sample carries the envelope."""
@@ -176,7 +176,7 @@ def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
 
 def _value(row: Row, criterion: str, weights: Array | None) -> float:
     if criterion == "lp":
-        return (row.limit or 0.0) * row.scale
+        return (row.limit or 0.0) * row.limit_unit
     d = row.d[row.free_psi] / (row.unit_psi * row.scale)
     weight = 1.0 if weights is None else float(weights[row.i])
     return weight * row.scale**2 * float(d @ row.gram @ d + 2.0 * row.linear @ d)
@@ -206,7 +206,7 @@ def _linear_gains(row: Row) -> dict[int, float]:
         return {}
     trial = _copy(row)
     simplex = trial._minimax()
-    owner, least = np.empty(0, dtype=np.intp), np.empty(0)
+    owner, least = np.full(len(trial.asked), -1), np.full(len(trial.asked), -np.inf)
 
     def add(pool: Index) -> None:
         nonlocal owner, least
@@ -223,7 +223,7 @@ def _linear_gains(row: Row) -> dict[int, float]:
             slack[trial.pool] = np.inf
             if without >= 0:
                 slack[without] = np.inf
-            outside = np.flatnonzero(slack < -TOLERANCE)
+            outside = np.flatnonzero(slack < -trial.tolerance)
             if not len(outside):
                 return trial.limit
             add(outside)
@@ -232,10 +232,10 @@ def _linear_gains(row: Row) -> dict[int, float]:
     add(trial.pool)
     value = solve()
     gains = {}
-    for sample in np.unique(owner[np.abs(simplex.duals()) > 1e-12]).tolist():
+    for sample in np.unique(owner[(np.abs(simplex.duals()) > 1e-12) & (owner >= 0)]).tolist():
         rows = np.flatnonzero(owner == sample)
         simplex.hold(rows.tolist(), np.full(len(rows), -np.inf))
-        gains[int(row.samples.index[sample])] = (value - solve(sample)) * row.scale
+        gains[int(row.samples.index[sample])] = (value - solve(sample)) * row.limit_unit
         simplex.hold(rows.tolist(), least[rows])
     return gains
 
@@ -256,7 +256,7 @@ def _drop(row: Row, index: int) -> None:
     position = np.cumsum(keep) - 1
     row.pool = position[row.pool[keep[row.pool]]]
     row.samples = row.samples[keep]
-    row.phi, row.psi = row.phi[keep], row.psi[keep]
+    row.phi, row.plain_phi, row.psi = row.phi[keep], row.plain_phi[keep], row.psi[keep]
     row.y, row.half, row.width = row.y[keep], row.half[keep], row.width[keep]
     row._simplex, row._known = None, np.empty(0, dtype=np.intp)
 

@@ -18,11 +18,11 @@ from uncertain_lti.identification import formulation
 from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.passes import Judged, Moments
 from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble
 from uncertain_lti.identification.repair import repair
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.identification.working_set import InfeasibleError, Solution, WorkingSet
+from uncertain_lti.identification.working_set import GOOD, LEAST, InfeasibleError, Solution, WorkingSet
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.operating_point import OperatingPoint
@@ -30,6 +30,9 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
+
+SMALL = 1e-4
+"""Optimality gap from which on it is worth a word."""
 
 
 def fit(
@@ -94,7 +97,8 @@ def fit(
     -------
     UncertainLTI
         With zero training transitions outside its own `bounds`. `fit_summary["messages"]` says in words what the user
-        should know; `fit_summary["gap"]` is the relative distance of the objective from a lower bound of the optimum.
+        should know; `fit_summary["optimality_gap"]` is the relative distance of the objective from a lower bound of
+        the optimum, None if no bound was found.
 
     Raises
     ------
@@ -260,24 +264,26 @@ def fit_fleet(
     def build(theta: Array, d: Array) -> UncertainLTI:
         return _model(fleet.columns, signals, sums, theta, d, dt_median, alarm_rule)
 
-    model, d, judged = repair(build, fleet, sums, solution.theta, solution.d, solution.violation)
+    limits = engine.half_limits
+
+    def repaired(gentle: bool) -> tuple[UncertainLTI, Array, Judged]:
+        return repair(build, fleet, sums, solution.theta, solution.d, solution.violation, limits, gentle)
+
+    model, d, judged = repaired(False)
+    reference = _criterion(engine, criterion, solution.d, judged) if solution.delta is None else solution.delta
+    if not _relative(_criterion(engine, criterion, d, judged), reference, criterion, sums, judged) <= GOOD:
+        gentler = repaired(True)
+        if (_criterion(engine, criterion, *gentler[1:]) < _criterion(engine, criterion, d, judged)).any():
+            model, d, judged = gentler
+    objective = _criterion(engine, criterion, d, judged)
+    gap = _relative(objective, reference, criterion, sums, judged) + (solution.gap or 0.0)
     max_width = judged.largest
     mean_width = 2.0 * (sums.width_sum @ d) / sums.count
-    if criterion == "qp":
-        weights = engine.weights
-        objective = np.array([_objective(sums, d, weights)])
-        reference = np.array([_objective(sums, solution.d, weights)])
-    else:
-        assert solution.delta is not None
-        objective, reference = judged.weighted, solution.delta
-    # an envelope narrower than a millionth of the steps themselves is rounding, and so is its distance from 0
-    least = 1e-300 if criterion == "qp" else 1e-6 * sums.rate_scale * judged.weighted / np.maximum(max_width, 1e-300)
-    gap = float(np.max((objective - reference) / np.maximum(np.abs(objective), least), initial=0.0))
     X = model.operating_point.X
     facts: dict[str, Any] = {
         "criterion": criterion,
         "objective": float(objective[0]) if criterion == "qp" else objective,
-        "gap": max(gap, 0.0) + (solution.gap or 0.0),
+        "optimality_gap": gap if np.isfinite(gap) else None,
         "transitions": sums.count,
         "mean_width": mean_width,
         "max_width": max_width,
@@ -300,7 +306,35 @@ def fit_fleet(
         facts["rank"], facts["messages"] = describe(
             model, describe_on, sums, mean_width, max_width, transients, few, discarded if criterion == "qp" else None
         )
+        facts["messages"] += _distance(gap)
     return model.replace(fit_summary=facts)
+
+
+def _distance(gap: float) -> list[str]:
+    """What the user should know if the answer is not proven to be the optimum."""
+    remedy = (
+        "the containment holds; the signals may be nearly collinear or exact, so leave one out, or fix what is known "
+        "by structure"
+    )
+    if not np.isfinite(gap):
+        return [f"no bound of the distance from the optimum was found, so narrower widths may exist: {remedy}"]
+    if gap > SMALL:
+        return [f"the objective is {100 * gap:.2g} % above the optimum at most: {remedy}"]
+    return []
+
+
+def _criterion(engine: WorkingSet, criterion: str, d: Array, judged: Judged) -> Array:
+    """Value of (10), (1,), or of δ in every row of (11), (n,)."""
+    return np.array([_objective(engine.sums, d, engine.weights)]) if criterion == "qp" else judged.weighted
+
+
+def _relative(objective: Array, reference: Array, criterion: str, sums: Moments, judged: Judged) -> float:
+    """How far an objective is above its reference at most, relative; an envelope that is rounding has no distance."""
+    least = LEAST * sums.rate_scale
+    floor = least * judged.weighted / np.where(judged.largest > 0, judged.largest, 1.0)
+    if criterion == "qp":
+        floor = np.array([float(floor @ floor) * sums.count])
+    return float(np.max((objective - reference) / np.maximum(np.maximum(objective, floor), 1e-300), initial=0.0))
 
 
 def _as_written(engine: WorkingSet, criterion: str) -> Solution:
@@ -338,10 +372,15 @@ def contradiction_in(error: InfeasibleError, where: str, signals: SignalMap) -> 
         To be raised.
     """
     signal = signals.states[error.row]
-    distance = error.distance * float(signal.scale)
+    distance = f"{error.distance * float(signal.scale):.3g} {signal.unit}".rstrip()
+    remedy = "free a half-width of this row, or use an additive term"
+    if not error.together:
+        return FitError(
+            f"structure: '{signal.name}' cannot contain {where}, which stays {distance} outside at best; {remedy}"
+        )
     return FitError(
-        f"structure: '{signal.name}' cannot contain {where}, which stays {distance:.3g} {signal.unit} outside at "
-        f"best; free a half-width of this row, or use an additive term"
+        f"structure: '{signal.name}' cannot contain {where} and {plural(error.together, 'other transition')} at once: "
+        f"each alone can be inside, together one stays outside (this one by {distance} if they share it); {remedy}"
     )
 
 

@@ -629,7 +629,9 @@ def _weights(
         symmetric = np.abs(chosen - chosen.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-12 * largest
         if not symmetric.all():
             raise FitError(f"weights: the matrix of step {int(np.argmin(symmetric))} is not symmetric")
-        smallest = np.linalg.eigvalsh(chosen)[:, 0]
+        # the scales of the states apart, whose squares may differ by more than arithmetic holds
+        unit = 1.0 / np.sqrt(np.maximum(np.einsum("kii->ki", chosen), 1e-300))
+        smallest = np.linalg.eigvalsh(chosen * unit[:, :, None] * unit[:, None, :])[:, 0]
         if smallest.min() <= 0:
             raise FitError(f"weights: the matrix of step {int(np.argmin(smallest))} is not positive definite")
     elif (chosen <= 0).any():

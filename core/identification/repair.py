@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Judged, Moments
@@ -23,12 +24,15 @@ def repair(
     theta: Array,
     d: Array,
     violation: Array,
+    limits: tuple[Array, Array],
+    gentle: bool = False,
 ) -> tuple[UncertainLTI, Array, Judged]:
     """Lift d until `Fleet.judge` finds nothing outside in any row.
 
     A solver leaves a violation of at most `violation` x (scaled size of the sample), and the size is linear in |z|,
     so lifting each element by violation x its unit covers it in every sample. What is left is rounding: a few ulps
-    of |θ| + d for the products and sums and, for the state's own element, of 1 / Δt for the addition of x.
+    of |θ| + d for the products and sums and, for the state's own element, of 1 / Δt for the addition of x. What the
+    structure fixes stays, to the bit; the other elements of the row cover its rounding.
 
     Parameters
     ----------
@@ -43,7 +47,11 @@ def repair(
     d : array (q, n)
         Half-widths of the solver.
     violation : array (n,)
-        Largest violation that the solver left, in scaled units.
+        Times the size of a sample, which is the sum of |ψ| over their root mean squares.
+    limits : pair of array (q, n)
+        Least and largest half-widths that the structure allows.
+    gentle : bool
+        Try lifts far below an ulp first: for an envelope so narrow that a few ulps are much of it.
 
     Returns
     -------
@@ -63,23 +71,40 @@ def repair(
     free = sums.psi_scale > 0
     unit = np.zeros(len(sums.psi_scale))
     unit[free] = 1.0 / sums.psi_scale[free]
-    lifted = d + np.outer(unit, np.maximum(violation, 0.0) * sums.rate_scale)
+    low, high = limits
+    fixed = low == high
+    movable = free[:, None] & ~fixed
+    lifted = np.where(fixed, d, d + np.outer(unit, np.maximum(violation, 0.0)))
     nominal = np.zeros(d.shape)
     nominal[:p] = np.abs(theta[:p])
     if fleet.columns.disturbance:
         nominal[p] = np.abs(theta[p])
     own = np.zeros(d.shape)
     own[np.arange(n), np.arange(n)] = 1.0 / sums.dt_min
-    base = lifted
+    base = np.clip(lifted, low, high)
+    rounding = nominal + base + own
+    for i in np.flatnonzero((fixed & (rounding > 0)).any(axis=0)):  # the others carry what these cannot
+        share = float(sums.psi_scale @ (rounding[:, i] * fixed[:, i]))
+        rounding[:, i] += unit * share
     todo = np.ones(n, dtype=bool)
-    for attempt in range(_ROUNDS):
-        ulps = 2.0 ** (attempt + 2) * _EPS * (nominal + base + own) * free[:, None]
-        lifted = np.where(todo, base + ulps, lifted)
+    lifted = base
+    for attempt in range(-6 if gentle else 0, _ROUNDS):
+        ulps = 2.0 ** (attempt + 2) * _EPS * rounding * movable
+        lifted = np.where(todo, np.minimum(base + ulps, high), lifted)
         model = build(theta, lifted)
         judged = fleet.judge(model)
         todo = judged.outside > 0
         if not todo.any():
             return model, lifted, judged
+        if not movable[:, todo].any(axis=0).all():
+            break
+    row = int(np.argmax(todo))
+    if fixed[free, row].any():
+        raise FitError(
+            f"structure: with half-widths that are fixed, '{model.state_names[row]}' leaves "
+            f"{plural(int(judged.outside[row]), 'transition')} outside, by rounding at least; let a half-width of "
+            f"this row be free, or use an additive term"
+        )
     raise FitError(
         f"containment could not be repaired in row {int(np.argmax(todo))}: the signals differ too much in scale; "
         f"give steady and scale that bring them to order one"

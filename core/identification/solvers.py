@@ -47,11 +47,12 @@ def solve_qp(
     upper: Array,
     active: Sense | None = None,
     any_solver: bool = True,
+    feasible: float = FEASIBLE,
 ) -> Answer:
     """Minimise ½ ξᵀHξ + fᵀξ subject to G ξ >= h, lower <= ξ <= upper.
 
     H must be positive definite, everything scaled to order one. DAQP (dual active set, exact to rounding) first;
-    PIQP, then OSQP with polishing, where it gives up.
+    PIQP if it gives up or returns what violates a row by more than `FEASIBLE`.
 
     Parameters
     ----------
@@ -71,6 +72,8 @@ def solve_qp(
         `Answer.active` of a programme like this one, to start from.
     any_solver : bool
         The others may try where DAQP gives up.
+    feasible : float
+        Largest violation, if no solver reaches `FEASIBLE`, of an answer that the caller will judge itself.
 
     Returns
     -------
@@ -99,7 +102,7 @@ def solve_qp(
             best = (violation, Answer(answer, name, found))
         if violation <= FEASIBLE:
             return best[1]
-    if best is not None and best[0] <= 1e-4:  # the repair makes it contained; the gap reported says how good it is
+    if best is not None and best[0] <= feasible:
         return best[1]
     names = ", ".join(name for name, _ in _SOLVERS)
     raise FitError(f"no solver ({names}) could solve the quadratic programme; scale the signals to order one")
@@ -138,29 +141,7 @@ def _piqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, _:
     return (np.array(solver.result.x, dtype=np.float64) if status in done else None), None
 
 
-def _osqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, _: Sense | None) -> _Found:
-    import osqp
-    import scipy.sparse as sparse
-
-    solver = osqp.OSQP()
-    rows = sparse.vstack([sparse.csc_matrix(G), sparse.identity(len(f))], format="csc")
-    solver.setup(
-        sparse.csc_matrix(np.triu(H)),
-        f,
-        rows,
-        np.concatenate([h, lower]),
-        np.concatenate([np.full(len(h), np.inf), upper]),
-        eps_abs=1e-9,
-        eps_rel=1e-9,
-        max_iter=100_000,
-        polishing=True,
-        verbose=False,
-    )
-    result = solver.solve()
-    return (None if result.x is None or result.x[0] is None else np.asarray(result.x, dtype=np.float64)), None
-
-
-_SOLVERS = (("DAQP", _daqp), ("PIQP", _piqp), ("OSQP", _osqp))
+_SOLVERS = (("DAQP", _daqp), ("PIQP", _piqp))
 
 
 def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array) -> float:
@@ -216,6 +197,15 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
         left = whitened @ multiplier - linear
         best = max(best, float(limits @ multiplier - 0.5 * left @ left))
     return best
+
+
+_REMEDIES: tuple[dict[str, Any], ...] = (
+    {"simplex_scale_strategy": 2},
+    {"presolve": "off"},
+    {"primal_feasibility_tolerance": 1e-9, "dual_feasibility_tolerance": 1e-9},
+    {"simplex_strategy": 4},
+)
+"""Options that are set one after the other, from scratch each time, if the simplex method finds no optimum."""
 
 
 class Simplex:
@@ -305,9 +295,12 @@ class Simplex:
             There is no optimum.
         """
         self._highs.run()
-        if self._highs.getModelStatus() != self._optimal:
+        for remedy in _REMEDIES:
+            if self._highs.getModelStatus() == self._optimal:
+                break
             self._highs.clearSolver()  # a warm start can go astray; from scratch then
-            self._highs.setOptionValue("simplex_scale_strategy", 2)
+            for option, value in remedy.items():
+                self._highs.setOptionValue(option, value)
             self._highs.run()
         if self._highs.getModelStatus() != self._optimal:
             status = self._highs.modelStatusToString(self._highs.getModelStatus())

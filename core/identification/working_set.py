@@ -12,7 +12,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Moments, Samples
-from uncertain_lti.identification.solvers import Sense, Simplex, dual_bound, solve_qp
+from uncertain_lti.identification.solvers import FEASIBLE, Sense, Simplex, dual_bound, solve_qp
 from uncertain_lti.identification.structure import Structure
 
 SUBSAMPLE = 10_000
@@ -20,12 +20,22 @@ SUBSAMPLE = 10_000
 TOLERANCE = 1e-11
 """Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
 TIE_BREAK = 1e-8
-"""Weight of the squared distance of the centre beside the squared widths.
+"""Weight of the squared distance of the centre beside the squared half-widths.
 
-|rate - centre| <= half-width for every sample, so the sum of squared distances is at most a quarter of (10), and
-the optimum of the sum is within TIE_BREAK / 4 (relative) of the optimum of (10) alone, with the centre that the
-stated tie-break asks for.
+|rate - centre| <= half-width for every sample, so the sum of squared distances is at most that of squared half-widths,
+and the optimum of the sum is within TIE_BREAK (relative) of the optimum of (10) alone, with the centre that the stated
+tie-break asks for.
 """
+ROUGH = 1e-4
+"""Violation, in scaled units, up to which a first answer is worth judging: how good it is, is measured at the end."""
+GOOD = 1e-7
+"""Relative distance from the optimum, what the repair will add included, above which a row is solved once more, in
+coordinates of its residual."""
+LEAST = 1e-9
+"""Widths below this share of the steps themselves are rounding, and so is their distance from the optimum."""
+COLLINEAR = 1e-11
+"""Relative singular value of the columns below which a direction has no effect that arithmetic could tell."""
+_EPS = float(np.finfo(np.float64).eps)
 WIDTH_SLACK = 1e-9
 """Relative room above δ of (11) in which its ties are broken; a solver needs some."""
 BOUNDED_TIE_BREAK = 1e-5
@@ -36,7 +46,8 @@ REGULARISATION = 1e-4
 With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
 of the squared widths. Whether it was is seen from the optimum of δ alone, at the end.
 """
-MAX_ROUNDS = 200
+MAX_ROUNDS, FEW_ROUNDS = 200, 60
+_REMEDY = "a state may follow from the others exactly: leave it out, or fix its row by structure"
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
 _JOIN = 48  # samples that join a working set per round, at least; more where there are many unknowns
 
@@ -52,7 +63,7 @@ class Solution:
     d : array (q, n)
         Half-widths.
     violation : array (n,)
-        Largest violation left, in scaled units.
+        Largest violation left, in units of the size of a sample.
     delta : array (n,) or None, optional
         Optimum of (11) on the working set, a lower bound of the optimum over all samples; None for (10).
     rounds : int, default 0
@@ -64,7 +75,7 @@ class Solution:
     solvers : set of str, optional
         Names of those that found it.
     gap : float or None, optional
-        How far (10) is above a lower bound of its optimum at most, relative, by the dual objective; None for (11).
+        How far (10) is above a lower bound of its optimum at most, relative; inf if no bound was found, None for (11).
     """
 
     theta: Array
@@ -95,7 +106,31 @@ class Row:
 
     def __init__(self, i: int, sums: Moments, bounds: tuple[Array, Array, Array, Array]) -> None:
         self.i = i
-        self.scale = float(sums.rate_scale[i])
+        self.sums = sums
+        self._bounds = bounds
+        self.refined = False
+        self.width: Array = np.empty(0)
+        self.kept: float | None = None  # violation, in units of the size, of an answer of before that was good
+        self.width_unit = 1.0  # of δ and `width`, beside scale: of order one in refined coordinates
+        self.tolerance = TOLERANCE
+        self._coordinates(float(sums.rate_scale[i]))
+        self.samples = Samples.join([], len(sums.low))
+        self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
+        self.limit: float | None = None  # δ of (11) in units of scale x width_unit
+        self.exact = False  # (11) by the simplex method
+        self._forget()
+
+    def _forget(self) -> None:
+        """What solvers start from."""
+        self.attempt = _ATTEMPTS[0]
+        self._active: dict[str, Sense] = {}  # what was active in the last programme of a kind
+        self._simplex: Simplex | None = None
+        self._known: Index = np.empty(0, dtype=np.intp)
+
+    def _coordinates(self, scale: float) -> None:
+        """Scaled unknowns: columns of unit size, elements in units of `scale` per step."""
+        i, sums, bounds = self.i, self.sums, self._bounds
+        self.scale = scale
         theta_low, theta_high, d_low, d_high = (b[:, i] for b in bounds)
         dead_phi, dead_psi = sums.phi_scale == 0, sums.psi_scale == 0
         fixed_phi, fixed_psi = theta_low == theta_high, d_low == d_high
@@ -121,14 +156,97 @@ class Row:
         plain = self._gram(sums.plain_gram, sums.count)
         self.plain, self.plain_linear, _ = plain
         self.gram, self.linear, self.known = plain if sums.gram is None else self._gram(sums.gram[i], sums.count)
-        self.samples = Samples.join([], len(sums.low))
-        self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
-        self.limit: float | None = None  # δ of (11) in units of scale
-        self.exact = False  # (11) by the simplex method
-        self.attempt = _ATTEMPTS[0]
-        self._active: dict[str, Sense] = {}  # what was active in the last programme of a kind
-        self._simplex: Simplex | None = None
-        self._known: Index = np.empty(0, dtype=np.intp)
+        self.basis: Array | None = None  # scaled θ = basis η, in refined coordinates
+        self.asked: Array = np.empty((0, self.r))  # asked η >= asked_limits: what the structure says of θ there
+        self.asked_limits: Array = np.empty(0)
+
+    def refine(self) -> None:
+        """Go over to coordinates in which the envelope has order one, however narrow and collinear the data.
+
+        The elements are sought as differences from the least squares over the samples held, in units of the residual
+        instead of the step, along directions of equal effect instead of columns. A solver's tolerance is then one on
+        the envelope. It costs a decomposition, so rows are refined only where it matters.
+        """
+        samples, pool, limit = self.samples, self.pool, self.limit
+        theta, d, before = self.theta, self.d, self.limit_unit
+        phi = self._phi(samples)
+        step = samples.rate * samples.dt
+        fixed = np.where(np.isin(np.arange(len(self.theta)), self.free_phi), 0.0, self.theta)
+        columns = (phi[self.free_phi] * samples.dt).T * self.unit_phi
+        left, values, right = np.linalg.svd(columns, full_matrices=False)
+        keep = values > COLLINEAR * values.max(initial=0.0)
+        inverse = right[keep].T / values[keep]
+        base, residual = np.zeros(self.r), step - fixed @ phi * samples.dt
+        for _ in range(2):  # the first leaves the rounding of large numbers
+            change = inverse @ (left[:, keep].T @ residual)
+            base, residual = base + change, residual - columns @ change
+        low, high = (b[:, self.i][self.free_phi] for b in self._bounds[:2])
+        base = np.clip(base * self.unit_phi, low, high)
+        fixed[self.free_phi] = base
+        residual = step - fixed @ phi * samples.dt
+        largest = float(np.abs(samples.z[self.i]).max(initial=0.0)) + float(np.abs(step).max(initial=0.0))
+        rounding = _EPS * largest
+        scale = max(float(np.sqrt(np.mean(residual**2))) if len(step) else 0.0, 4.0 * rounding, 1e-14 * self.rms_step)
+        self._coordinates(scale)
+        self.refined = True
+        self.tolerance = max(TOLERANCE, 0.25 * rounding / scale)
+        self.fixed_theta[self.free_phi] = base
+        self.lower[: self.r] -= base / (self.unit_phi * scale)
+        self.upper[: self.r] -= base / (self.unit_phi * scale)
+        target = self.sums.target[:, self.i] - self.sums.centre @ self.fixed_theta
+        self.target = target[self.free_phi] * self.unit_phi / (self.sums.count * scale)
+        if self.r:
+            root = np.sqrt(len(step))
+            self.basis = inverse * root
+            if values[keep].min(initial=np.inf) > 1e-5 * values.max(initial=0.0):
+                self.centre = self.basis.T @ self.centre @ self.basis
+                self.target = self.basis.T @ self.target
+            else:  # sums of squares do not hold so small a difference, the samples do
+                self.centre = np.eye(self.basis.shape[1])
+                self.target = left[:, keep].T @ residual / (root * scale)
+            low, high = self.lower[: self.r], self.upper[: self.r]
+            there = np.concatenate([np.flatnonzero(np.isfinite(low)), np.flatnonzero(np.isfinite(high))])
+            signs = np.repeat([1.0, -1.0], [int(np.isfinite(low).sum()), int(np.isfinite(high).sum())])
+            asked = signs[:, None] * self.basis[there]
+            size = np.maximum(np.abs(asked).max(axis=1, initial=0.0), 1e-300)
+            limits = np.concatenate([low[np.isfinite(low)], -high[np.isfinite(high)]])
+            self.asked, self.asked_limits = asked / size[:, None], limits / size
+            self.r = self.basis.shape[1]
+            self.lower = np.concatenate([np.full(self.r, -np.inf), self.lower[-self.q :] if self.q else np.empty(0)])
+            self.upper = np.concatenate([np.full(self.r, np.inf), self.upper[-self.q :] if self.q else np.empty(0)])
+        self.theta, self.d = theta, d
+        self._forget()
+        self.width_unit = 1.0
+        self.hold(samples, *self._columns)
+        self.width_unit = float(np.sqrt(np.mean(self.width**2))) if len(samples) else 1.0
+        self.width = self.width / self.width_unit
+        self.limit = None if limit is None else limit * before / self.limit_unit
+        self.pool = pool
+
+    @property
+    def limit_unit(self) -> float:
+        """Of `limit`, in normalised units."""
+        return self.scale * self.width_unit
+
+    def _sizes(self, positions: Index | int) -> Array:
+        """Size of held samples: the unit of their slack, with `scale`."""
+        return np.asarray(self.width[positions] * self.width_unit / (2.0 * self.samples.root_weight[positions]))
+
+    def _phi(self, samples: Samples) -> Array:
+        return np.vstack([samples.z, np.ones(len(samples))]) if self._columns[0] else samples.z
+
+    def scaled(self) -> tuple[Array, Array]:
+        """Return the row's elements as differences from its fixed part, in scaled units.
+
+        Returns
+        -------
+        array (r,), array (q,)
+            Of the nominal elements, without the basis, and of the half-widths.
+        """
+        theta, d = self.theta[self.free_phi], self.d[self.free_psi]
+        if self.refined:
+            theta = theta - self.fixed_theta[self.free_phi]
+        return theta / (self.unit_phi * self.scale), d / (self.unit_psi * self.scale)
 
     def _gram(self, gram: Array, count: int) -> tuple[Array, Array, float]:
         """Squared widths as ½ dᵀ G d + gᵀ d + k in scaled units; G has order one."""
@@ -137,6 +255,7 @@ class Row:
         linear = (gram @ self.fixed_d)[self.free_psi] * unit / (count * self.scale)
         largest = float(np.diagonal(inside).max(initial=0.0)) or 1.0
         known = 0.5 * float(self.fixed_d @ gram @ self.fixed_d) / (count * self.scale**2)
+        self.largest = largest
         return inside / largest, linear / largest, known / largest
 
     @property
@@ -157,9 +276,14 @@ class Row:
         answer : array (r + q,)
             Scaled unknowns ξ.
         """
-        self.theta[self.free_phi] = answer[: self.r] * self.unit_phi * self.scale
+        self._store_theta(answer[: self.r])
         d = np.maximum(answer[self.r :], np.maximum(self.lower[self.r :], 0.0))
         self.d[self.free_psi] = d * self.unit_psi * self.scale
+
+    def _store_theta(self, answer: Array) -> None:
+        change = answer if self.basis is None else self.basis @ answer
+        theta = change * self.unit_phi * self.scale
+        self.theta[self.free_phi] = theta + self.fixed_theta[self.free_phi] if self.refined else theta
 
     def hold(self, samples: Samples, columns_drift: bool, disturbance: bool, noise: bool) -> None:
         """Hold these samples, and the working set so far.
@@ -175,22 +299,26 @@ class Row:
         noise : bool
             The fit has v.
         """
+        self._columns = (columns_drift, disturbance, noise)
         p = len(samples.z)
         kept = self.samples[self.pool]
         self.samples = samples = Samples.join([samples, kept], p)
         self.pool = np.searchsorted(samples.index, kept.index)
         ones = np.ones(len(samples))
-        phi = np.vstack([samples.z, ones]) if columns_drift else samples.z
+        phi = self._phi(samples)
         extra = ([ones] if disturbance else []) + ([1.0 / samples.dt] if noise else [])
         psi = np.vstack([np.abs(samples.z), *extra])
         size = self.size_unit @ psi
         size[size == 0.0] = 1.0
         # rows of the programme: each sample divided by its own size, so that one near rest weighs as any other
-        self.phi = ((phi[self.free_phi] * self.unit_phi[:, None]) / size).T
+        self.plain_phi = ((phi[self.free_phi] * self.unit_phi[:, None]) / size).T
+        self.phi = self.plain_phi if self.basis is None else self.plain_phi @ self.basis
         self.psi = ((psi[self.free_psi] * self.unit_psi[:, None]) / size).T
         self.y = (samples.rate - self.fixed_theta @ phi) / (size * self.scale)
         self.half = (self.fixed_d @ psi) / (size * self.scale)
         self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
+        if self.refined:
+            self.width = self.width / self.width_unit
 
     def slacks(self) -> tuple[Array, Array | None]:
         """Slack of every held sample.
@@ -202,10 +330,9 @@ class Row:
         array (K,) or None
             From being wider than (11) allows; None without a limit.
         """
-        theta = self.theta[self.free_phi] / (self.unit_phi * self.scale)
-        d = self.d[self.free_psi] / (self.unit_psi * self.scale)
+        theta, d = self.scaled()
         half = self.psi @ d + self.half
-        inside = half - np.abs(self.y - self.phi @ theta)
+        inside = half - np.abs(self.y - self.plain_phi @ theta)
         return inside, None if self.limit is None else self.limit / self.width - half
 
     def slack(self) -> Array:
@@ -238,18 +365,16 @@ class Row:
             Slack from being too wide.
         """
         inside, room = self.slacks()
-        least = 10 * TOLERANCE
+        least = 10 * self.tolerance
         wanted = max(float(np.quantile(inside, share)), least)
         width = 0.0 if room is None else float(np.quantile(room, share))
         return wanted, min(width, wanted) if width > 1e-6 else 0.0
 
-    def widen_pool(self, tolerance: float = TOLERANCE, most: int | None = None) -> bool:
+    def widen_pool(self, most: int | None = None) -> bool:
         """Let the most violated held samples join the working set.
 
         Parameters
         ----------
-        tolerance : float, optional
-            Violation that is accepted, in scaled units; default TOLERANCE.
         most : int, optional
             Samples at most; default twice the unknowns, or a fixed number if that is more.
 
@@ -260,7 +385,7 @@ class Row:
         """
         slack = self.slack()
         slack[self.pool] = np.inf
-        outside = np.flatnonzero(slack < -tolerance)
+        outside = np.flatnonzero(slack < -self.tolerance)
         most = most or max(_JOIN, 2 * (self.r + self.q))
         if len(outside) > most:
             outside = outside[np.argpartition(slack[outside], most)[:most]]
@@ -330,9 +455,10 @@ class Row:
 
         objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
         """
+        feasible = FEASIBLE if self.refined else ROUGH
         fixed, per_sample = len(lower), len(h) // max(len(self.pool), 1)
         start = None
-        if kind in self._active:
+        if kind in self._active and per_sample:
             known = self._active[kind][fixed:].reshape(per_sample, -1)
             known = known[:, : len(self.pool)]  # the pool grows, but for discards
             start = np.zeros(fixed + len(h), dtype=np.int32)
@@ -340,18 +466,25 @@ class Row:
             start[fixed:].reshape(per_sample, -1)[:, : known.shape[1]] = known
         for attempt in _ATTEMPTS:
             try:
-                answer = solve_qp(*objective(*attempt), G, h, lower, upper, start, any_solver=False)
+                answer = solve_qp(*objective(*attempt), *self._asked(G, h), lower, upper, start, False, feasible)
                 break
             except FitError:
                 continue
         else:
             if not any_solver:
                 raise FitError("DAQP could not solve the quadratic programme")
-            answer = solve_qp(*objective(*attempt), G, h, lower, upper)
+            answer = solve_qp(*objective(*attempt), *self._asked(G, h), lower, upper, feasible=feasible)
         self.attempt = attempt
-        if answer.active is not None:
+        if answer.active is not None and not len(self.asked):
             self._active[kind] = answer.active
         return answer.xi, answer.solver
+
+    def _asked(self, G: Array, h: Array) -> tuple[Array, Array]:
+        """Rows G ξ >= h, and what the structure asks of θ if that is no bound of an unknown."""
+        if not len(self.asked):
+            return G, h
+        rows = np.hstack([self.asked, np.zeros((len(self.asked), G.shape[1] - self.r))])
+        return np.vstack([G, rows]), np.concatenate([h, self.asked_limits])
 
     def solve_quadratic(self) -> str:
         """Solve (10) on the working set.
@@ -467,26 +600,221 @@ class Row:
     def _minimax(self) -> Simplex:
         """Minimise δ, the last unknown."""
         cost = np.append(np.zeros(self.r + self.q), 1.0)
-        return Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
+        simplex = Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
+        simplex.add(*self._asked(np.empty((0, len(cost))), np.empty(0)))
+        return simplex
 
     def duality_gap(self) -> float:
-        """How far the squared widths of this row are above the optimum at most, relative to it.
+        """How far the squared widths of this row are above the optimum at most, relative to it, by the dual objective.
 
-        The tie-break adds at most TIE_BREAK / 4 of them to the optimum of the programme that is solved.
+        The programme that is solved has the tie-break and the ridge beside the squared widths; both are bounded. inf
+        where the columns are so collinear that the ridge is not.
 
         Returns
         -------
         float
             Relative.
         """
-        theta = self.theta[self.free_phi] / (self.unit_phi * self.scale)
-        d = self.d[self.free_psi] / (self.unit_psi * self.scale)
+        theta, d = self.scaled()
         factor, ridge = self.attempt
+        if self.basis is not None:
+            theta = np.linalg.lstsq(self.basis, theta, rcond=None)[0].astype(np.float64)
         H, f = self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge)
         xi = np.concatenate([theta, d])
-        bound = dual_bound(H, f, *self.containment(self.pool), self.lower, self.upper, xi)
-        value = float(0.5 * d @ self.gram @ d + self.linear @ d) + self.known
-        return _relative_gap(float(0.5 * xi @ H @ xi + f @ xi) - bound, value, factor)
+        bound = dual_bound(H, f, *self._asked(*self.containment(self.pool)), self.lower, self.upper, xi)
+        value = max(self.value(d), self.least_value())
+        weight = factor * TIE_BREAK * float(np.diagonal(self.gram).min(initial=1.0))
+        spread = max(float(d @ self.plain @ d), 0.0)
+        smallest = float(np.linalg.eigvalsh(self.centre)[0]) if self.r else 1.0
+        largest = (self.rms_step / self.scale + np.sqrt(spread) + float(np.abs(self.half).max(initial=0.0))) ** 2
+        lifted = 0.5 * weight * ridge * 4.0 * largest / smallest if smallest > 1e-13 else np.inf
+        ties = factor * TIE_BREAK * (1.0 if self.sums.gram is None else float(len(d)))
+        return float(max(0.5 * xi @ H @ xi + f @ xi - bound, 0.0) + lifted) / value + ties
+
+    def among(self, coupled: Array, widths: list[Array]) -> None:
+        """Take the row's part of (10) with full weights, given the other rows, as its own.
+
+        Parameters
+        ----------
+        coupled : array (n q, n q)
+            Of `Moments`.
+        widths : list of array (q,)
+            Half-widths of all rows.
+        """
+        q = len(self.d)
+        mine = slice(self.i * q, (self.i + 1) * q)
+        unit = self.unit_psi * self.scale
+        fixed = np.concatenate(widths)
+        fixed[mine] = self.fixed_d
+        gram = coupled[mine, mine][np.ix_(self.free_psi, self.free_psi)] * np.outer(unit, unit)
+        self.largest = float(np.diagonal(gram).max(initial=0.0)) or 1.0
+        self.gram = gram / self.largest
+        self.linear = (coupled[mine] @ fixed)[self.free_psi] * unit / self.largest
+
+    def solve_among(self) -> str:
+        """(10) with full weights, of this row given the others.
+
+        If another row is wider by many orders of magnitude, what it weighs here is as many times steeper than the
+        row's own part. Either this row follows it, and is solved in its units, or the row is as narrow as can be.
+
+        Returns
+        -------
+        str
+            The solver.
+
+        Raises
+        ------
+        FitError
+            No solver found an answer.
+        """
+        try:
+            return self.solve_quadratic()
+        except FitError:
+            steep = float(np.abs(self.linear).max(initial=0.0))
+            if steep <= 1.0:
+                raise
+        G, h = self._asked(*self.containment(self.pool))
+        if -self.linear.min() >= self.linear.max():
+            H, f = self.hessian(self.gram, self.linear, TIE_BREAK)
+            answer = solve_qp(H, f / steep, G, h / steep, self.lower / steep, self.upper / steep)
+            self.store(answer.xi * steep)
+            return answer.solver
+        simplex = Simplex(np.concatenate([np.zeros(self.r), self.linear / steep]), self.lower, self.upper)
+        simplex.add(G, h)
+        self.store(simplex.solve())
+        return "HiGHS simplex"
+
+    def value(self, d: Array) -> float:
+        """Return half the mean of the squared half-widths of all samples, in scaled units.
+
+        Parameters
+        ----------
+        d : array (q,)
+            Scaled half-widths.
+
+        Returns
+        -------
+        float
+            The row's part of (10) but for a factor.
+        """
+        return max(float(0.5 * d @ self.gram @ d + self.linear @ d) + self.known, 0.0)
+
+    def least_value(self) -> float:
+        """Return the `value` of an envelope so narrow that it is rounding.
+
+        Returns
+        -------
+        float
+            In the same units.
+        """
+        return 0.125 * (LEAST * self.rms_step / self.scale) ** 2
+
+    def collinear(self) -> bool:
+        """Tell whether columns are so alike that the simplex method's tolerance is none on the envelope.
+
+        Returns
+        -------
+        bool
+            Never in refined coordinates.
+        """
+        return self.r > 0 and not self.refined and float(np.linalg.eigvalsh(self.centre)[0]) < 1e-8
+
+    @property
+    def rms_step(self) -> float:
+        """Root mean square of x_next - x."""
+        return float(self.sums.rate_scale[self.i])
+
+    def outside(self) -> float:
+        """Return the largest violation of the samples held.
+
+        Returns
+        -------
+        float
+            In scaled units; 0 if none is violated.
+        """
+        return max(0.0, -float(self.slack().min(initial=0.0)))
+
+    def answer(self) -> tuple[Array, Array, float]:
+        """Return what the row is now.
+
+        Returns
+        -------
+        array (r,), array (q,), float
+            Nominal elements, half-widths, and their largest violation in units of the size of a sample.
+        """
+        return self.theta.copy(), self.d.copy(), self.outside() * self.scale
+
+    def keep(self, answer: tuple[Array, Array, float]) -> None:
+        """Return to an answer of before.
+
+        Parameters
+        ----------
+        answer : (array, array, float)
+            What `answer` returned.
+        """
+        self.theta, self.d, self.kept = answer
+
+    def least_linear(self, cost: Array) -> float:
+        """Minimise costᵀ d over scaled half-widths that contain the working set.
+
+        Parameters
+        ----------
+        cost : array (q,)
+            Of the free half-widths.
+
+        Returns
+        -------
+        float
+            The minimum.
+
+        Raises
+        ------
+        FitError
+            The simplex method found none.
+        """
+        simplex = Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, self.upper)
+        simplex.add(*self._asked(*self.containment(self.pool)))
+        return float(cost @ simplex.solve()[self.r :])
+
+    def linear_gap(self) -> float:
+        """As `duality_gap`, by the simplex method.
+
+        (10) is convex, so its optimum is no less than what its linearisation here says of any elements that contain
+        the working set. It needs neither multipliers nor a Hessian that can be inverted.
+
+        Returns
+        -------
+        float
+            Relative; inf if the simplex method found no bound.
+        """
+        _, d = self.scaled()
+        slope = self.gram @ d + self.linear
+        largest = float(np.abs(slope).max(initial=0.0))
+        if largest == 0.0:
+            return 0.0
+        try:
+            least = self.least_linear(slope / largest) * largest
+        except FitError:
+            return np.inf
+        return max(float(slope @ d) - least, 0.0) / max(self.value(d), self.least_value())
+
+    def lifted_loss(self) -> float:
+        """Estimate what lifting the half-widths over the violation that is left adds to the optimum.
+
+        Returns
+        -------
+        float
+            Relative.
+        """
+        _, d = self.scaled()
+        outside = self.outside()
+        if outside <= 0.0:
+            return 0.0
+        if self.limit is None:
+            slope = float((self.gram @ d + self.linear).sum())
+            return outside * slope / max(self.value(d), self.least_value())
+        least = LEAST * self.rms_step / self.limit_unit * float(self.samples.root_weight.max(initial=0.0))
+        return outside * float(self.width.max(initial=0.0)) / max(self.limit, least, 1e-300)
 
     def _rows(self, pool: Index) -> tuple[Array, Array]:
         """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
@@ -555,44 +883,52 @@ class Row:
             answer = solve_qp(
                 self.centre + self.attempt[1] * np.eye(self.r),
                 -self.target,
-                np.vstack([phi, -phi]),
-                np.concatenate([y - half, -y - half]),
+                *self._asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half])),
                 self.lower[: self.r],
                 self.upper[: self.r],
                 any_solver=False,
+                feasible=FEASIBLE if self.refined else ROUGH,
             )
         except FitError:  # the half-widths leave no room at all
             return
-        self.theta[self.free_phi] = answer.xi * self.unit_phi * self.scale
+        self._store_theta(answer.xi)
 
-    def contradiction(self) -> tuple[int, float] | None:
-        """A sample that no elements within the structure can contain.
+    def contradiction(self) -> tuple[int, float, int] | None:
+        """A sample that no elements within the structure can contain, alone or with others.
 
         Returns
         -------
-        (int, float) or None
-            Index of the sample, and its distance from the bounds, normalised; None where there is none.
+        (int, float, int) or None
+            Index of the sample, its distance from the bounds at best, normalised, and how many others it contradicts:
+            0 if it could not be contained alone either. None where there is none.
 
         Raises
         ------
         FitError
             There is no optimum.
         """
-        simplex = self._minimax()
-        G, h = self.containment(self.pool)
-        simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
-        answer = simplex.solve()
+
+        def least(pool: Index) -> tuple[Array, Array, Array]:
+            simplex = self._minimax()
+            G, h = self.containment(pool)
+            simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
+            answer = simplex.solve()
+            prices = np.abs(simplex.duals()[len(self.asked) :]).reshape(2, -1).sum(axis=0)
+            return answer, (h - G @ answer[:-1]).reshape(2, -1).max(axis=0), prices
+
+        answer, short, prices = least(self.pool)
         if answer[-1] <= 1e-9:
             return None
-        short = h - G @ answer[:-1]
-        worst = self.pool[int(np.argmax(short)) % len(self.pool)]
-        size = self.width[worst] / (2.0 * self.samples.root_weight[worst])
-        return int(self.samples.index[worst]), float(answer[-1] * size * self.scale)
-
-
-def _relative_gap(above: float, value: float, factor: float = 1.0) -> float:
-    """Of squared widths in scaled units; widths below a millionth of the steps themselves are rounding."""
-    return max(above, 0.0) / max(value, 1e-12) + factor * TIE_BREAK / 4
+        against = np.flatnonzero(prices > 1e-9 * prices.max(initial=0.0))  # they prove that there is no answer
+        worst = int(against[np.argmax(short[against])]) if len(against) else int(np.argmax(short))
+        distance, together = float(answer[-1]), len(against) - 1
+        for position in against[np.argsort(-short[against])]:
+            alone = float(least(self.pool[[position]])[0][-1])
+            if alone > 1e-9:
+                worst, distance, together = int(position), alone, 0
+                break
+        sample = int(self.pool[worst])
+        return int(self.samples.index[sample]), distance * float(self._sizes(sample)) * self.scale, max(together, 0)
 
 
 class InfeasibleError(FitError):
@@ -606,11 +942,13 @@ class InfeasibleError(FitError):
         Position of the transition.
     distance : float
         How far it stays outside at best, normalised.
+    together : int, default 0
+        How many other transitions it contradicts, if it could be contained without them.
     """
 
-    def __init__(self, row: int, index: int, distance: float) -> None:
+    def __init__(self, row: int, index: int, distance: float, together: int = 0) -> None:
         super().__init__(f"row {row} cannot contain transition {index}")
-        self.row, self.index, self.distance = row, index, distance
+        self.row, self.index, self.distance, self.together = row, index, distance, together
 
 
 class WorkingSet:
@@ -649,11 +987,13 @@ class WorkingSet:
         self._terms = (columns.drift, columns.disturbance, columns.noise)
         structure = structure or Structure(fleet.n, fleet.p - fleet.n)
         bounds = structure.stacked(*self._terms)
+        self.half_limits = bounds[2:]  # least and largest half-widths that the structure allows, (q, n) each
         self.rows = [Row(i, self.sums, bounds) for i in range(fleet.n)]
         self.solvers: set[str] = set()
         self.rounds, self.passes = 0, 1
-        self._reach: Array | None = None  # (2, n)
-        self._coupled_gap = 0.0
+        self._reach: Array | None = None  # (2, n), in these scales of the rows
+        self._reach_scales = np.empty(0)
+        self._coupled_gap = np.inf
 
     def quadratic(self) -> Solution:
         """Solve (10).
@@ -668,12 +1008,103 @@ class WorkingSet:
         FitError
             No solver found an answer; `InfeasibleError` where the structure contradicts a transition.
         """
-        coupled = self.sums.coupled is not None
-        self._run(
-            self._settle_coupled if coupled else lambda rows: self._settle(rows, Row.solve_quadratic, polish=True)
-        )
-        gap = self._coupled_gap if coupled else self._largest_gap()
-        return replace(self._solution(), gap=gap)
+        if self.sums.coupled is not None:
+            return self._coupled_quadratic()
+        self._start(self._settle_quadratic)
+        self._prove(self._settle_quadratic)
+        gaps = np.array([row.duality_gap() if row.unknown else 0.0 for row in self.rows])
+        again = [row for row in self.rows if row.unknown and not gaps[row.i] + row.lifted_loss() <= GOOD]
+        if again:
+            before = {row.i: (row.answer(), self._lifted(row)) for row in again}
+            for row in again:
+                if not row.refined:
+                    row.refine()
+            self._again(again, self._settle_quadratic)
+            for row in again:
+                gaps[row.i] = min(row.duality_gap(), row.linear_gap())
+                answer, value = before[row.i]
+                now = self._lifted(row) if row.outside() <= max(1e-6, row.tolerance) else np.inf
+                if value <= now * (1.0 + GOOD):  # nothing gained: the elements stay
+                    gaps[row.i] = max(gaps[row.i] + value / max(now, 1e-300) - 1.0, 0.0) if now < np.inf else np.inf
+                    row.keep(answer)
+        return replace(self._solution(), gap=float(gaps.max(initial=0.0)))
+
+    def _again(self, rows: list[Row], settle: Callable[[list[Row]], None]) -> None:
+        """Solve rows once more; what a solver cannot improve stays as it was."""
+
+        def settle_each(some: list[Row]) -> None:
+            for row in some:
+                theta, d, limit = row.theta.copy(), row.d.copy(), row.limit
+                try:
+                    settle([row])
+                except InfeasibleError:
+                    raise
+                except FitError:
+                    row.theta, row.d, row.limit = theta, d, limit
+
+        settle_each(rows)
+        self._prove(settle_each)
+
+    def _settle_quadratic(self, rows: list[Row]) -> None:
+        for row in rows:
+            self._settle_or_refine(row, Row.solve_quadratic, polish=True)
+
+    def _settle_or_refine(self, row: Row, solve: Callable[[Row], str], polish: bool = False) -> None:
+        """Settle a row, in refined coordinates where it does not settle in those of its steps."""
+        if not row.refined:
+            try:
+                self._settle([row], solve, polish)
+                return
+            except InfeasibleError:
+                raise
+            except FitError:
+                row.refine()
+        self._settle([row], solve, polish)
+
+    def _lifted(self, row: Row) -> float:
+        """Part of the row in the objective of (10), with the half-widths lifted over what is violated."""
+        _, d = row.scaled()
+        scaled = row.value(d + row.outside())
+        return scaled * row.scale**2 + row.least_value() * row.scale**2
+
+    def _coupled_quadratic(self) -> Solution:
+        """(10) with full weights: all rows in one programme, then one row after the other if that is not good."""
+        try:
+            self._start(self._settle_coupled)
+            self._prove(self._settle_coupled)
+            if not self._coupled_gap <= GOOD:
+                self._coupled_gap = min(self._coupled_gap, self._coupled_linear_gap())
+            if self._coupled_gap + self._coupled_loss() <= GOOD:
+                return replace(self._solution(), gap=self._coupled_gap)
+        except InfeasibleError:
+            raise
+        except FitError:
+            pass
+        for row in self.rows:
+            if not row.refined:
+                row.refine()
+        self._settle_in_turn(self.rows)
+        self._prove(self._settle_in_turn)
+        return replace(self._solution(), gap=self._coupled_linear_gap())
+
+    def _settle_in_turn(self, rows: list[Row]) -> None:
+        """(10) with full weights by one row at a time, the others as they are.
+
+        The rows meet in the objective alone, which is convex and smooth, so going round them descends to the optimum
+        of all; and rows whose widths differ by many orders of magnitude never share a programme.
+        """
+        assert self.sums.coupled is not None
+        before = np.inf
+        for _ in range(MAX_ROUNDS):
+            for row in self.rows:
+                if row.unknown:
+                    row.among(self.sums.coupled, [other.d for other in self.rows])
+                self._settle([row], Row.solve_among, polish=True)
+            flat = np.concatenate([row.d for row in self.rows])
+            value = float(flat @ self.sums.coupled @ flat)
+            if value >= before * (1.0 - 1e-11):
+                return
+            before = value
 
     def linear(self) -> Solution:
         """Solve (11), then least sum of squared widths among its optima, then the centre.
@@ -700,34 +1131,66 @@ class WorkingSet:
                     except FitError:
                         row.exact = True
                 if row.exact:
-                    row.limit = None if row.limit is None else float(deltas[row.i]) / row.scale
-                    self._settle([row], Row.solve_linear)
+                    row.limit = None if row.limit is None else float(deltas[row.i]) / row.limit_unit
+                    self._settle_or_refine(row, Row.solve_linear)
                 if row.limit is None:  # nothing unknown: the widths are what the structure says
                     row.limit = float((row.width * row.half).max(initial=0.0))
-                deltas[row.i] = row.limit * row.scale
+                deltas[row.i] = row.limit * row.limit_unit
                 row.limit *= 1.0 + WIDTH_SLACK
                 if row.exact:
                     self._settle([row], Row.solve_bounded, polish=True)
 
         self._start(settle)
         self._prove(settle)
+        bounds = deltas.copy()
         again = []
         for row in self.rows:
             if row.unknown:
-                least = row.least_width() * row.scale
-                self.solvers.add("HiGHS simplex")
-                above = deltas[row.i] > (1.0 + WIDTH_SLACK) * least + 1e-13 * row.scale
-                deltas[row.i] = min(deltas[row.i], least)
+                bounds[row.i] = self._least_width(row)
+                above = deltas[row.i] > (1.0 + WIDTH_SLACK) * bounds[row.i] + 1e-13 * row.scale
                 if above and not row.exact:
                     row.exact = True
                     again.append(row)
         if again:  # the weight beside δ was too large for these rows
             settle(again)
             self._prove(settle)
-        return self._solution(deltas)
+        again = [
+            row
+            for row in self.rows
+            if row.unknown and (row.collinear() or not self._above(row, bounds) <= GOOD) and not row.refined
+        ]
+        if again:
+            before = {row.i: (row.answer(), self._largest_width(row)) for row in again}
+            for row in again:
+                row.refine()
+                row.exact = True
+            self._again(again, settle)
+            for row in again:
+                bounds[row.i] = self._least_width(row)
+                answer, width = before[row.i]
+                if width <= self._largest_width(row) * (1.0 + GOOD):  # nothing gained: the elements stay
+                    row.keep(answer)
+        return self._solution(np.minimum(deltas, bounds))
 
-    def _largest_gap(self) -> float:
-        return max((row.duality_gap() for row in self.rows if row.unknown), default=0.0)
+    def _least_width(self, row: Row) -> float:
+        """A lower bound of δ."""
+        self.solvers.add("HiGHS simplex")
+        try:
+            return row.least_width() * row.limit_unit
+        except FitError:
+            return -np.inf
+
+    def _above(self, row: Row, bounds: Array) -> float:
+        """How far the largest width of a row will be above its bound at most, relative."""
+        least = LEAST * row.rms_step * float(row.samples.root_weight.max(initial=0.0))
+        return (self._largest_width(row) - float(bounds[row.i])) / max(float(bounds[row.i]), least, 1e-300)
+
+    def _largest_width(self, row: Row) -> float:
+        """√w x width of a row at most, with the half-widths lifted over what is left outside."""
+        _, d = row.scaled()
+        inside, _ = row.slacks()
+        lift = max(0.0, -float(inside.min(initial=0.0)))
+        return float((row.width * (row.psi @ d + row.half + lift)).max(initial=0.0)) * row.limit_unit
 
     @property
     def weights(self) -> Array | None:
@@ -759,12 +1222,12 @@ class WorkingSet:
 
     def _solution(self, delta: Array | None = None) -> Solution:
         for row in self.rows:  # a solver may stop close to what cannot be
-            if -float(row.slack().min(initial=0.0)) > 1e-8 and (found := row.contradiction()):
+            if row.outside() > 1e-8 and (found := row.contradiction()):
                 raise InfeasibleError(row.i, *found)
         return Solution(
             np.column_stack([row.theta for row in self.rows]),
             np.column_stack([row.d for row in self.rows]),
-            np.array([max(0.0, -float(row.slack().min(initial=0.0))) for row in self.rows]),
+            np.array([row.outside() * row.scale if row.kept is None else row.kept for row in self.rows]),
             delta,
             self.rounds,
             self.passes,
@@ -795,15 +1258,18 @@ class WorkingSet:
         for _ in range(MAX_ROUNDS):
             wanted = np.array([row.reach(share) for row in self.rows]).T
             # the samples held after a pass are those of least slack, so the next reach would shrink: keep the first
-            self._reach = wanted = wanted if self._reach is None else np.maximum(wanted, self._reach)
+            scales = np.array([row.scale for row in self.rows])
+            if self._reach is not None and np.array_equal(scales, self._reach_scales):
+                wanted = np.maximum(wanted, self._reach)
+            self._reach, self._reach_scales = wanted, scales
             found = self.fleet.scan(self._candidate(wanted[0], wanted[1], most))
             self.passes += 1
-            before = [(row.theta.copy(), row.d.copy(), row.limit) for row in self.rows]
+            before = [(row.theta.copy(), row.d.copy(), row.limit, row.scale) for row in self.rows]
             todo = []
             left = 0
             for row, (samples, _) in zip(self.rows, found, strict=True):
                 self._hold(row, samples)
-                left += int((row.slack() < -TOLERANCE).sum())
+                left += int((row.slack() < -row.tolerance).sum())
                 if row.widen_pool():
                     todo.append(row)
             self.progress(f"pass {self.passes}: {plural(left, 'sample')} outside, working set {self._sizes()}")
@@ -819,20 +1285,24 @@ class WorkingSet:
         limits = [row.limit for row in self.rows]
         limit = None
         if all(value is not None for value in limits):
-            limit = np.array([float(value or 0.0) * row.scale for value, row in zip(limits, self.rows, strict=True)])
+            limit = np.array(
+                [float(value or 0.0) * row.limit_unit for value, row in zip(limits, self.rows, strict=True)]
+            )
         return Candidate(
             np.column_stack([row.theta for row in self.rows]),
             np.column_stack([row.d for row in self.rows]),
             self.rows[0].size_unit,
-            self.sums.rate_scale,
+            np.array([row.scale for row in self.rows]),
             limit,
             reach,
             room,
             most,
         )
 
-    def _moved(self, row: Row, theta: Array, d: Array, limit: float | None) -> float:
+    def _moved(self, row: Row, theta: Array, d: Array, limit: float | None, scale: float) -> float:
         """Largest change of any sample's slack, in scaled units, since theta, d and the limit."""
+        if row.scale != scale:
+            return np.inf
         if limit is not None and row.limit is not None and row.limit < limit * (1.0 - 1e-12):
             return np.inf  # the optimum over more samples is no less, so this is rare
         p = self.fleet.p
@@ -862,18 +1332,20 @@ class WorkingSet:
 
     def _settle(self, rows: list[Row], solve: Callable[[Row], str], polish: bool = False) -> None:
         for row in rows:
-            for _ in range(MAX_ROUNDS):
+            for number in range(MAX_ROUNDS if row.refined else FEW_ROUNDS):
                 if row.unknown:
                     self._guarded(row, solve)
                 self.rounds += 1
-                if row.unknown and row.widen_pool():
+                # most rows settle in 15 rounds; where rounding makes nearly every sample active, all of them may join
+                most = None if number < 40 else max(_JOIN, 2 * (row.r + row.q)) * 2 ** min(number - 40, 20)
+                if row.unknown and row.widen_pool(most):
                     continue
                 if polish and row.unknown:
                     row.polish()
-                if not polish or not row.unknown or not row.widen_pool():
+                if not polish or not row.unknown or not row.widen_pool(most):
                     break
             else:
-                raise FitError(f"row {row.i}: no working set after {MAX_ROUNDS} rounds; scale the signals to order one")
+                raise FitError(f"row {row.i}: no working set after {MAX_ROUNDS} rounds; {_REMEDY}")
             if not row.unknown:
                 self._known_row(row)
 
@@ -891,8 +1363,8 @@ class WorkingSet:
         slack = row.slack() if row.limit is None else row.half - np.abs(row.y)
         worst = int(np.argmin(slack)) if len(slack) else 0
         if len(slack) and slack[worst] < -1e-9:
-            size = row.width[worst] / (2.0 * row.samples.root_weight[worst])
-            raise InfeasibleError(row.i, int(row.samples.index[worst]), float(-slack[worst] * size * row.scale))
+            distance = float(-slack[worst] * row._sizes(worst) * row.scale)
+            raise InfeasibleError(row.i, int(row.samples.index[worst]), distance)
 
     def _settle_coupled(self, rows: list[Row]) -> None:
         for _ in range(MAX_ROUNDS):
@@ -931,7 +1403,7 @@ class WorkingSet:
         lower, upper = (np.concatenate([getattr(row, side) for row in rows]) for side in ("lower", "upper"))
         h = np.concatenate([h for _, h in parts])
         try:
-            answer = solve_qp(H, f, G, h, lower, upper)
+            answer = solve_qp(H, f, G, h, lower, upper, feasible=ROUGH)
         except FitError:
             for row in rows:
                 if found := row.contradiction():
@@ -942,5 +1414,52 @@ class WorkingSet:
             row.store(answer.xi[starts[k] : starts[k + 1]])
         xi, d = answer.xi, answer.xi[where_d]
         above = float(0.5 * xi @ H @ xi + f @ xi) - dual_bound(H, f, G, h, lower, upper, xi)
-        value = (0.5 * d @ gram @ d + linear @ d + 0.5 * fixed @ self.sums.coupled @ fixed) / largest
-        self._coupled_gap = _relative_gap(above, float(value))
+        known = 0.5 * float(fixed @ self.sums.coupled @ fixed) / largest
+        value = 0.5 * float(d @ gram @ d) / largest + float(linear @ d) / largest + known
+        least = sum(row.least_value() * row.scale**2 * self._weight(row) for row in rows) / largest
+        lifted = 0.0
+        for row, mine in zip(rows, starts[:-1], strict=True):
+            smallest = float(np.linalg.eigvalsh(row.centre)[0]) if row.r else 1.0
+            weight = float(np.diagonal(H)[mine : mine + row.r].max(initial=0.0))
+            size = (row.rms_step / row.scale + float(np.abs(row.half).max(initial=0.0))) ** 2
+            lifted += 0.5 * weight * 1e-10 * 16.0 * size / smallest if smallest > 1e-13 else np.inf
+        # a tie-break per row, of full weights: no part of the squared widths, so measured against them
+        ties = TIE_BREAK * float(len(d))
+        self._coupled_gap = (max(above, 0.0) + lifted) / max(value, least, 1e-300) + ties
+        self._coupled_slope: Array = (gram @ d + linear) / largest
+        self._coupled_value = max(value, least, 1e-300)
+
+    def _weight(self, row: Row) -> float:
+        """Sum of w_ii over the transitions, about."""
+        assert self.sums.coupled is not None
+        q, scale = len(self.sums.psi_scale), self.sums.psi_scale
+        own = np.diagonal(self.sums.coupled)[row.i * q : (row.i + 1) * q]
+        there = scale > 0
+        return float(np.max(own[there] / scale[there] ** 2, initial=0.0))
+
+    def _coupled_loss(self) -> float:
+        """What lifting the half-widths over what is violated adds to the optimum, relative, about."""
+        lifts = np.concatenate([np.full(row.q, row.outside()) for row in self.rows])
+        return float(np.abs(self._coupled_slope) @ lifts) / self._coupled_value
+
+    def _coupled_linear_gap(self) -> float:
+        """As `Row.linear_gap`; the rows meet in the objective alone."""
+        assert self.sums.coupled is not None
+        flat = np.concatenate([row.d for row in self.rows])
+        slopes = (self.sums.coupled @ flat).reshape(len(self.rows), -1)
+        least = sum(row.least_value() * row.scale**2 * self._weight(row) for row in self.rows)
+        value = max(0.5 * float(flat @ slopes.ravel()), least, 1e-300)
+        above = 0.0
+        for row, own in zip(self.rows, slopes, strict=True):
+            if not row.unknown:
+                continue
+            slope = own[row.free_psi] * row.unit_psi * row.scale
+            largest = float(np.abs(slope).max(initial=0.0))
+            _, d = row.scaled()
+            if largest * (float(d.sum()) + 1.0) <= 1e-12 * value:  # nothing to gain
+                continue
+            try:
+                above += float(slope @ d) - row.least_linear(slope / largest) * largest
+            except FitError:
+                return np.inf
+        return max(above, 0.0) / value

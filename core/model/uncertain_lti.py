@@ -29,6 +29,8 @@ from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 FORMAT = "uncertain-lti/1"
 MAX_FILE_BYTES = 64 * 2**20
+_IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
+_IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 _BLOCK = 65536  # products per block of the vectorised path: they stay in the cache
 
 
@@ -409,7 +411,7 @@ class UncertainLTI:
                 "window": self.alarm_rule.window,
                 "margin": self.alarm_rule.margin,
             },
-            "fit": _plain(self.fit_summary),
+            "fit": _plain({_IN_FILES.get(key, key): value for key, value in self.fit_summary.items()}),
             "validation": _plain(self.validation),
         }
 
@@ -547,7 +549,7 @@ class UncertainLTI:
             sampling=sampling,
             domain=domain,
             alarm_rule=AlarmRule(**alarm),
-            fit_summary=_object(data.get("fit", {}), "fit"),
+            fit_summary={_IN_PYTHON.get(k, k): v for k, v in _object(data.get("fit", {}), "fit").items()},
             validation=_object(data.get("validation", {}), "validation"),
         )
 

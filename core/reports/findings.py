@@ -81,7 +81,16 @@ def _model(model: UncertainLTI, model_file: str | os.PathLike[str]) -> dict[str,
     fit = model.fit_summary
     known = {
         key: fit[key]
-        for key in ("criterion", "additive", "transitions", "transients", "violations", "objective", "gap", "rank")
+        for key in (
+            "criterion",
+            "additive",
+            "transitions",
+            "transients",
+            "violations",
+            "objective",
+            "optimality_gap",
+            "rank",
+        )
         if isinstance(fit.get(key), (str, int, float))
     }
     width = numbers_of(fit.get("mean_width_recorded"), model.n), numbers_of(fit.get("max_width_recorded"), model.n)

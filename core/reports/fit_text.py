@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -73,7 +73,7 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
         )
     lines = [
         f"criterion {criterion}; additive: {facts['additive']}; {plural(facts['transitions'], 'transition')}, "
-        f"{facts['violations']} outside, gap to the optimum {facts['gap']:.1e}",
+        f"{facts['violations']} outside, {_optimality_gap(facts)}",
         table(("one-step envelope", "mean width", "largest", "rms step", "range", "width/range"), rows),
         f"eigenvalues of A [1/s]: {eigenvalues_text(model)}",
     ]
@@ -85,6 +85,12 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
             + (f" and {len(gone) - 20} more (in the model file)" if len(gone) > 20 else "")
         )
     return "\n".join(lines + [f"note: {message}" for message in facts["messages"]])
+
+
+def _optimality_gap(facts: Mapping[str, Any]) -> str:
+    """How far the fit is from its optimum at most."""
+    gap = facts.get("optimality_gap")
+    return "optimality gap not known" if gap is None else f"optimality gap {gap:.1e}"
 
 
 def archive_text(model: UncertainLTI) -> str:
@@ -109,7 +115,7 @@ def archive_text(model: UncertainLTI) -> str:
         [
             f"criterion {facts['criterion']}; additive: {facts['additive']}; "
             f"{plural(facts['transients'], 'recording')}, "
-            f"{plural(facts['transitions'], 'transition')}, {facts['violations']} outside, gap {facts['gap']:.1e}, "
+            f"{plural(facts['transitions'], 'transition')}, {facts['violations']} outside, {_optimality_gap(facts)}, "
             f"{plural(facts['solver']['passes'], 'pass')}",
             table(("one-step envelope", "mean width", "largest"), rows),
             f"eigenvalues of A [1/s]: {eigenvalues_text(model)}",
