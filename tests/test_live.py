@@ -18,7 +18,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.message_types import header_stamp_ns
+from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -18,7 +18,7 @@ from uncertain_lti.recordings.mcap_batches import Batch, IndexMismatchError, bat
 from uncertain_lti.recordings.mcap_records import LATEST, Contents
 from uncertain_lti.recordings.message_types import Definition
 from uncertain_lti.recordings.raw_messages import RecordedChannel
-from uncertain_lti.recordings.recording import Columns, Progress, TopicInfo
+from uncertain_lti.recordings.recording import Columns, Progress, Recording
 from uncertain_lti.signals.field_path import FieldPath
 
 
@@ -38,34 +38,8 @@ class _Undecoded:
             self.last, self.why = place, why
 
 
-class Blocks(Protocol):
+class Blocks(Recording, Protocol):
     """A recording whose files are read block by block: `Bag`."""
-
-    @property
-    def path(self) -> Path:
-        """Name of the recording."""
-
-    @property
-    def topics(self) -> Mapping[str, TopicInfo]:
-        """Topics by name."""
-
-    @property
-    def reading_notes(self) -> tuple[list[str], dict[str, str]]:
-        """Warnings, and sentences on messages left out by topic."""
-
-    def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
-        """Set `reading_notes`.
-
-        Parameters
-        ----------
-        warnings : sequence of str
-            Sentences.
-        undecoded : mapping of str to str
-            Topic -> sentence on its messages that are left out.
-        """
-
-    def walk(self) -> None:
-        """Read what the index stated from the files themselves."""
 
     def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
         """Each file, and its channels that count for some topics.

@@ -24,7 +24,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys.base import normalize_fieldname
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.message_types import CODES, Definition, header_stamp_ns
+from uncertain_lti.recordings.message_types import CODES, Definition
+from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.functions import FieldFunction
 

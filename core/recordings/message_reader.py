@@ -14,6 +14,7 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import FieldType, TypeFields
 from uncertain_lti.signals.functions import FieldFunction
@@ -95,7 +96,7 @@ class MessageReader:
                 f"is {left} bytes longer than a {self.type_name}; its publisher may have another version of that type"
             )
         try:
-            stamp, values = stamp_ns(message), [path.read(message) for path in self._paths]
+            stamp, values = header_stamp_ns(message), [path.read(message) for path in self._paths]
         except _SHAPED_ODDLY as error:
             raise UnreadableError(f"a field cannot be read: {error}") from None
         if self._budget >= _LAYOUT:
@@ -127,15 +128,6 @@ class MessageReader:
         if found is not None and found[0] == stamp and _same(found[1], values):
             self._layouts.insert(0, layout)
             del self._layouts[_MOST_LAYOUTS:]
-
-
-def stamp_ns(message: Any) -> int | None:
-    """Header stamp of a message in ns; None where it has no header or the stamp is zero."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None:
-        return None
-    time: int = stamp.sec * 1_000_000_000 + stamp.nanosec
-    return time or None
 
 
 def _same(some: Sequence[float], others: Sequence[float]) -> bool:

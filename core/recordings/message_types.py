@@ -21,6 +21,7 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_types import FieldType
 
 _LARGEST_SCHEMA = 1 << 20  # bytes
@@ -278,26 +279,6 @@ def _plain(data: bytes, wanted: int = _LARGEST_MESSAGE) -> bytes:
     if data[:2] not in _CDR:  # the decoder takes whatever it is for plain
         raise TypesysError(f"it is no plain CDR; it begins with {data[:2].hex() or 'nothing'}")
     return data
-
-
-def header_stamp_ns(message: Any) -> int | None:
-    """Header stamp of a message (rosbags or rclpy) in ns; None where it has no header or the stamp is zero.
-
-    Parameters
-    ----------
-    message : object
-        Decoded message (rosbags or rclpy).
-
-    Returns
-    -------
-    int or None
-        Stamp, or None.
-    """
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None:
-        return None
-    time: int = stamp.sec * 1_000_000_000 + stamp.nanosec
-    return time or None
 
 
 def normal_name(name: str) -> str:
