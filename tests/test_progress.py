@@ -14,7 +14,7 @@ import pytest
 from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.base.progress import Progress
+from uncertain_lti.base.progress import CountedStep, Progress
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification.cache import CacheWriter
 
@@ -114,15 +114,21 @@ def test_verbose_tells_every_step(folder, capsys):
     assert times == sorted(times)
 
 
-def test_a_line_that_counts_moves_the_bar():
+def test_a_step_that_is_counted_moves_the_bar():
     screen = Terminal()
     with Progress(stream=screen) as progress, progress.stage("fitting") as step:
         time.sleep(0.5)
-        step("fit 4 of 10: without the third")
+        step("state 9 of 10 is wide")  # text alone moves nothing
+        time.sleep(0.2)
+        step(CountedStep("fit 4 of 10: without the third", 4, 10))
         time.sleep(0.2)
         step("pass 7: 12 samples outside")
         progress.note("said while the bar stands")
-    assert " 30%" in screen.getvalue() and "pass 7: 12 samples outside" in screen.getvalue()
+    assert (
+        " 30%" in screen.getvalue()
+        and " 80%" not in screen.getvalue()
+        and "pass 7: 12 samples outside" in screen.getvalue()
+    )
     assert "note: said while the bar stands\n" in screen.getvalue()
 
 

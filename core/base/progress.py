@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -16,7 +15,26 @@ from uncertain_lti.base.english import printable
 _DELAY = 0.4  # s; what is done sooner shows no bar
 _REDRAW = 0.1  # s
 _LONGEST_LINE = 20_000  # letters of a result
-_COUNTED = re.compile(r"\b(\d+) of (\d+)\b")
+
+
+class CountedStep(str):
+    """A line of progress that also holds which of how many steps it is about.
+
+    Parameters
+    ----------
+    text : str
+        The line.
+    number : int
+        Which step begins, from 1.
+    total : int
+        Number of steps.
+    """
+
+    def __new__(cls, text: str, number: int, total: int) -> CountedStep:  # noqa: D102
+        return super().__new__(cls, text)
+
+    def __init__(self, text: str, number: int, total: int) -> None:
+        self.number, self.total = number, total
 
 
 class Progress:
@@ -121,7 +139,7 @@ class Progress:
 
     @contextmanager
     def stage(self, what: str) -> Iterator[Callable[[str], None]]:
-        """Yields a callable for one line of text per step; a line that says `3 of 10` moves the bar there.
+        """Yields a callable for one line of text per step; a `CountedStep` moves the bar there.
 
         Parameters
         ----------
@@ -147,9 +165,9 @@ class Progress:
                 if bar is None:
                     bar = stack.enter_context(self._bar(bar_format="{desc} [{elapsed}]"))
                     bar.start_t -= now - began
-                if counted := _COUNTED.search(text):
+                if isinstance(text, CountedStep):
                     bar.bar_format = "{desc} {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
-                    bar.n, bar.total = int(counted[1]) - 1, int(counted[2])
+                    bar.n, bar.total = text.number - 1, text.total
                 shown = printable(text)
                 bar.set_description_str(f"{what}: {shown if len(shown) <= 50 else f'{shown[:47]}...'}")
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError, FitError, SignalError
+from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.identification.cluster import DaskFleet
 from uncertain_lti.identification.diagnosis import too_few
@@ -87,7 +88,7 @@ def fit_archive(
     alarm_rule : AlarmRule, optional
         As for `fit`.
     progress : callable, optional
-        Called with one line of text per recording, with its number among all (`3 of 10`), and per pass, with the
+        Called with one line of text per recording, with its number among all (a `CountedStep`), and per pass, with the
         samples still outside and the size of the working set.
 
     Returns
@@ -118,15 +119,16 @@ def fit_archive(
     if not recordings:
         raise BagError("no recording is named; give at least one MCAP file or folder")
 
-    def told(what: str) -> Callable[[int], None]:
-        return lambda number: say(f"{what} ({number} of {len(recordings)})")
+    def counting(what: str) -> Callable[[int], None]:
+        total = len(recordings)
+        return lambda number: say(CountedStep(f"{what} ({number} of {total})", number, total))
 
     def visit(what: str, function: Callable[..., Any], *more: Any) -> list[Any]:
         if client is not None:
-            return DaskFleet.run(client, [(function, (recording, *more)) for recording in recordings], told(what))
+            return DaskFleet.run(client, [(function, (recording, *more)) for recording in recordings], counting(what))
         results = []
         for number, recording in enumerate(recordings, start=1):
-            told(f"{what} {recording[0]}")(number)
+            counting(f"{what} {recording[0]}")(number)
             results.append(function(recording, *more))
         return results
 
@@ -142,14 +144,14 @@ def fit_archive(
         constant = additive == "both" and all(visit("steps of", _constant_dt, signals))
         columns = Columns.of(additive, constant)
         tasks = [(load, (recording, signals, columns)) for recording in recordings]
-        fleet = DaskFleet(client, tasks, told("reading"))
+        fleet = DaskFleet(client, tasks, counting("reading"))
         counts, dt = fleet.counts, None
     else:
         assert cache is not None
         counts, steps = [], []
         with CacheWriter(cache) as writer:
             for number, recording in enumerate(recordings, start=1):
-                told(f"reading {recording[0]}")(number)
+                counting(f"reading {recording[0]}")(number)
                 problem = load(recording, signals, Columns(False, False, False))
                 counts.append(problem.N)
                 steps.append(problem.dt)

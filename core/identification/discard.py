@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.structure import Structure
@@ -88,13 +89,14 @@ def choose_discards(
     """
     chosen: list[tuple[int, float]] = []
     if progress is not None:
-        progress(f"discard 1 of {budget}")
+        progress(CountedStep(f"discard 1 of {budget}", 1, budget))
     for index, effect in _greedy(WorkingSet(Fleet([problem]), structure), criterion):
         chosen.append((index, effect))
         if len(chosen) == budget:
             break
         if progress is not None:
-            progress(f"discard {len(chosen) + 1} of {budget}")
+            number = len(chosen) + 1
+            progress(CountedStep(f"discard {number} of {budget}", number, budget))
     return chosen
 
 

@@ -15,6 +15,7 @@ from scipy.linalg import expm
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.files import whole_file
+from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -211,7 +212,7 @@ def reproduce(
     ]
     cases = []
     for number_of, (name, transients, recording, criterion, additive) in enumerate(wanted, start=1):
-        step(f"fit {number_of} of {len(wanted)}: {name}")
+        step(CountedStep(f"fit {number_of} of {len(wanted)}: {name}", number_of, len(wanted)))
         cases.append(Case.of(name, transients, recording, criterion, additive))
     tell(cases_text(cases))
     tell(width_text(cases))

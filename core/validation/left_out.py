@@ -14,6 +14,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
+from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
@@ -384,7 +385,7 @@ def validate(
         name = left.name if blocks is None else f"{left.name} from {left.t[start]:.6g} to {left.t[stop - 1]:.6g} s"
         name = f"group {unit}" if grouping else name
         if progress is not None:
-            progress(f"fit {number + 1} of {len(units)}: without {name}")
+            progress(CountedStep(f"fit {number + 1} of {len(units)}: without {name}", number + 1, len(units)))
         absent = {id(cuts[i][0]): cuts[i][1:] for i in together}
         pieces, kept = [], []
         for transient, weight in zip(transients, own, strict=True):
