@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import excitation, sensors
+from uncertain_lti.identification import excitation, residuals, sensors
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.excitation import quoted as _list
 from uncertain_lti.identification.noise import Memory, memory
@@ -24,6 +24,8 @@ LOOKED_AT, STRETCHES = 20_000, 20
 """At most so many transitions, in so many stretches, are looked at for what shows in any of them."""
 FAST = 0.7
 """|eigenvalue| x dt above which a step of forward Euler is long for the mode."""
+NEARLY = 0.5
+"""Share of a mode's speed that must remain without measurement noise, or noise is what makes it fast."""
 TRIED = 4000
 """Samples on which the gain of an additive term is tried."""
 WIDE = 0.5
@@ -173,15 +175,21 @@ def describe(
     found, messages = _rank(problem, sums, names)
     apart = not messages
     part = _stretches(problem)
-    alike = excitation.collinear(problem, sums, names, 1e-12 * problem.p)
+    alike = excitation.collinear(
+        problem, sums, names, 1e-12 * problem.p, residuals.lagged_states(model.signals.signals, model.n)
+    )
     messages += [*_carried(few, discarded, problem, names, transients), *alike]
-    messages += _recordings(model, problem, part, sums, names, transients)
     known = memory(part)
-    messages += _noise_like(known, part, states)
-    slow = _slow(model, known, apart and not alike)
+    told, follow = _recordings(model, problem, part, sums, names, transients)
+    messages += told
+    messages += _noise_like(known, part, states, follow)
+    past = bool(residuals.lagged_states(model.signals.signals, model.n))  # A alone is then not the dynamics
+    slow = [] if past else _slow(model, known, apart and not alike, bool(follow))
     messages += slow
     unstable = [v for v in model.eigenvalues() if v.real > 0]
-    if unstable:
+    if past:
+        pass
+    elif unstable:
         values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
         messages.append(
             f"the nominal model is unstable (eigenvalues {values} 1/s): one-step bounds restart from the measured "
@@ -203,7 +211,7 @@ def describe(
     columns = problem.columns
     if not columns.noise and not columns.disturbance:
         messages += _near_rest(problem, sums, mean_width, states)
-    messages += _wide(problem, mean_width, states, known, few, bool(slow) and SLOW in slow[0])
+    messages += _wide(problem, mean_width, states, known, few, bool(slow) and SLOW in slow[0], follow)
     if columns.drift and columns.noise and not columns.disturbance:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return found, messages
@@ -216,20 +224,29 @@ def _recordings(
     sums: Moments,
     names: Sequence[str],
     transients: Sequence[Transient],
-) -> list[str]:
-    """What the recordings themselves say: excitation, sensors, topics."""
+) -> tuple[list[str], set[int]]:
+    """What the recordings themselves say (excitation, sensors, topics), and the states that lack another state."""
     signals = model.signals.signals
+    past = residuals.lagged_states(signals, model.n)
     rare = excitation.rare(part, names)
+    known = {*rare, *past}
+    held, late = sensors.held(part, signals), sensors.delayed(part, signals, past)
+    found = None if late else residuals.residuals(part)
+    # what a slow topic or a late control explains needs no further state
+    follow = {i for i in range(model.n) if found and found.follows(i) and not any(f"'{names[i]}'" in m for m in held)}
     messages = [*rare.values()]
-    messages += excitation.weak(problem, sums, names, rare)
-    messages += excitation.one_sided(part, names, rare)
-    messages += excitation.fed_back(part, names)
-    messages += sensors.delayed(part, signals)
+    if found:
+        messages += residuals.missing(found, signals, follow)
+    lost = {j: (i, certainty) for j, (i, certainty) in excitation.lost(problem, sums, known).items() if i not in follow}
+    messages += residuals.weak(problem, lost, names, lambda few: _where(problem, few, transients))
+    messages += excitation.one_sided(part, names, known)
+    messages += excitation.fed_back(part, names, past)
+    messages += late
     messages += sensors.quantised(part, signals)
-    messages += sensors.held(part, signals)
+    messages += held
     messages += sensors.frozen(part, signals, transients)
     messages += sensors.stale(signals, model.n, part, transients)
-    return messages
+    return messages, follow
 
 
 def _stretches(problem: Problem) -> Problem:
@@ -253,15 +270,7 @@ def _carried(
     if few is None:
         return []
     indices = sorted(few.transitions)
-    places: dict[str, list[str]] = {}
-    for index in indices[:4]:
-        source, k = int(problem.source[index]), int(problem.k[index])
-        if source < len(transients):
-            places.setdefault(transients[source].name, []).append(f"{transients[source].t[k]:.6g} s")
-        else:
-            places.setdefault(f"recording {source + 1}", []).append(f"sample {k}")
-    where = "; ".join(f"{name} at {', '.join(at)}" for name, at in places.items())
-    where += f"; and {len(indices) - 4} more" if len(indices) > 4 else ""
+    where = _where(problem, indices, transients)
     wide = sorted((i for i in range(problem.n) if few.carry(i)), key=lambda i: -few.factor[i])
     widths = [f"'{names[i]}' {few.factor[i]:.3g} times" for i in wide[:4]]
     widths += [f"{len(wide) - 4} other states"] if len(wide) > 4 else []
@@ -285,6 +294,20 @@ def _carried(
     ]
 
 
+def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transient]) -> str:
+    """When some transitions happened: the first few, and how many more."""
+    places: dict[str, list[str]] = {}
+    indices = sorted(indices)
+    for index in indices[:4]:
+        source, k = int(problem.source[index]), int(problem.k[index])
+        if source < len(transients):
+            places.setdefault(transients[source].name, []).append(f"{transients[source].t[k]:.6g} s")
+        else:
+            places.setdefault(f"recording {source + 1}", []).append(f"sample {k}")
+    where = "; ".join(f"{name} at {', '.join(at)}" for name, at in places.items())
+    return where + (f"; and {len(indices) - 4} more" if len(indices) > 4 else "")
+
+
 def _at_steps(problem: Problem, indices: Sequence[int]) -> list[int]:
     """Columns of controls that seldom change, and do so at most of these transitions."""
     found = []
@@ -298,10 +321,10 @@ def _at_steps(problem: Problem, indices: Sequence[int]) -> list[int]:
     return found
 
 
-def _noise_like(known: Memory, problem: Problem, states: Sequence[str]) -> list[str]:
-    """States whose next sample cannot be told from the one before."""
+def _noise_like(known: Memory, problem: Problem, states: Sequence[str], follow: Collection[int]) -> list[str]:
+    """States whose next sample cannot be told from those before."""
     moving = np.ptp(problem.z[:, : problem.n], axis=0) > 0
-    like = [i for i in range(problem.n) if moving[i] and known.like_noise(i)]
+    like = [i for i in range(problem.n) if moving[i] and known.like_noise(i) and i not in follow]
     if not like:
         return []
     worst = min(like, key=lambda i: float(known.predicted[i]))
@@ -313,10 +336,11 @@ def _noise_like(known: Memory, problem: Problem, states: Sequence[str]) -> list[
     ]
 
 
-def _slow(model: UncertainLTI, known: Memory, apart: bool) -> list[str]:
+def _slow(model: UncertainLTI, known: Memory, apart: bool, hidden: bool) -> list[str]:
     """Modes that a step of forward Euler is too long for, where the recordings bear them out.
 
-    apart: the columns can be told apart, so that the eigenvalues mean something.
+    apart: the columns can be told apart, so that the eigenvalues mean something; hidden: a state is missing, so that
+    what looks like noise may be a mode of which one sample does not tell.
     """
     dt = model.sampling.dt_median
     if dt is None:
@@ -326,6 +350,8 @@ def _slow(model: UncertainLTI, known: Memory, apart: bool) -> list[str]:
     if turn <= FAST:
         return []
     mode = f"{fastest.real:.3g}{fastest.imag:+.3g}j" if fastest.imag else f"{fastest.real:.3g}"
+    if apart and known.fastest <= FAST and (hidden or known.fastest > NEARLY * turn):
+        return []  # nearly as fast without the noise, or not seen at all: neither is its doing
     if not apart or known.fastest <= FAST:
         cause = "noise" if apart else "columns that the recordings do not tell apart"
         return [
@@ -340,7 +366,13 @@ def _slow(model: UncertainLTI, known: Memory, apart: bool) -> list[str]:
 
 
 def _wide(
-    problem: Problem, mean_width: Array, states: Sequence[str], known: Memory, few: Carriers | None, slow: bool
+    problem: Problem,
+    mean_width: Array,
+    states: Sequence[str],
+    known: Memory,
+    few: Carriers | None,
+    slow: bool,
+    follow: Collection[int],
 ) -> list[str]:
     """States whose envelope is as wide as what they do, and why where something is known."""
     span = np.ptp(problem.z[:, : problem.n], axis=0)
@@ -349,6 +381,8 @@ def _wide(
     for i in wide:
         if few is not None and few.carry(i):
             cause = "a few samples carry the width (see above)"
+        elif i in follow:
+            cause = "a state that moves it is not among the signals (see above)"
         elif known.like_noise(i):
             cause = "noise is most of what the recordings show of it"
         elif slow:
@@ -389,6 +423,8 @@ def remedies(messages: Sequence[str], additive: str, state: str) -> str:
         found.append("look at the few samples that carry the width, named above")
     if any("like noise from sample to sample" in m for m in named):
         return "it moves like noise: leave it out, or record the machine at work"
+    if any("one sample earlier explains" in m for m in named):
+        found.append("add its value one sample earlier, as said above")
     if additive == "none":
         found.append("try --additive noise")
     if any("`delay:" in m for m in messages):

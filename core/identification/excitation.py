@@ -25,7 +25,9 @@ FED_BACK = 0.9
 """Share of a control's changes that the states explain, from which on they are said to."""
 
 
-def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: float) -> list[str]:
+def collinear(
+    problem: Problem, moments: Moments, names: Sequence[str], limit: float, past: Collection[int] = ()
+) -> list[str]:
     """Signals that nearly move together, and the recording that would tell them apart.
 
     Parameters
@@ -38,6 +40,8 @@ def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: f
         Of states and controls.
     limit : float
         Share of variance below which signals are one; those are named elsewhere.
+    past : collection of int, optional
+        Columns that are a state some samples earlier, which are like it by intention.
 
     Returns
     -------
@@ -45,6 +49,7 @@ def collinear(problem: Problem, moments: Moments, names: Sequence[str], limit: f
         Messages.
     """
     free = np.flatnonzero(moments.phi_scale[: problem.p] > 0)
+    free = free[~np.isin(free, list(past))]
     unit = 1.0 / moments.phi_scale[free]
     values, vectors = np.linalg.eigh(moments.centre[np.ix_(free, free)] * np.outer(unit, unit) / moments.count)
     messages: list[str] = []
@@ -141,7 +146,7 @@ def one_sided(problem: Problem, names: Sequence[str], known: Collection[int] = (
     return messages
 
 
-def weak(problem: Problem, moments: Moments, names: Sequence[str], known: Collection[int] = ()) -> list[str]:
+def lost(problem: Problem, moments: Moments, known: Collection[int] = ()) -> dict[int, tuple[int, float]]:
     """Controls whose effect on every state is lost in what one step leaves unexplained.
 
     Parameters
@@ -150,41 +155,61 @@ def weak(problem: Problem, moments: Moments, names: Sequence[str], known: Collec
         The data.
     moments : Moments
         Of all data.
-    names : sequence of str
-        Of states and controls.
     known : collection of int, optional
         Columns of which worse is known, which are left out.
 
     Returns
     -------
-    list of str
-        Messages.
+    dict of int to (int, float)
+        Column -> the state with the strongest effect, and that effect in standard errors.
     """
     free = np.flatnonzero(moments.phi_scale > 0)
     centre, target = moments.centre[np.ix_(free, free)], moments.target[free]
     if not len(free) or moments.count <= len(free):
-        return []
-    inverse = np.linalg.pinv(centre, hermitian=True)
-    theta = inverse @ target
-    total = moments.rate_square
-    residual = np.maximum(total - np.einsum("ji,ji->i", theta, target), 1e-14 * total)
-    error = np.sqrt(np.outer(np.diagonal(inverse), residual / (moments.count - len(free))))
-    messages = []
+        return {}
+    certainty = _certainty(centre, target, moments.rate_square, moments.count)
+    found = {}
     for row, j in enumerate(free.tolist()):
         if not problem.n <= j < problem.p or j in known or np.ptp(problem.z[:, j]) == 0:
             continue
-        certainty = np.abs(theta[row]) / np.maximum(error[row], 1e-300)
-        best = int(np.argmax(certainty))
-        if certainty[best] < DETERMINED:
-            messages.append(
-                f"control '{names[j]}' moves too little to be told from the noise: its strongest effect, on "
-                f"'{names[best]}', is {certainty[best]:.2g} standard errors; record it with larger or more steps "
-                f"({max(2.0, DETERMINED / max(float(certainty[best]), 0.4)):.2g} times the amplitude), or leave it out"
-            )
-    return messages
+        best = int(np.argmax(certainty[row]))
+        if certainty[row, best] < DETERMINED:
+            found[j] = (best, float(certainty[row, best]))
+    return found
 
 
-def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
+def certainty_of(problem: Problem, column: int, state: int) -> float:
+    """The effect of a column on a state, in standard errors of least squares.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    column : int
+        Of [x; u].
+    state : int
+        Position of the state.
+
+    Returns
+    -------
+    float
+        Its absolute value.
+    """
+    phi = np.column_stack([problem.z, np.ones(problem.N)])
+    rate = (problem.x_next[:, state] - problem.z[:, state]) / problem.dt
+    return float(_certainty(phi.T @ phi, (phi.T @ rate)[:, None], np.array([rate @ rate]), problem.N)[column, 0])
+
+
+def _certainty(gram: Array, cross: Array, total: Array, count: int) -> Array:
+    """|Element| over its standard error, (b, t): gram (b, b), cross (b, t), sums of squares of the targets (t,)."""
+    inverse = np.linalg.pinv(gram, hermitian=True)
+    theta = inverse @ cross
+    residual = np.maximum(total - np.einsum("ji,ji->i", theta, cross), 1e-14 * total)
+    error = np.sqrt(np.outer(np.diagonal(inverse), residual / (count - len(gram))))
+    return np.asarray(np.abs(theta) / np.maximum(error, 1e-300))
+
+
+def fed_back(problem: Problem, names: Sequence[str], past: Collection[int] = ()) -> list[str]:
     """Controls whose changes follow from the states: closed-loop recordings, or inputs too regular to tell.
 
     u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} where a feedback sets u_k; an input that somebody steps
@@ -196,6 +221,8 @@ def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
         The data.
     names : sequence of str
         Of states and controls.
+    past : collection of int, optional
+        Columns that are a state some samples earlier, which follow it by intention.
 
     Returns
     -------
@@ -210,7 +237,7 @@ def fed_back(problem: Problem, names: Sequence[str]) -> list[str]:
     basis = np.column_stack([now[:, :n], before, np.ones(len(before))])
     gram = basis.T @ basis
     messages = []
-    for j in range(n, problem.p):
+    for j in [j for j in range(n, problem.p) if j not in past]:
         change = now[:, j] - before[:, j]
         change = change - change.mean()
         size = float(change @ change)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -195,7 +195,7 @@ def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Seque
     return messages
 
 
-def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+def delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int] = ()) -> list[str]:
     """Controls that explain the states better when taken some samples earlier.
 
     Parameters
@@ -204,6 +204,8 @@ def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
         The data.
     signals : sequence of Signal
         States, then controls.
+    past : collection of int, optional
+        Columns that are a state some samples earlier, which are late by intention.
 
     Returns
     -------
@@ -224,6 +226,8 @@ def delayed(problem: Problem, signals: Sequence[Signal]) -> list[str]:
     now = problem.z_columns[:n, usable]
     messages = []
     for j, (best, share) in lags(now, lagged, problem.next_columns[:, usable] - now, problem.dt[usable]).items():
+        if n + j in past:
+            continue
         said = signals[n + j].delay + best
         messages.append(
             f"the states follow control '{signals[n + j].name}' better when it is taken "

@@ -1,0 +1,276 @@
+"""What one step leaves unexplained: whether it follows from sample to sample, or a few transitions dominate it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.identification.excitation import DETERMINED, certainty_of, successive, unexplained
+from uncertain_lti.identification.problem import Problem
+from uncertain_lti.signals.signal_map import Signal
+
+Array = NDArray[np.float64]
+
+FOLLOW, ALTERNATE = 0.5, -0.7
+"""Autocorrelation from which on residuals follow one another. Sensor noise alone gives -0.5 to 0 at one sample, and
+0 at two."""
+GAIN = 1.5
+"""By so much the state's own value one sample earlier must reduce what a step leaves unexplained."""
+CURVED = 0.5
+"""Share of that reduction which curves of the present signals may give: more is a nonlinear machine, not a missing
+state."""
+_CLIP = 5.0
+"""Standard deviations at which a residual is cut before it is correlated: one event is no rule."""
+_MOST_PRODUCTS = 12
+"""Signals up to which all products of two are tried as curves; beyond, squares and magnitudes alone."""
+FEW, MOST = 12, 0.5
+"""At most so many transitions that hold more than this share of the squared residual dominate it."""
+OUTLYING = 10.0
+"""Each of them is so many times as large as the others' root mean square."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What least squares on one sample leaves unexplained of each state's step.
+
+    Parameters
+    ----------
+    correlation : array (n, 2)
+        Autocorrelation at one and at two samples.
+    gain : array (n,)
+        Root mean square over that with the state's own value one sample earlier as well.
+    curved : array (n,)
+        Root mean square over that with squares, products and magnitudes of the same sample as well.
+    """
+
+    correlation: Array
+    gain: Array
+    curved: Array
+
+    def follows(self, state: int) -> bool:
+        """Whether the next sample depends on more than these signals at one instant.
+
+        Parameters
+        ----------
+        state : int
+            Position of the state.
+
+        Returns
+        -------
+        bool
+            True if the residual is autocorrelated, one sample more reduces it, and no curve does as well.
+        """
+        one, two = self.correlation[state]
+        correlated = _correlated(float(one)) or abs(two) >= FOLLOW
+        gain = float(self.gain[state])
+        return bool(correlated and gain >= GAIN and self.curved[state] - 1.0 < CURVED * (gain - 1.0))
+
+
+def _correlated(one: float) -> bool:
+    return one >= FOLLOW or one <= ALTERNATE
+
+
+def residuals(problem: Problem) -> Residuals | None:
+    """Residuals of least squares, and what would explain them.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+
+    Returns
+    -------
+    Residuals or None
+        None if too few transitions follow one another.
+    """
+    n, p = problem.n, problem.p
+    before = successive(problem)
+    if len(before) < 40 * p:
+        return None
+    now = before + 1
+    dt = problem.dt[now, None]
+    z = problem.z[now]
+    step = problem.x_next[now] - z[:, :n]
+    base = np.column_stack([z, np.ones(len(z))])
+    lagged = problem.z[before, :n]
+    basis = np.column_stack([base, lagged, _curves(z)]) * dt
+    gram, cross, total = basis.T @ basis, basis.T @ step, np.einsum("kn,kn->n", step, step)
+    total = np.maximum(total, 1e-300)
+    own = np.arange(p + 1)
+
+    def left(columns: NDArray[np.intp], states: slice) -> Array:
+        return unexplained(gram[np.ix_(columns, columns)], cross[columns, states], total[states])
+
+    plain = left(own, slice(None))
+    past = np.array([left(np.append(own, p + 1 + i), slice(i, i + 1))[0] for i in range(n)])
+    curved = left(np.append(own, np.arange(p + 1 + n, basis.shape[1])), slice(None))
+    return Residuals(_correlation(problem, now), np.sqrt(plain / past), np.sqrt(plain / curved))
+
+
+def _curves(z: Array) -> Array:
+    """Squares, magnitudes and (of few signals) products of two, (K, curves)."""
+    z = z / np.maximum(np.abs(z).max(axis=0), 1e-300)
+    p = z.shape[1]
+    if p > _MOST_PRODUCTS:
+        return np.hstack([z**2, np.abs(z)])
+    i, j = np.triu_indices(p)
+    return np.hstack([z[:, i] * z[:, j], np.abs(z)])
+
+
+def _least_squares(problem: Problem) -> Array:
+    """Residual of each step, (N, n)."""
+    basis = np.column_stack([problem.z, np.ones(problem.N)]) * problem.dt[:, None]
+    basis = basis / np.maximum(np.abs(basis).max(axis=0), 1e-300)
+    step = problem.x_next - problem.z[:, : problem.n]
+    return np.asarray(step - basis @ np.linalg.lstsq(basis, step, rcond=None)[0])
+
+
+def _correlation(problem: Problem, now: NDArray[np.intp]) -> Array:
+    """Autocorrelation at one and two samples, (n, 2); `now`: transitions that continue the one before."""
+    residual = _least_squares(problem)
+    spread = np.median(np.abs(residual), axis=0) / 0.6745
+    limit = np.where(spread > 0, _CLIP * spread, np.inf)
+    residual = np.clip(residual, -limit, limit)
+    residual = residual - residual.mean(axis=0)
+    size = np.maximum(np.mean(residual**2, axis=0), 1e-300)
+    twice = now[np.isin(now - 1, now)]
+    one = np.mean(residual[now] * residual[now - 1], axis=0) / size
+    two = np.mean(residual[twice] * residual[twice - 2], axis=0) / size if len(twice) else np.zeros(problem.n)
+    return np.column_stack([one, two])
+
+
+def lagged_states(signals: Sequence[Signal], n: int) -> set[int]:
+    """Controls that are a state some samples earlier.
+
+    Parameters
+    ----------
+    signals : sequence of Signal
+        States, then controls.
+    n : int
+        Number of states.
+
+    Returns
+    -------
+    set of int
+        Their columns among [x; u].
+    """
+    states = {(s.topic, s.field) for s in signals[:n] if s.topic}
+    return {j for j, s in enumerate(signals) if j >= n and s.delay > 0 and (s.topic, s.field) in states}
+
+
+def missing(known: Residuals, signals: Sequence[Signal], states: Collection[int]) -> list[str]:
+    """The sentence for each state whose next sample depends on more than the signals at one instant.
+
+    Parameters
+    ----------
+    known : Residuals
+        Of `residuals`.
+    signals : sequence of Signal
+        States, then controls.
+    states : collection of int
+        Of which it is said.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
+    messages = []
+    for i in sorted(states):
+        signal = signals[i]
+        one, two = (float(c) for c in known.correlation[i])
+        first = _correlated(one)
+        how = "alternates" if first and one < 0 else "follows"
+        what = "a state that moves it, or a swing faster than the samples show," if one < 0 else "a state that moves it"
+        entry = (
+            f"{{name: {signal.name}_before, topic: {signal.topic}, field: '{signal.field}', delay: 1}}"
+            if signal.topic
+            else "the same column, one row later"
+        )
+        messages.append(
+            f"what one step leaves unexplained of '{signal.name}' {how} from sample to sample (autocorrelation "
+            f"{one if first else two:.2f} at {'one sample' if first else 'two samples'}): {what} is not among the "
+            f"signals. Its value one sample earlier explains {1 - 1 / known.gain[i]:.0%} of it (root "
+            f"mean square); add that as a control ({entry}), or its measured rate as a state"
+        )
+    return messages
+
+
+def dominating(problem: Problem, state: int) -> NDArray[np.intp]:
+    """The few transitions that hold most of what one step leaves unexplained of a state.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    state : int
+        Position of the state.
+
+    Returns
+    -------
+    array of int
+        Positions, the largest first; empty if no few do.
+    """
+    square = _least_squares(problem)[:, state] ** 2
+    most = min(FEW, problem.N // 200)
+    largest = np.argsort(square)[::-1][:most]
+    total = float(square.sum())
+    rest = (total - float(square[largest].sum())) / max(problem.N - most, 1)
+    apart = largest[square[largest] > OUTLYING**2 * rest]
+    dominate = float(square[apart].sum()) > MOST * total
+    return np.asarray(apart if dominate else apart[:0])
+
+
+def weak(
+    problem: Problem,
+    lost: Mapping[int, tuple[int, float]],
+    names: Sequence[str],
+    place: Callable[[Sequence[int]], str],
+) -> list[str]:
+    """The sentence for each control whose effect is lost: the few transitions that hide it, or its small amplitude.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    lost : mapping of int to (int, float)
+        Of `excitation.lost`.
+    names : sequence of str
+        Of states and controls.
+    place : callable
+        Says in words when transitions happened.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
+    messages = []
+    hiding = {state: dominating(problem, state) for state in {state for state, _ in lost.values()}}
+    for j, (state, certainty) in lost.items():
+        cure, few = "", hiding[state]
+        if len(few):
+            without = certainty_of(problem.without(few), j, state)
+            one = len(few) == 1
+            hidden = (
+                f"{plural(len(few), 'transition')} ({place(few.tolist())}) {'holds' if one else 'hold'} most of what "
+                f"one step leaves unexplained of '{names[state]}'"
+            )
+            look = "look at what happened there first"
+            if without >= DETERMINED:
+                messages.append(
+                    f"{hidden}, so the effect of control '{names[j]}' cannot be told ({certainty:.2g} standard errors, "
+                    f"{without:.2g} without {'it' if one else 'them'}): {look}; larger steps are not needed"
+                )
+                continue
+            certainty, cure = without, f"{hidden}: {look}; without {'it' if one else 'them'} "
+        messages.append(
+            f"{cure}control '{names[j]}' moves too little to be told from the noise: its strongest effect, on "
+            f"'{names[state]}', is {certainty:.2g} standard errors; record it with larger or more steps "
+            f"({max(2.0, DETERMINED / max(certainty, 0.4)):.2g} times the amplitude), or leave it out"
+        )
+    return messages
