@@ -270,3 +270,29 @@ def test_help_and_usage():
         assert one.returncode == 0 and "usage" in one.stdout, one.stderr
     for wrong in ([], ["fit"], ["nonsense"], ["check", "a", "b", "--margin", "x"]):
         assert subprocess.run([*command, *wrong], capture_output=True, timeout=60).returncode == 2
+
+
+def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, capsys):
+    """Inside all bounds, and most of it where nothing vouches for them: said loudly, and in the JSON by a word."""
+    assert fitted(folder, "--additive", "noise") == 0
+    path = folder / "m.model.json"
+    model = json.loads(path.read_text())
+    capsys.readouterr()
+    assert main(["check", str(path), str(folder / "run.mcap"), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["outcome"], printed["exit_status"]) == ("quiet", 0)
+    middle = np.median([s["state"][0] for s in printed["recordings"][0]["verdict_per_sample"]])
+    model["domain"]["x_max"][0] = float(middle)  # half of what was seen is now beyond what was fitted
+    path.write_text(json.dumps(model))
+    assert main(["check", str(path), str(folder / "run.mcap")]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("no alarm, but UNKNOWN: 4") or last.startswith("no alarm, but UNKNOWN: 5")
+    assert "outside the fitted domain, where nothing vouches for the bounds" in last
+    assert main(["check", str(path), str(folder / "run.mcap"), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["outcome"], printed["exit_status"], printed["alarm"]) == ("unknown", 0, False)
+    (recording,) = printed["recordings"]
+    assert 0.4 < recording["outside_domain_share"] < 0.6 and "nothing vouches" in recording["reason"]
+    main(["report", str(path), str(folder / "run.mcap"), "--json"])
+    (happened,) = json.loads(capsys.readouterr().out)["happened"]
+    assert happened["state"] == "unknown" and "nothing vouches" in happened["text"]

@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.base.english import plural
     from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.reports.check_data import check_data
+    from uncertain_lti.reports.check_data import check_data, outcome
     from uncertain_lti.reports.check_text import check_text
     from uncertain_lti.sampling.reading import read_as_fitted_with_decisions
 
@@ -83,9 +83,11 @@ def run(options: argparse.Namespace) -> int:
                 options,
                 f"{plural(made.messages, 'message')} and the verdicts below {made.topics} written to {made.path}",
             )
+    status = ALARM if any(r["alarm"] for r in results) else DONE
     if options.json:
-        print_json({"model": options.model, "alarm": any(r["alarm"] for r in results), "recordings": results})
-    return ALARM if any(r["alarm"] for r in results) else DONE
+        ended = {"alarm": status == ALARM, "outcome": outcome(results), "exit_status": status}
+        print_json({"model": options.model, **ended, "recordings": results})
+    return status
 
 
 COMMAND = Command(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -178,9 +178,16 @@ def describe(
     alike = excitation.collinear(
         problem, sums, names, 1e-12 * problem.p, residuals.lagged_states(model.signals.signals, model.n)
     )
-    messages += [*_carried(few, discarded, problem, names, transients), *alike]
+    signals = model.signals.signals
+
+    def place(some: Sequence[int]) -> str:
+        return _where(problem, some, transients)
+
+    broken = [*sensors.coded(problem, signals), *sensors.flipped(problem, signals, place)]
+    messages = [*broken, *messages]
+    messages += [*([] if broken else _carried(few, discarded, problem, names, place)), *alike]
     known = memory(part)
-    told, follow = _recordings(model, problem, part, sums, names, transients)
+    told, follow = _recordings(model, problem, part, sums, names, transients, place, bool(broken))
     messages += told
     messages += _noise_like(known, part, states, follow)
     past = bool(residuals.lagged_states(model.signals.signals, model.n))  # A alone is then not the dynamics
@@ -224,21 +231,28 @@ def _recordings(
     sums: Moments,
     names: Sequence[str],
     transients: Sequence[Transient],
+    place: Callable[[Sequence[int]], str],
+    broken: bool,
 ) -> tuple[list[str], set[int]]:
-    """What the recordings themselves say (excitation, sensors, topics), and the states that lack another state."""
+    """What the recordings themselves say (excitation, sensors, topics), and the states that lack another state.
+
+    broken: some numbers are no movement; what the jumps do to the residuals comes from them.
+    """
     signals = model.signals.signals
     past = residuals.lagged_states(signals, model.n)
     rare = excitation.rare(part, names)
     known = {*rare, *past}
     held, late = sensors.held(part, signals), sensors.delayed(part, signals, past)
-    found = None if late else residuals.residuals(part)
+    found = None if late or broken else residuals.residuals(part)
     # what a slow topic or a late control explains needs no further state
     follow = {i for i in range(model.n) if found and found.follows(i) and not any(f"'{names[i]}'" in m for m in held)}
-    messages = [*rare.values()]
+    speed = max((abs(v) for v in model.eigenvalues()), default=0.0) * (model.sampling.dt_median or np.inf)
+    uneven = [] if broken else sensors.jittering(part, signals, float(speed), model.sampling.clock)
+    messages = [*rare.values(), *uneven]
     if found:
         messages += residuals.missing(found, signals, follow)
     lost = {j: (i, certainty) for j, (i, certainty) in excitation.lost(problem, sums, known).items() if i not in follow}
-    messages += residuals.weak(problem, lost, names, lambda few: _where(problem, few, transients))
+    messages += [] if broken else residuals.weak(problem, lost, names, place)
     messages += excitation.one_sided(part, names, known)
     messages += excitation.fed_back(part, names, past)
     messages += late
@@ -264,13 +278,13 @@ def _carried(
     discarded: int | None,
     problem: Problem,
     names: Sequence[str],
-    transients: Sequence[Transient],
+    place: Callable[[Sequence[int]], str],
 ) -> list[str]:
     """States whose width a few samples carry."""
     if few is None:
         return []
     indices = sorted(few.transitions)
-    where = _where(problem, indices, transients)
+    where = place(indices)
     wide = sorted((i for i in range(problem.n) if few.carry(i)), key=lambda i: -few.factor[i])
     widths = [f"'{names[i]}' {few.factor[i]:.3g} times" for i in wide[:4]]
     widths += [f"{len(wide) - 4} other states"] if len(wide) > 4 else []
@@ -418,6 +432,8 @@ def remedies(messages: Sequence[str], additive: str, state: str) -> str:
         Remedies, or an empty text.
     """
     named = [m for m in messages if f"'{state}'" in m]
+    if any(words in m for m in named for words in (sensors.STANDS_FOR_NONE, sensors.CHANGES_SIGN, sensors.WRAPS)):
+        return "it jumps without moving, as said above"
     found = []
     if any("as wide as the rest needs" in m for m in named):
         found.append("look at the few samples that carry the width, named above")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.identification.excitation import quoted, successive, unexplained
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.sampling.codes import codes
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal
 
@@ -17,8 +19,153 @@ LONGEST_DELAY = 10
 """Delays of a control that are tried, samples."""
 FROZEN = 25
 """A value that stands still for so many samples while the others move may be frozen."""
+UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
+"""|log(step / median)| of an uneven step, and by how much a constant one must explain them better; see `jittering`."""
+STANDS_FOR_NONE, CHANGES_SIGN, WRAPS, JITTERS = (
+    "a number that stands for no value",
+    "change sign together",
+    "wraps around",
+    "the stamps jitter",
+)
+"""Words by which a message is known again."""
+_QUATERNION = re.compile(r"((?:.*\.)?(?:orientation|rotation|quaternion|quat|q)(?:\.|_?))[xyzw]")
 STALE = 0.01
 """Share of the samples from which on stale controls are worth a word."""
+
+
+def coded(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+    """Signals in which a number stands for no value.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    signals : sequence of Signal
+        States, then controls.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
+    messages = []
+    for j, signal in enumerate(signals):
+        z = problem.z[:, j]
+        found = codes(z)
+        for code, count in found.items():
+            steady, scale = float(signal.steady), float(signal.scale)
+            others = z[~np.isin(z, list(found))] * scale + steady
+            messages.append(
+                f"'{signal.name}' is exactly {code * scale + steady:.9g} in {count} of {problem.N} transitions and "
+                f"{others.min():.4g} to {others.max():.4g} in the others: {STANDS_FOR_NONE}, or a sensor at its limit, "
+                f"and the envelope is fitted to the jumps there and back; leave those stretches out of the recording, "
+                f"or have NaN published"
+            )
+    return messages
+
+
+def flipped(problem: Problem, signals: Sequence[Signal], place: Callable[[Sequence[int]], str]) -> list[str]:
+    """Components of a quaternion that change sign together, and angles that wrap around.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    signals : sequence of Signal
+        States, then controls.
+    place : callable
+        Says in words when transitions happened.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
+    n = problem.n
+    states = signals[:n]
+    scale, steady = np.array([float(s.scale) for s in states]), np.array([float(s.steady) for s in states])
+    before, after = problem.z[:, :n] * scale + steady, problem.x_next * scale + steady
+    messages = []
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, signal in enumerate(states):
+        if match := _QUATERNION.fullmatch(signal.field) or (not signal.topic and _QUATERNION.fullmatch(signal.name)):
+            groups.setdefault((signal.topic, match[1]), []).append(i)
+    for (topic, attitude), those in groups.items():
+        one, other = before[:, those], after[:, those]
+        if max(np.abs(one).max(), np.abs(other).max()) > 1.01:
+            continue  # no unit quaternion
+        sum_, difference = np.square(one + other).sum(axis=1), np.square(one - other).sum(axis=1)
+        flips = np.flatnonzero((np.square(one).sum(axis=1) > 0.1) & (sum_ < 0.02 * difference))
+        if len(flips):
+            messages.append(
+                f"{quoted([states[i].name for i in those])} {CHANGES_SIGN} in {plural(len(flips), 'step')} "
+                f"({place(flips.tolist())}): q and -q are one attitude, so that jump is no movement, and the envelope "
+                f"is fitted to it; use roll, pitch or yaw"
+                + (f", such as 'unwrap(yaw({attitude.rstrip('.')}))' of {topic}," if topic else "")
+                + " instead of components"
+            )
+    for i, signal in enumerate(states):
+        for turn in (2 * np.pi, 360.0):
+            step = np.abs(after[:, i] - before[:, i])
+            wraps = np.flatnonzero(np.abs(step - turn) < 0.1 * turn)
+            inside = np.abs(before[:, i]).max() < 0.51 * turn or (before[:, i].min() >= 0 and before[:, i].max() < turn)
+            rest = np.delete(step, wraps)
+            if 0 < len(wraps) < 0.05 * problem.N and inside and len(rest) and rest.max() < 0.3 * turn:
+                messages.append(
+                    f"'{signal.name}' {WRAPS} in {plural(len(wraps), 'step')} ({place(wraps.tolist())}), by "
+                    f"{turn:.4g}: that jump is no movement, and the envelope is fitted to it; use "
+                    f"'unwrap({signal.field or signal.name})'"
+                )
+    return messages
+
+
+def jittering(problem: Problem, signals: Sequence[Signal], speed: float, clock: str | None) -> list[str]:
+    """Stamps that are unevenly spaced where the samples are not.
+
+    Over the uneven steps, what a constant step explains is compared with what the stated one does. Of samples that are
+    really uneven the stated one explains more.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    signals : sequence of Signal
+        States, then controls.
+    speed : float
+        |eigenvalue| x Δt of the fastest mode; from SLOW_STEP on a step hardly depends on its length, and nothing is
+        said.
+    clock : str, optional
+        Topic whose stamps these are.
+
+    Returns
+    -------
+    list of str
+        Messages.
+    """
+    dt = problem.dt
+    usual = float(np.median(dt))
+    uneven = np.abs(np.log(dt / usual)) > UNEVEN
+    if uneven.sum() < max(20, 0.01 * problem.N) or not speed < SLOW_STEP:
+        return []
+    step = problem.x_next - problem.z[:, : problem.n]
+    moving = np.ptp(problem.z[:, : problem.n], axis=0) > 0
+    left = []
+    for length in (dt, np.full(len(dt), usual)):
+        basis = np.column_stack([problem.z, np.ones(problem.N)]) * length[:, None]
+        gram, cross = basis.T @ basis, basis.T @ step
+        rest = step - basis @ (np.linalg.pinv(gram, hermitian=True) @ cross)
+        left.append(np.sqrt(np.mean(rest[uneven] ** 2, axis=0)))
+    ratio = (left[0] / np.maximum(left[1], 1e-300))[moving]
+    if not len(ratio) or ratio.max() < JITTER or ratio.min() < 1 / 1.05:
+        return []
+    most = int(np.flatnonzero(moving)[np.argmax(ratio)])
+    return [
+        f"{JITTERS}: steps range from {dt.min() * 1e3:.3g} to {dt.max() * 1e3:.3g} ms around {usual * 1e3:.3g} ms, and "
+        f"a constant step leaves {1 - 1 / ratio.max():.0%} less of '{signals[most].name}' unexplained over the "
+        f"{int(uneven.sum())} uneven ones (root mean square), so the samples are more even than their stamps: have "
+        f"them stamped at the sensor"
+        + (f", or try the other time of {clock} (header or log) under `topics`" if clock else "")
+    ]
 
 
 def quantised(problem: Problem, signals: Sequence[Signal]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,12 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
+
+
+UNVOUCHED = 0.2
+"""Share of the verdicts outside the fitted domain from which on their quiet says nothing."""
+OUTCOMES = ("alarm", "unknown", "violations", "quiet")
+"""What a check can come to, from what weighs most."""
 
 
 def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) -> dict[str, Any]:
@@ -70,6 +77,18 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "alarm": bool(alarms),
         "alarms": [{**_instant(transient, start), **_length(t, (start, stop))} for start, stop in alarms],
     }
+    share = data["outside_domain"] / judged if judged else 1.0
+    unknown = share > UNVOUCHED
+    data["outside_domain_share"] = share if judged else None
+    data["outcome"] = OUTCOMES[0 if alarms else 1 if unknown else 2 if data["violated"] else 3]
+    data["reason"] = (
+        ""
+        if not unknown
+        else f"{share:.2%} of the verdicts are outside the fitted domain, where nothing vouches for the bounds; fit "
+        f"recordings that reach as far"
+        if judged
+        else "no verdict was possible, so nothing is known"
+    )
     if samples:
         data["verdict_per_sample"] = [
             {
@@ -86,6 +105,22 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
             for k, status in enumerate(transient.statuses())
         ]
     return data
+
+
+def outcome(recordings: Sequence[dict[str, Any]]) -> str:
+    """The outcome of several recordings: the first of OUTCOMES that one of them has.
+
+    Parameters
+    ----------
+    recordings : sequence of dict
+        Of `check_data`.
+
+    Returns
+    -------
+    str
+        One of OUTCOMES.
+    """
+    return next(o for o in OUTCOMES if o == OUTCOMES[-1] or any(r["outcome"] == o for r in recordings))
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -48,6 +48,8 @@ def check_text(data: dict[str, Any]) -> str:
         lines.append(
             f"ALARM: raised {times(len(data['alarms']))}, first at {first['t']:.4f} s for {number(first['seconds'])} s"
         )
+    elif data["outcome"] == "unknown" and data["verdicts"]:
+        lines.append(f"no alarm, but UNKNOWN: {data['reason']}")
     else:
-        lines.append("no alarm" if data["verdicts"] else "no verdict was possible, so nothing is known")
+        lines.append("no alarm" if data["verdicts"] else data["reason"])
     return "\n".join(lines)

@@ -239,8 +239,15 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     if not judged:
         return {"recording": recording["recording"], "state": "unknown", "text": "no verdict was possible"}
     over = f"{plural(judged, 'verdict')} over {number(recording['seconds'])} s"
+    unknown = recording["outcome"] == "unknown"
+    but = f", but {recording['reason']}" if unknown else ""
     if not bad:
-        return {"recording": recording["recording"], "state": "quiet", "text": f"{over}: every one inside all bounds"}
+        state = "unknown" if unknown else "quiet"
+        return {
+            "recording": recording["recording"],
+            "state": state,
+            "text": f"{over}: every one inside all bounds{but}",
+        }
     states = {name: s["violations"] for name, s in recording["states"].items() if s["violations"]}
     most = sorted(states, key=lambda name: -states[name])[:3]
     text = f"{over}: {bad} violated, {_episodes_word(recording['episode_count'])}, first at "
@@ -250,7 +257,8 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
         first = recording["alarms"][0]
         text += f". The alarm was raised {times(len(recording['alarms']))}, first at {first['t']:.8g} s"
         return {"recording": recording["recording"], "state": "alarm", "text": text}
-    return {"recording": recording["recording"], "state": "violations", "text": f"{text}. The alarm was not raised"}
+    state = "unknown" if unknown else "violations"
+    return {"recording": recording["recording"], "state": state, "text": f"{text}. The alarm was not raised{but}"}
 
 
 def _episodes_word(count: int) -> str:

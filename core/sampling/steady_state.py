@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.sampling.codes import codes
 from uncertain_lti.signals.signal_map import Signal
 
 STILL_SAMPLES = 10
@@ -61,8 +62,8 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
     """Numbers for steady and scale where a signal says auto, and the rule applied, in words.
 
     steady: median over the longest still stretch (see `still_stretches`; the band is doubled until a stretch
-    is found). scale: the largest magnitude of the medians over all still stretches of all recordings, measured
-    in recorded units, or the range (largest less least value) where that is 0, or 1 where the range is 0 too.
+    is found), without `codes`. scale: the largest magnitude of the medians over all still stretches of all
+    recordings, measured in recorded units, or the range (largest less least value) where that is 0, or 1 where the range is 0 too.
 
     Parameters
     ----------
@@ -82,6 +83,12 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
     """
     finite = [np.where(np.isfinite(r), r, np.nan) for r in recordings]
     pooled = np.concatenate(finite)
+    left = []
+    for j, signal in enumerate(signals):  # of a number that stands for none there is no steady state
+        for code, count in codes(pooled[:, j]).items():
+            left.append(f"{signal.name} {code:.9g} in {count}")
+            for r in (pooled, *finite):
+                r[r[:, j] == code, j] = np.nan
     seen = np.isfinite(pooled).any(axis=0)
     span = np.zeros(len(signals))
     span[seen] = np.nanmax(pooled[:, seen], axis=0) - np.nanmin(pooled[:, seen], axis=0)
@@ -101,6 +108,8 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
         still[seen] = np.nanmedian(pooled[:, seen], axis=0)
         medians = still[None, :]
         words = "all samples (no still stretch)"
+    if left:
+        words += f", without samples that seem to stand for no value ({', '.join(left)})"
     magnitude = np.abs(medians).max(axis=0)
     scales = np.where(magnitude > 1e-9 * span, magnitude, span)
     scales = np.where(scales > 0, scales, 1.0)
