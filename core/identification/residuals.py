@@ -269,7 +269,7 @@ def weak(
                 continue
             certainty, cure = without, f"{hidden}: {look}; without {'it' if one else 'them'} "
         messages.append(
-            f"{cure}control '{names[j]}' moves too little to be told from the noise: its strongest effect, on "
+            f"{cure}control '{names[j]}' moves too little to be distinguished from the noise: its strongest effect, on "
             f"'{names[state]}', is {certainty:.2g} standard errors; record it with larger or more steps "
             f"({max(2.0, DETERMINED / max(certainty, 0.4)):.2g} times the amplitude), or leave it out"
         )

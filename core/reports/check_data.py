@@ -15,7 +15,6 @@ from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
 
-
 UNVOUCHED = 0.2
 """Share of the verdicts outside the fitted domain from which on their quiet says nothing."""
 OUTCOMES = ("alarm", "unknown", "violations", "quiet")

@@ -63,7 +63,8 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
 
     steady: median over the longest still stretch (see `still_stretches`; the band is doubled until a stretch
     is found), without `codes`. scale: the largest magnitude of the medians over all still stretches of all
-    recordings, measured in recorded units, or the range (largest less least value) where that is 0, or 1 where the range is 0 too.
+    recordings, measured in recorded units, or the range (largest less least value) where that is 0, or 1 where the
+    range is 0 too.
 
     Parameters
     ----------
