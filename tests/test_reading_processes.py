@@ -12,13 +12,14 @@ from pathlib import Path
 
 import pytest
 from bag_writer import float64
+from processes import runs as runs_still
 from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
 import uncertain_lti.sampling.reading_processes
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.sampling.reading import read_transients
-from uncertain_lti.sampling.reading_processes import processes_for
+from uncertain_lti.sampling.reading_processes import children_ignore_ctrl_c, processes_for
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))
@@ -81,11 +82,12 @@ def test_what_a_process_refuses_is_one_error_here(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_process_that_is_killed_is_an_error_and_not_a_hang(tmp_path: Path) -> None:
     script = SCRIPT.format(paths=[str(p) for p in runs(tmp_path)])
-    with subprocess.Popen([sys.executable, "-c", textwrap.dedent(script)], stdout=subprocess.PIPE, text=True) as reader:
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as reader:
         assert reader.stdout is not None
         assert reader.stdout.readline() == "reading\n"
         os.kill(first_child(reader.pid), signal.SIGKILL)
-        rest, _ = reader.communicate(timeout=60)
+        rest, _ = reader.communicate("go on\n", timeout=300)
     assert "BagError" in rest and "the process that read it was ended" in rest
 
 
@@ -94,6 +96,7 @@ def test_interrupted_it_leaves_no_process_and_no_traceback_of_theirs(tmp_path: P
     script = SCRIPT.format(paths=[str(p) for p in runs(tmp_path)])
     reader = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(script)],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -104,12 +107,25 @@ def test_interrupted_it_leaves_no_process_and_no_traceback_of_theirs(tmp_path: P
         assert reader.stdout.readline() == "reading\n"
         child = first_child(reader.pid)
         os.killpg(reader.pid, signal.SIGINT)  # as a terminal does
-        rest, errors = reader.communicate(timeout=60)
+        rest, errors = reader.communicate(timeout=300)
     assert rest == "interrupted\n" and errors == ""
-    deadline = time.monotonic() + 10
-    while Path(f"/proc/{child}").exists() and time.monotonic() < deadline:
+    deadline = time.monotonic() + 60
+    while runs_still(child) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not Path(f"/proc/{child}").exists()
+    assert not runs_still(child)
+
+
+def test_ctrl_c_while_processes_start_is_neither_lost_nor_theirs() -> None:
+    reached = False
+    with pytest.raises(KeyboardInterrupt):
+        with children_ignore_ctrl_c():
+            with subprocess.Popen(["sleep", "600"]) as child:
+                os.kill(os.getpid(), signal.SIGINT)
+                child.send_signal(signal.SIGINT)
+                child.send_signal(signal.SIGTERM)  # would come second
+                assert child.wait() == -signal.SIGTERM
+            reached = True
+    assert reached
 
 
 SCRIPT = """
@@ -121,7 +137,7 @@ SCRIPT = """
 
     def progress(items, total):
         print("reading", flush=True)
-        time.sleep(3)  # until something happens to it
+        sys.stdin.readline()  # until something has happened to it
         yield from items
 
     signals = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))
@@ -136,7 +152,7 @@ SCRIPT = """
 
 def first_child(parent: int) -> int:
     """A process that reads for it."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
         found = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
         workers = [int(pid) for pid in found if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]

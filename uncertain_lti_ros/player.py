@@ -7,7 +7,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -201,25 +201,36 @@ def _wait(life: Life, played: dict[str, _Played], limit: float) -> None:
         say(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing all the same")
 
 
-def _paced(
-    life: Life, played: dict[str, _Played], clock: Publisher | None, rate: float, messages: Iterator[RawMessage],
-    crowd: float,
-) -> None:  # fmt: skip
-    progress, total, sent = Progress(), sum(p.count for p in played.values()), 0
+def when_due(
+    messages: Iterable[RawMessage], rate: float, crowd: float, alive: Callable[[], bool]
+) -> Iterator[tuple[RawMessage, float]]:
+    """Each message at its time, never before, with how late it is in s; ends when `alive` turns false.
+
+    The first is due at once; at most `crowd` messages a second go out, also while catching up.
+    """
     began = last = time.monotonic()
     first: int | None = None
-    behind = 0.0
     for message in messages:
         if first is None:
             first = message.log_time_ns
         due = began + (message.log_time_ns - first) * 1e-9 / rate
         at = max(due, last + 1.0 / crowd)
-        while life.alive and (rest := at - time.monotonic()) > 0:
+        while alive() and (rest := at - time.monotonic()) > 0:
             time.sleep(min(rest, 0.1))
-        if not life.alive:
-            break
+        if not alive():
+            return
         last = time.monotonic()
-        behind = max(behind, last - due)
+        yield message, last - due
+
+
+def _paced(
+    life: Life, played: dict[str, _Played], clock: Publisher | None, rate: float, messages: Iterator[RawMessage],
+    crowd: float,
+) -> None:  # fmt: skip
+    progress, total, sent = Progress(), sum(p.count for p in played.values()), 0
+    behind = 0.0
+    for message, late in when_due(messages, rate, crowd, lambda: life.alive):
+        behind = max(behind, late)
         if clock is not None:
             clock.publish(_clock(message.log_time_ns))
         _send(played, message)

@@ -109,22 +109,28 @@ def _read(bag: Recording, signals: SignalMap) -> tuple[Any, ...]:
 
 @contextmanager
 def children_ignore_ctrl_c() -> Iterator[None]:
-    """Processes that are started in the block leave Ctrl-C to this one.
+    """Processes that are started in the block leave Ctrl-C to this one, which takes it at the end of the block.
 
-    In another than the main thread it cannot be set.
+    They inherit that SIGINT is blocked. In another than the main thread it cannot be set.
 
     Yields
     ------
     None
         The block in which they are started.
     """
-    main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []  # another thread may take the signal, which makes this one call the handler
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
     finally:
-        if main:
-            signal.signal(signal.SIGINT, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager
