@@ -233,13 +233,7 @@ def _wanting(module: Module, name: str, node: Function | ast.ClassDef, said: dic
     return wanting
 
 
-PENDING = (
-    "core/model", "core/monitor", "core/recordings/cdr_arrays", "core/recordings/message_reader",
-    "core/sampling/sampler", "uncertain_lti_ros",
-)  # fmt: skip
-"""Beginnings of the paths whose docstrings do not have every section yet."""
 FILES = sorted([*(ROOT / "core").rglob("*.py"), *(ROOT / "uncertain_lti_ros").glob("*.py")])
-FILES = [path for path in FILES if not str(path.relative_to(ROOT)).startswith(PENDING)]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))

@@ -38,7 +38,23 @@ class ArgumentError(UncertainLTIError):
 
 @dataclass(frozen=True)
 class Declared:
-    """One parameter; fixed: it can be given at the start only."""
+    """One parameter of a node.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    default : str or bool or int or float
+        Its default, which gives the type.
+    text : str
+        What it means, for `--help` and `ros2 param describe`.
+    fixed : bool, default False
+        It can be given at the start only.
+    low : float, optional
+        Least value; None without a range.
+    high : float, optional
+        Greatest value; None without a range.
+    """
 
     name: str
     default: str | bool | int | float
@@ -48,7 +64,13 @@ class Declared:
     high: float | None = None
 
     def descriptor(self) -> ParameterDescriptor:
-        """What `ros2 param describe` tells."""
+        """What `ros2 param describe` shows.
+
+        Returns
+        -------
+        ParameterDescriptor
+            With the range.
+        """
         descriptor = ParameterDescriptor(description=self.text, read_only=self.fixed)
         if self.low is not None and self.high is not None:
             if isinstance(self.default, int):
@@ -74,7 +96,19 @@ class Declared:
 
 
 def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
-    """Declare the parameters of a node; returns their values by name.
+    """Declare the parameters of a node.
+
+    Parameters
+    ----------
+    node : Node
+        The node.
+    parameters : iterable of Declared
+        To declare.
+
+    Returns
+    -------
+    dict
+        Name -> value.
 
     Raises
     ------
@@ -108,9 +142,27 @@ def run_node(
     run: Callable[[list[str]], int],
     args: Sequence[str] | None,
 ) -> int:
-    """Run a node on these arguments (None: those of the process); returns the exit status.
+    """Run a node on some arguments.
 
-    `--help` prints what the node is and its parameters. An UncertainLTIError of `run` is printed; status 2.
+    `--help` prints what the node is and its parameters.
+
+    Parameters
+    ----------
+    name : str
+        Of the program.
+    summary : str
+        What it is, for `--help`.
+    parameters : sequence of Declared
+        Of the node, for `--help`.
+    run : callable
+        Takes the arguments and returns the exit status.
+    args : sequence of str or None
+        Words of the command line; None for those of the process.
+
+    Returns
+    -------
+    int
+        Exit status; 2 for an UncertainLTIError, which is printed.
     """
     given = list(sys.argv[1:] if args is None else args)
     if "--help" in given or "-h" in given:
@@ -210,7 +262,18 @@ def _hold_value(flag: str, value: str) -> None:
 
 
 def in_words(error: Exception) -> str:
-    """One sentence out of an error of rcl, which names lines of its own source."""
+    """One sentence from an error of rcl, which names lines of its own source.
+
+    Parameters
+    ----------
+    error : Exception
+        Of rcl.
+
+    Returns
+    -------
+    str
+        The sentence, with its remedy.
+    """
     text = re.sub(r",? at /\S+:\d+", "", " ".join(str(error).split()))
     text = re.sub(r"Error: error not set\W*", "", text).removeprefix("failed to initialize rcl: ").rstrip(". ")
     if typed := re.search(r"parameter '(\S+)' to '(.*)' of type '\w+', expecting type '(\w+)'", text):
@@ -235,6 +298,13 @@ def hold_overrides(node: Node, args: Sequence[str]) -> None:
     """Refuse parameters that were given and that the node does not have; log what may be meant for others.
 
     A name that stands in a file and is like none of this node's may be there for another node that shares the file.
+
+    Parameters
+    ----------
+    node : Node
+        With its parameters declared.
+    args : sequence of str
+        Words of the command line.
 
     Raises
     ------

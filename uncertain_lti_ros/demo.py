@@ -37,18 +37,38 @@ _PATIENCE = 20.0  # s for another process to do its next step
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti demo`."""
+    """Declare the arguments of `uncertain-lti demo`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("--output", metavar="FOLDER", default="demo-output", help="where model and figure are written")
     parser.add_argument("--rate", type=speed, default=4.0, metavar="R", help="speed of the player (default 4)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo; 0 where the live verdicts are those of the offline check and the departure was seen.
+    """Run the demo.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed arguments.
+
+    Returns
+    -------
+    int
+        Exit status: 0 where the live verdicts are those of the offline check and the departure was seen, else 2.
 
     Raises
     ------
     UncertainLTIError
-        The recordings are not there, or a node does not answer.
+        A node does not answer.
+    KeyboardInterrupt
+        A signal came.
+    BagError
+        The recordings are not there.
     """
     bags = _bags()
     output = Path(args.output)

@@ -249,7 +249,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- lifecycle ---
 
     def start(self) -> None:
-        """Configure and activate; where that fails the reason is logged and stands in /diagnostics."""
+        """Configure and activate; where that fails the reason is logged and published on /diagnostics."""
         self._starts_itself = True
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self._starts_itself = self.trigger_activate() != TransitionCallbackReturn.SUCCESS
@@ -269,7 +269,18 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @_failures_noted
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load and check the model, and offer the outputs."""
+        """Load and check the model, and offer the outputs.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            Before the transition.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            FAILURE where the model or a parameter cannot be used.
+        """
         path = str(self.get_parameter("model").value)
         try:
             self._wish()
@@ -321,7 +332,23 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @_failures_noted
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start with no sample and no verdict, and subscribe."""
+        """Start with no sample and no verdict, and subscribe.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            Before the transition.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Of the node's own activation.
+
+        Raises
+        ------
+        ModelError
+            A parameter of the quality of service is set to a word that is none.
+        """
         assert self.watch is not None
         result = super().on_activate(state)
         self.watch.restart(time.monotonic())
@@ -339,27 +366,71 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @_failures_noted
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop listening; no heartbeat comes from now on."""
+        """Stop listening; no heartbeat comes from now on.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            Before the transition.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Of the node's own deactivation.
+        """
         self._unsubscribe()
         self.get_logger().info("no longer active: no verdicts are given")
         return super().on_deactivate(state)
 
     @_failures_noted
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the model."""
+        """Forget the model.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            Before the transition.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Of the node's own cleanup.
+        """
         result = super().on_cleanup(state)
         self._put_away()
         return result
 
     @_failures_noted
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Put everything away."""
+        """Put everything away.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            Before the transition.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Of the node's own shutdown.
+        """
         result = super().on_shutdown(state)
         self._put_away()
         return result
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Put everything away; the node can be configured again."""
+        """Put everything away; the node can be configured again.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            Before the transition.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            SUCCESS.
+        """
         self._reason = "a transition failed unexpectedly; see the log"
         self.get_logger().error(self._reason)
         self._put_away()
@@ -378,7 +449,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.watch = None
 
     def finish(self) -> None:
-        """The orderly end of the process."""
+        """Shut down in good order, at the end of the process."""
         if self._state_machine.current_state[1] in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
         self._reason = ""
@@ -387,7 +458,15 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- what nobody thought of ---
 
     def note_failure(self, where: str, error: Exception) -> None:
-        """Count an error that nobody foresaw, log it, and have it in the next diagnostics; the node goes on."""
+        """Count an error that nobody foresaw, log it, and put it into the next diagnostics; the node goes on.
+
+        Parameters
+        ----------
+        where : str
+            What was being done.
+        error : Exception
+            The error.
+        """
         self._failures += 1
         self._failed_how = f"{where}: {error!r}"[:300]
         now = time.monotonic()
@@ -738,7 +817,18 @@ class EnvelopeMonitorNode(LifecycleNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until a signal ends it; 0 then, 2 for arguments that it cannot use."""
+    """Run the node until a signal ends it.
+
+    Parameters
+    ----------
+    args : list of str, optional
+        Words of the command line; None for those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0 after a signal, 2 for arguments that the node cannot use.
+    """
     return run_node(NAME, _SUMMARY, PARAMETERS, _run, args)
 
 

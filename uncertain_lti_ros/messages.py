@@ -23,6 +23,16 @@ _NUMBERS = {
 def message_class(type_name: str) -> Any:
     """Class of a message type such as `sensor_msgs/msg/JointState`.
 
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name or package/Name.
+
+    Returns
+    -------
+    type
+        The class.
+
     Raises
     ------
     SignalError
@@ -47,7 +57,23 @@ def message_class(type_name: str) -> Any:
 
 
 def live_fields(type_name: str) -> Mapping[str, FieldType]:
-    """Field name -> FieldType of an installed message type; raises SignalError where there is none."""
+    """Fields of an installed message type.
+
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name.
+
+    Returns
+    -------
+    mapping of str to FieldType
+        Field name -> FieldType.
+
+    Raises
+    ------
+    SignalError
+        The type is not installed.
+    """
     described = message_class(type_name).get_fields_and_field_types()
     return {name: _field_type(text) for name, text in described.items()}
 
@@ -78,7 +104,18 @@ def _field_type(text: str) -> FieldType:
 
 
 def full_name(type_name: str) -> str:
-    """`pkg/msg/Type` also for `pkg/Type`."""
+    """A type's name in full.
+
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name or package/Name.
+
+    Returns
+    -------
+    str
+        As package/msg/Name.
+    """
     parts = type_name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
 
@@ -87,6 +124,21 @@ def definition(type_name: str) -> str:
     """Definition of an installed type and of all it uses, as MCAP's schema encoding `ros2msg` wants it.
 
     Constants and default values are not in it: a class does not tell them, and no reader of messages needs them.
+
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name.
+
+    Returns
+    -------
+    str
+        The text.
+
+    Raises
+    ------
+    SignalError
+        A type is not installed.
     """
     bodies: dict[str, str] = {}
     waiting = [full_name(type_name)]

@@ -44,7 +44,18 @@ class Plant(Node):
 
 
 def run(life: Life) -> int:
-    """Wait for subscribers, publish one transient, wait until it has been received."""
+    """Wait for subscribers, publish one transient, wait until it has been received.
+
+    Parameters
+    ----------
+    life : Life
+        Of a `Plant`.
+
+    Returns
+    -------
+    int
+        Exit status, as of `publish`.
+    """
     node = life.node
     assert isinstance(node, Plant)
     return publish(
@@ -64,7 +75,26 @@ def run(life: Life) -> int:
 def publish(
     life: Life, publishers: tuple[Publisher, Publisher], make: Callable[[], Transient], rate: float, wait: float
 ) -> int:
-    """Publish states and controls of a transient once both topics have subscribers; 2 where none came in `wait` s."""
+    """Publish states and controls of a transient once both topics have subscribers.
+
+    Parameters
+    ----------
+    life : Life
+        Of the node.
+    publishers : (Publisher, Publisher)
+        Of states and controls.
+    make : callable
+        Makes the transient when subscribers are there.
+    rate : float
+        Speed, times real time.
+    wait : float
+        How long to wait for subscribers, s.
+
+    Returns
+    -------
+    int
+        Exit status: 2 where none came, else 0.
+    """
     node = life.node
     if not _subscribed(life, publishers, wait):
         if life.alive:
@@ -106,7 +136,18 @@ def _subscribed(life: Life, publishers: tuple[Publisher, ...], limit: float) -> 
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until its transient is over."""
+    """Run the node until its transient is over.
+
+    Parameters
+    ----------
+    args : list of str, optional
+        Words of the command line; None for those of the process.
+
+    Returns
+    -------
+    int
+        Exit status, as of `run_node`.
+    """
 
     def started(args: list[str]) -> int:
         with living(Plant, args) as life:

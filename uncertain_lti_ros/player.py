@@ -42,7 +42,13 @@ _REPEAT = 0.1  # s after which /clock, which is best effort, is sent again
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti play`."""
+    """Declare the arguments of `uncertain-lti play`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
     parser.add_argument("bag", metavar="BAG", help="recording (MCAP file, or folder of a split one)")
     parser.add_argument("--rate", type=speed, metavar="R", help="speed, times real time (default 1)")
     parser.add_argument("--clock", action="store_true", help="publish /clock (log time) before each message")
@@ -69,7 +75,17 @@ class _Played:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play to the end (0), or until SIGINT (130) or SIGTERM (143).
+    """Play a recording to its end, or until a signal.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Parsed arguments.
+
+    Returns
+    -------
+    int
+        Exit status: 0 at the end, 130 after SIGINT, 143 after SIGTERM.
 
     Raises
     ------
@@ -204,9 +220,25 @@ def _wait(life: Life, played: dict[str, _Played], limit: float) -> None:
 def when_due(
     messages: Iterable[RawMessage], rate: float, crowd: float, alive: Callable[[], bool]
 ) -> Iterator[tuple[RawMessage, float]]:
-    """Each message at its time, never before, with how late it is in s; ends when `alive` turns false.
+    """Hand over each message at its time, never before, until `alive` returns False.
 
     The first is due at once; at most `crowd` messages a second go out, also while catching up.
+
+    Parameters
+    ----------
+    messages : iterable of RawMessage
+        In order of log time.
+    rate : float
+        Speed, times real time.
+    crowd : float
+        Messages a second at most.
+    alive : callable
+        Takes nothing; whether to go on.
+
+    Yields
+    ------
+    (RawMessage, float)
+        The message, and how late it is, s.
     """
     began = last = time.monotonic()
     first: int | None = None

@@ -32,6 +32,13 @@ class Life:
     deliver nothing in some releases, so it is driven by timed calls. Where it is absent the default executor takes
     its place, which delivers messages that arrive together in order of subscription. The multi-threaded one
     loses messages and is not used.
+
+    Parameters
+    ----------
+    node : Node
+        The node.
+    stop : list of int
+        Signals that have come; the list is filled in elsewhere.
     """
 
     def __init__(self, node: Node, stop: list[int]) -> None:
@@ -59,13 +66,24 @@ class Life:
         return self._stop[0] if self._stop else None
 
     def spin_once(self, seconds: float = _PATIENCE) -> None:
-        """Wait for work at most this long, and do what is there."""
+        """Wait for work, and do what is there.
+
+        Parameters
+        ----------
+        seconds : float, optional
+            How long at most, s; never longer than the default.
+        """
         self.executor.spin_once(timeout_sec=min(seconds, _PATIENCE))
 
     def spin(self, note: Callable[[str, Exception], None]) -> None:
         """Work until the end; an error that a callback lets through is noted, and the work goes on.
 
         The node must have a timer: a signal is seen when Python comes to run.
+
+        Parameters
+        ----------
+        note : callable
+            Takes where an error came from, and the error.
         """
         while self.alive:
             self._end = Future(executor=self.executor)
@@ -97,6 +115,18 @@ def spare_the_middleware() -> None:
 @contextmanager
 def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
     """Start rclpy on these ROS arguments, make the node, and put all away at the end.
+
+    Parameters
+    ----------
+    make_node : callable
+        Makes the node.
+    args : list of str, optional
+        ROS arguments.
+
+    Yields
+    ------
+    Life
+        Of the node, until the block ends.
 
     Raises
     ------

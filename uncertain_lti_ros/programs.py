@@ -9,17 +9,35 @@ _BAD_USAGE, _INTERRUPTED = 2, 130
 
 
 def envelope_monitor() -> int:
-    """The live monitor."""
+    """The live monitor.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     return _run("envelope_monitor")
 
 
 def plant() -> int:
-    """The published engine."""
+    """The published engine.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     return _run("plant")
 
 
 def turbofan() -> int:
-    """The nonlinear engine."""
+    """The nonlinear engine.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
     return _run("turbofan")
 
 

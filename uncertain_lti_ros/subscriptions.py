@@ -24,7 +24,17 @@ _NEVER_NS = 2**62
 
 @dataclass(frozen=True)
 class Wish:
-    """What a user asks of subscriptions; None: what the publishers offer."""
+    """What a user asks of subscriptions.
+
+    Parameters
+    ----------
+    depth : int, optional
+        Messages kept until they are taken.
+    reliability : ReliabilityPolicy or None, optional
+        None for what the publishers offer.
+    durability : DurabilityPolicy or None, optional
+        None for what the publishers offer.
+    """
 
     depth: int = DEPTH
     reliability: ReliabilityPolicy | None = None
@@ -32,11 +42,24 @@ class Wish:
 
 
 def choose_qos(offers: Iterable[QoSProfile], wish: Wish, history: bool = True) -> QoSProfile:
-    """Reliable only if every publisher is, transient local only if every publisher is; without any, reliable, volatile.
+    """The quality of service that hears the publishers.
 
+    Reliable only if every publisher is, transient local only if every publisher is; without any, reliable and volatile.
     The deadline is the longest that publishers offer, and none where one of them offers none.
 
-    history: whether messages sent before may still be asked for; where some have come, that would repeat them.
+    Parameters
+    ----------
+    offers : iterable of QoSProfile
+        Of the publishers.
+    wish : Wish
+        Goes before what they offer.
+    history : bool, default True
+        Whether messages sent before may still be asked for; where some have come, that would repeat them.
+
+    Returns
+    -------
+    QoSProfile
+        To subscribe with.
     """
     offers = list(offers)
     reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
@@ -54,7 +77,20 @@ def choose_qos(offers: Iterable[QoSProfile], wish: Wish, history: bool = True) -
 
 
 def incompatible(asked: QoSProfile, offered: QoSProfile) -> list[str]:
-    """What a publisher does not offer of what is asked, in words."""
+    """What a publisher does not offer of what is asked, in words.
+
+    Parameters
+    ----------
+    asked : QoSProfile
+        By the subscription.
+    offered : QoSProfile
+        By the publisher.
+
+    Returns
+    -------
+    list of str
+        One entry per policy.
+    """
     found = []
     if asked.reliability == ReliabilityPolicy.RELIABLE != offered.reliability:
         found.append("reliability: best effort is offered, reliable asked")
@@ -74,15 +110,19 @@ class MatchedSubscription:
     Parameters
     ----------
     node : Node
+        The node.
     topic : str
         As in the model or on the command line; expanded and remapped by the node.
     type_name : str
         `pkg/msg/Type`.
     message_class : type
+        Class of the type.
     callback : callable
         Takes the message, or its bytes when raw.
-    wish : Wish
-    raw : bool
+    wish : Wish, optional
+        What the user asks.
+    raw : bool, default False
+        Whether the callback takes bytes.
 
     Attributes
     ----------
@@ -119,7 +159,7 @@ class MatchedSubscription:
         return self._qos
 
     def look(self) -> None:
-        """Hold the subscription against what publishers offer now, and make it anew where it must change."""
+        """Compare the subscription with what publishers offer now, and make another where it must change."""
         self.look_soon = False
         infos = self._node.get_publishers_info_by_topic(self._asked_topic)
         offers = [i.qos_profile for i in infos if i.topic_type == self.type_name]

@@ -46,7 +46,18 @@ class Turbofan(Node):
 
 
 def run(life: Life) -> int:
-    """Simulate, wait for subscribers, publish, wait until all has been received."""
+    """Simulate, wait for subscribers, publish, wait until all has been received.
+
+    Parameters
+    ----------
+    life : Life
+        Of a `Turbofan`.
+
+    Returns
+    -------
+    int
+        Exit status, as of `publish`.
+    """
     node = life.node
     assert isinstance(node, Turbofan)
     start_ns = START_NS if node.simulated else node.get_clock().now().nanoseconds
@@ -55,7 +66,18 @@ def run(life: Life) -> int:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until its transient is over."""
+    """Run the node until its transient is over.
+
+    Parameters
+    ----------
+    args : list of str, optional
+        Words of the command line; None for those of the process.
+
+    Returns
+    -------
+    int
+        Exit status, as of `run_node`.
+    """
 
     def started(args: list[str]) -> int:
         with living(Turbofan, args) as life:

@@ -66,8 +66,8 @@ def uncompiled(name: str) -> ModuleType:
 
     Returns
     -------
-    module
-        A new one each time.
+    ModuleType
+        Its names are those of the module as it runs without a compiler.
     """
     found = import_module(f"uncertain_lti.{name}")
     spec = spec_from_file_location(f"{found.__name__}_uncompiled", found.__file__)

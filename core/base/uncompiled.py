@@ -30,17 +30,17 @@ def declare(type: Any = None, value: Any = None, **_: Any) -> Any:
 
     Parameters
     ----------
-    type : Any
-        Its C type, which counts only when compiled.
-    value : Any
-        Its value.
-    **_ : Any
-        Whether it can be read from Python, likewise.
+    type : object, optional
+        Not looked at.
+    value : object, optional
+        The value.
+    **_ : object
+        Not looked at.
 
     Returns
     -------
-    Any
-        The value.
+    object
+        The value as it was given.
     """
     return value
 

@@ -16,7 +16,19 @@ LONGEST_WINDOW = 1_000_000
 class AlarmRule:
     """The alarm is raised while `violations` of the last `window` verdicts are violations.
 
-    margin multiplies the half-widths of the bounds that are judged.
+    Parameters
+    ----------
+    violations : int, default 1
+        m of the rule.
+    window : int, default 1
+        n of the rule, in verdicts.
+    margin : float, default 1.0
+        Multiplies the half-widths of the bounds that are judged.
+
+    Raises
+    ------
+    ModelError
+        Not 1 <= violations <= window <= LONGEST_WINDOW, or the margin is not positive.
     """
 
     violations: int = 1

@@ -33,7 +33,22 @@ from uncertain_lti.base.compiled import use_twin
 @cython.inline
 @cython.exceptval(check=False)
 def normalised(value: cython.double, steady: cython.double, scale: cython.double) -> cython.double:
-    """Deviation from the steady state, without dimension."""
+    """Deviation from the steady state, without dimension.
+
+    Parameters
+    ----------
+    value : float or array
+        Recorded units.
+    steady : float or array
+        Steady state.
+    scale : float or array
+        Positive scale.
+
+    Returns
+    -------
+    float or array
+        Without dimension.
+    """
     return (value - steady) / scale
 
 
@@ -41,7 +56,22 @@ def normalised(value: cython.double, steady: cython.double, scale: cython.double
 @cython.inline
 @cython.exceptval(check=False)
 def recorded(value: cython.double, steady: cython.double, scale: cython.double) -> cython.double:
-    """Deviation in recorded units: the inverse of `normalised`."""
+    """Deviation in recorded units: the inverse of `normalised`.
+
+    Parameters
+    ----------
+    value : float or array
+        Without dimension.
+    steady : float or array
+        Steady state.
+    scale : float or array
+        Positive scale.
+
+    Returns
+    -------
+    float or array
+        Recorded units.
+    """
     return steady + scale * value
 
 
@@ -49,7 +79,22 @@ def recorded(value: cython.double, steady: cython.double, scale: cython.double) 
 @cython.inline
 @cython.exceptval(check=False)
 def centre_of(x: cython.double, dt: cython.double, rate: cython.double) -> cython.double:
-    """Centre of the bounds one step after x, where Theta phi = rate."""
+    """Centre of the bounds one step after x, where Theta phi = rate.
+
+    Parameters
+    ----------
+    x : float or array
+        State at t_k, normalised.
+    dt : float or array
+        Δt_k, s.
+    rate : float or array
+        Θ φ, 1/s.
+
+    Returns
+    -------
+    float or array
+        Normalised.
+    """
     return rate * dt + x
 
 
@@ -57,7 +102,22 @@ def centre_of(x: cython.double, dt: cython.double, rate: cython.double) -> cytho
 @cython.inline
 @cython.exceptval(check=False)
 def half_of(dt: cython.double, spread: cython.double, v: cython.double) -> cython.double:
-    """Half-width of the bounds, where Delta psi = spread."""
+    """Half-width of the bounds, where Delta psi = spread.
+
+    Parameters
+    ----------
+    dt : float or array
+        Δt_k, s.
+    spread : float or array
+        Δ ψ, 1/s.
+    v : float or array
+        Half-width that dt does not multiply.
+
+    Returns
+    -------
+    float or array
+        Normalised, at least 0.
+    """
     return spread * dt + v
 
 
@@ -65,7 +125,22 @@ def half_of(dt: cython.double, spread: cython.double, v: cython.double) -> cytho
 @cython.inline
 @cython.exceptval(check=False)
 def lower_of(centre: cython.double, half: cython.double, margin: cython.double) -> cython.double:
-    """Eq. (6) with a margin."""
+    """Eq. (6) with a margin.
+
+    Parameters
+    ----------
+    centre : float or array
+        Of the bounds.
+    half : float or array
+        Half-width.
+    margin : float
+        Multiplies the half-width.
+
+    Returns
+    -------
+    float or array
+        x_min at t_{k+1}.
+    """
     return centre - half * margin
 
 
@@ -73,7 +148,22 @@ def lower_of(centre: cython.double, half: cython.double, margin: cython.double) 
 @cython.inline
 @cython.exceptval(check=False)
 def upper_of(centre: cython.double, half: cython.double, margin: cython.double) -> cython.double:
-    """Eq. (7) with a margin."""
+    """Eq. (7) with a margin.
+
+    Parameters
+    ----------
+    centre : float or array
+        Of the bounds.
+    half : float or array
+        Half-width.
+    margin : float
+        Multiplies the half-width.
+
+    Returns
+    -------
+    float or array
+        x_max at t_{k+1}.
+    """
     return centre + half * margin
 
 
@@ -81,7 +171,22 @@ def upper_of(centre: cython.double, half: cython.double, margin: cython.double) 
 @cython.inline
 @cython.exceptval(check=False)
 def contained(lower: cython.double, x_next: cython.double, upper: cython.double) -> cython.bint:
-    """Eqs. (8)(9)."""
+    """Whether the sample lies within its bounds, Leibov (2006), eqs. (8)(9).
+
+    Parameters
+    ----------
+    lower : float or array
+        x_min at t_{k+1}.
+    x_next : float or array
+        Recorded state at t_{k+1}, normalised.
+    upper : float or array
+        x_max at t_{k+1}.
+
+    Returns
+    -------
+    bool or array of bool
+        On a bound is within; NaN is not.
+    """
     return (lower <= x_next) & (x_next <= upper)
 
 
@@ -89,7 +194,22 @@ def contained(lower: cython.double, x_next: cython.double, upper: cython.double)
 @cython.inline
 @cython.exceptval(check=False)
 def outside(z: cython.double, least: cython.double, greatest: cython.double) -> cython.bint:
-    """Whether a value lies outside the range that the fit saw."""
+    """Whether a value lies outside the range that the fit saw.
+
+    Parameters
+    ----------
+    z : float or array
+        State or control, normalised.
+    least : float or array
+        Least value in the fit.
+    greatest : float or array
+        Greatest value in the fit.
+
+    Returns
+    -------
+    bool or array of bool
+        False within, and on either end.
+    """
     return (z < least) | (z > greatest)
 
 
@@ -97,7 +217,20 @@ def outside(z: cython.double, least: cython.double, greatest: cython.double) -> 
 @cython.exceptval(check=False)
 @cython.cdivision(True)
 def utilisation_of(difference: cython.double, half: cython.double) -> cython.double:
-    """(x_next - centre) / half; where half is 0, 0 for no difference and otherwise infinite with its sign."""
+    """(x_next - centre) / half; where half is 0, 0 for no difference and otherwise infinite with its sign.
+
+    Parameters
+    ----------
+    difference : float or array
+        x_next less the centre.
+    half : float or array
+        Half-width, before the margin.
+
+    Returns
+    -------
+    float or array
+        -1 and 1 at the bounds.
+    """
     if cython.compiled:
         return 0.0 if difference == 0.0 else difference / half  # as C divides
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -117,6 +250,7 @@ def ordered_sum(weights: Any, values: Any) -> Any:
     Returns
     -------
     array (...)
+        The sum.
     """
     products = np.multiply(weights, values, order="C")  # the layout decides the order of the sum
     return _sum_of_rows(products.shape)(products)
@@ -164,7 +298,10 @@ def centre_and_half(theta: Any, delta: Any, v: Any, phi: Any, dt: Any) -> tuple[
 
     Returns
     -------
-    centre, half : array (n, K)
+    array (n, K)
+        Centre, normalised.
+    array (n, K)
+        Half-width, normalised.
     """
     columns = phi[:, None, :]
     rate = ordered_sum(np.ascontiguousarray(theta.T)[:, :, None], columns)
@@ -182,12 +319,14 @@ class Judgement:
 
     Attributes
     ----------
+    values : object
+        What `numbers` is computed from; compiled and uncompiled code keep different things.
     contained : bool
-        Every state is within its bounds.
+        As the attribute.
     violation : bool
-        Some state whose violations count is not.
+        As the attribute.
     outside_domain : bool
-        x_k or u_k lies outside the ranges that the fit saw.
+        As the attribute.
     """
 
     contained = cython.declare(cython.bint, visibility="readonly")
@@ -210,6 +349,7 @@ class Judgement:
         Returns
         -------
         buffer of doubles (n,)
+            One per state.
         """
         if cython.compiled:
             n = len(self._values) // 4
@@ -230,18 +370,29 @@ class Judge:
 
     Parameters
     ----------
-    theta, delta : array (n, p)
-        Nominal elements and half-widths of the rates, for phi = [x; u; 1] (`terms.tables`), 1/s.
+    theta : array (n, p)
+        Nominal elements of the rates, for φ = [x; u; 1] (`terms.tables`), 1/s.
+    delta : array (n, p)
+        Their half-widths, for ψ = |φ|, 1/s.
     v : array (n,)
         Half-width that dt does not multiply.
-    steady, scale : array (n + m,)
-        Operating point of [x; u].
-    least, greatest : array (n + m,)
-        Normalised ranges of [x; u] that the fit saw.
+    steady : array (n + m,)
+        Steady states of [x; u].
+    scale : array (n + m,)
+        Scales of [x; u].
+    least : array (n + m,)
+        Least normalised [x; u] that the fit saw.
+    greatest : array (n + m,)
+        Greatest normalised [x; u] that the fit saw.
     margin : float
         Multiplies the half-widths.
     counted : array of bool (n,)
         States whose violations count.
+
+    Raises
+    ------
+    ValueError
+        The arrays do not fit one another.
     """
 
     n: cython.Py_ssize_t
@@ -308,7 +459,17 @@ class Judge:
         after : sequence of float (n,)
             x_{k+1}, recorded units.
         dt : float
-            s.
+            Δt_k, s.
+
+        Returns
+        -------
+        Judgement
+            Against the bounds of this model.
+
+        Raises
+        ------
+        ValueError
+            The numbers of values are not those of the model's signals.
         """
         if len(before) != self.size or len(after) != self.n:
             raise ValueError(f"{len(before)} and {len(after)} values for {self.size} and {self.n} signals")

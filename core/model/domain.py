@@ -13,7 +13,29 @@ from uncertain_lti.base.arrays import Array
 
 @dataclass(frozen=True)
 class Sampling:
-    """How samples were cut when the model was fitted, and what the steps were; times in s."""
+    """How samples were cut when the model was fitted, and what the steps were.
+
+    Parameters
+    ----------
+    clock : str, default ""
+        Topic whose messages define the sample instants; empty for arrays.
+    clock_type : str, default ""
+        Its message type.
+    time : mapping of str to {"header", "log"}, optional
+        Per topic, what its instant is.
+    dt_median : float or None, optional
+        Median step, s; None where nothing was fitted.
+    dt_min : float or None, optional
+        Shortest step, s; likewise.
+    dt_max : float or None, optional
+        Longest step, s; likewise.
+    max_gap : float or None, optional
+        Longest step that is a transition, s; None for no limit.
+    min_step : float, default 0.0
+        Shortest step, s; a message sooner than that is dropped.
+    max_skew : float or None, optional
+        Greatest age of a state from another topic than the clock, s; None for `max_gap`.
+    """
 
     clock: str = ""
     clock_type: str = ""
@@ -28,7 +50,19 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Domain:
-    """Normalised ranges of x (n,) and u (m,) seen in the fit; None where nothing was fitted."""
+    """Normalised ranges seen in the fit; without end where nothing was fitted.
+
+    Parameters
+    ----------
+    x_min : array (n,)
+        Least states.
+    x_max : array (n,)
+        Greatest states.
+    u_min : array (m,)
+        Least controls.
+    u_max : array (m,)
+        Greatest controls.
+    """
 
     x_min: Array
     x_max: Array
@@ -36,7 +70,20 @@ class Domain:
     u_max: Array
 
     def outside(self, x: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
-        """(...,): z = [x; u] leaves the box in some element."""
+        """Whether z = [x; u] leaves the box in some element.
+
+        Parameters
+        ----------
+        x : array (..., n)
+            Normalised states.
+        u : array (..., m)
+            Normalised controls.
+
+        Returns
+        -------
+        array (...) of bool
+            False where nothing was fitted.
+        """
         x, u = np.asarray(x), np.asarray(u)
         left_x = ((x < self.x_min) | (x > self.x_max)).any(axis=-1)
         left_u = ((u < self.u_min) | (u > self.u_max)).any(axis=-1)

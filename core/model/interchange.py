@@ -31,16 +31,22 @@ def to_control(model: Any, dt: float | None = None, recorded: bool = False) -> A
     Parameters
     ----------
     model : UncertainLTI
+        The model.
     dt : float, optional
         s; the discrete system of eq. (3), x_{k+1} = x_k + dt (A x_k + B u_k). Default: dx/dt = A x + B u. Its
         elements are those of one step of (3), so `control.c2d` of it is not (3) again.
     recorded : bool
         Deviations from the steady state in recorded units; default normalised.
 
+    Returns
+    -------
+    control.StateSpace
+        Continuous, or discrete with the step dt.
+
     Raises
     ------
     ModelError
-        dt is not a positive number.
+        dt is not a positive number, or a control is called `drift` beside a drift.
     """
     import control
 
@@ -84,12 +90,23 @@ def from_control(
         `UncertainLTI`.
     system : control.StateSpace
         Continuous, or discrete with a known step, by eq. (3). Its outputs must be its states.
-    dA, dB, dc, v : array, optional
+    dA : array (n, n), optional
         Half-widths as in `UncertainLTI`, normalised; 0 by default.
+    dB : array (n, m), optional
+        Likewise.
+    dc : array (n,), optional
+        Likewise.
+    v : array (n,), optional
+        Likewise.
     signals : SignalMap, optional
         Names, topics and operating point; default: the system's names, values used as they are.
     recorded : bool
         The system is in recorded units; signals give the scales.
+
+    Returns
+    -------
+    UncertainLTI
+        Without domain and fit.
 
     Raises
     ------
@@ -137,6 +154,13 @@ def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
     dt, dt_min, dt_max (s) are NaN where the model does not say them. `model_json` holds the whole model file, so that
     `UncertainLTI.load_mat` gives back everything.
 
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    path : path
+        The file.
+
     Raises
     ------
     ModelError
@@ -169,6 +193,18 @@ def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
 
     What else it holds of `save_mat` is taken too; matrices that were changed in MATLAB count, not those of
     `model_json`.
+
+    Parameters
+    ----------
+    model_class : type
+        `UncertainLTI`.
+    path : path
+        The file.
+
+    Returns
+    -------
+    UncertainLTI
+        The model.
 
     Raises
     ------

@@ -52,7 +52,20 @@ class Term:
         return (self.nominal, self.half) if self.nominal else (self.half,)
 
     def shape(self, n: int, m: int) -> tuple[int, ...]:
-        """Shape of its arrays for n states and m controls: (n, n), (n, m) or (n,)."""
+        """Shape of its arrays.
+
+        Parameters
+        ----------
+        n : int
+            Number of states.
+        m : int
+            Number of controls.
+
+        Returns
+        -------
+        tuple of int
+            (n, n), (n, m) or (n,).
+        """
         return {"x": (n, n), "u": (n, m), "1": (n,)}[self.regressor]
 
 
@@ -81,12 +94,14 @@ def regressors(x: Array, u: Array) -> Array:
     Parameters
     ----------
     x : array (n, ...)
+        Normalised states.
     u : array (m, ...)
+        Normalised controls.
 
     Returns
     -------
     array (n + m + 1, ...)
-        psi is its absolute value.
+        φ; ψ is its absolute value.
     """
     one = np.ones((1, *x.shape[1:]))
     return np.concatenate([{"x": x, "u": u, "1": one}[term.regressor] for term in _RATES])

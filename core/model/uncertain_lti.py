@@ -45,21 +45,32 @@ class UncertainLTI:
 
     Parameters
     ----------
-    A, dA : array (n, n)
-        Nominal elements and half-widths (>= 0), 1/s.
-    B, dB : array (n, m)
+    A : array (n, n)
+        Nominal elements, 1/s.
+    B : array (n, m)
         The same for the controls, 1/s.
-    c, dc : array (n,), optional
-        Drift and its half-width, 1/s; 0 by default.
+    dA : array (n, n)
+        Half-widths of A, all >= 0, 1/s.
+    dB : array (n, m)
+        Half-widths of B, all >= 0, 1/s.
+    c : array (n,), optional
+        Drift, 1/s; 0 by default.
+    dc : array (n,), optional
+        Half-width of the drift, 1/s; 0 by default.
     v : array (n,), optional
         Half-width of measurement noise, normalised; not multiplied by Δt; 0 by default.
     signals : SignalMap, optional
-        Names, topics, operating point; default names x1.., u1.. and values used as they are.
+        Names, topics, operating point; default names x1, x2, ..., u1, u2, ... and values used as they are.
     sampling : Sampling, optional
+        How samples were cut in the fit; default unknown.
     domain : Domain, optional
+        Ranges seen in the fit; default none.
     alarm_rule : AlarmRule, optional
-    fit_summary, validation : mapping, optional
-        How the model was obtained; plain data that goes to the file as it is.
+        Default `AlarmRule()`.
+    fit_summary : mapping, optional
+        How the model was fitted; plain data that goes to the file as it is.
+    validation : mapping, optional
+        How it was validated, likewise.
 
     Raises
     ------
@@ -189,7 +200,29 @@ class UncertainLTI:
     # --- one-step bounds ---
 
     def centre_and_half(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike) -> tuple[Array, Array]:
-        """Centre and half-width of the bounds, each (..., n); see `bounds`."""
+        """Centre and half-width of the bounds; see `bounds`.
+
+        Parameters
+        ----------
+        x : array (..., n)
+            Normalised state at t_k.
+        u : array (..., m)
+            Normalised control at t_k.
+        dt : float or array (...)
+            Δt_k, s.
+
+        Returns
+        -------
+        array (..., n)
+            Centre, normalised.
+        array (..., n)
+            Half-width, normalised.
+
+        Raises
+        ------
+        ModelError
+            Shapes do not fit.
+        """
         x = np.asarray(x, dtype=np.float64)
         u = np.asarray(u, dtype=np.float64)
         dt = np.asarray(dt, dtype=np.float64)
@@ -257,12 +290,16 @@ class UncertainLTI:
         Parameters
         ----------
         x0 : array (n,)
+            Normalised state at t_0.
         u : array (N, m)
+            Normalised controls.
         dt : float or array (N,)
+            Δt_k, s.
 
         Returns
         -------
         array (N+1, n)
+            Normalised states; infinite or NaN where an unstable model runs away.
         """
         u = np.asarray(u, dtype=np.float64)
         dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(u),))
@@ -292,6 +329,11 @@ class UncertainLTI:
             Eq. (4), over k = 1..N.
         largest : array (n,)
             Eq. (5) for each state.
+
+        Raises
+        ------
+        ModelError
+            W has another shape.
         """
         x = self.operating_point.normalise_x(transient.x)
         u = self.operating_point.normalise_u(transient.u)
@@ -319,19 +361,52 @@ class UncertainLTI:
         return total, largest
 
     def eigenvalues(self) -> NDArray[np.complex128]:
-        """Eigenvalues of A, 1/s, (n,), sorted by real part, greatest first."""
+        """Eigenvalues of A.
+
+        Returns
+        -------
+        array (n,) of complex
+            1/s, sorted by real part, greatest first.
+        """
         values = np.linalg.eigvals(self.A).astype(np.complex128)
         return values[np.lexsort((values.imag, -values.real))]
 
     def spectral_radius(self, dt: float | None = None) -> float:
-        """Largest |eigenvalue| of I + Δt A; above 1 the nominal recursion (3) runs away. dt: default dt_median."""
+        """Largest |eigenvalue| of I + Δt A; above 1 the nominal recursion (3) runs away.
+
+        Parameters
+        ----------
+        dt : float, optional
+            Δt, s; default the median step of the fit.
+
+        Returns
+        -------
+        float
+            The radius.
+
+        Raises
+        ------
+        ModelError
+            dt is left out and the model has no median step.
+        """
         dt = self.sampling.dt_median if dt is None else dt
         if dt is None:
             raise ModelError("spectral radius: the model has no dt_median; give dt")
         return float(np.abs(np.linalg.eigvals(np.eye(self.n) + dt * self.A)).max())
 
     def replace(self, **changes: Any) -> UncertainLTI:
-        """The same model with some constructor arguments replaced."""
+        """The same model with some constructor arguments replaced.
+
+        Parameters
+        ----------
+        **changes : object
+            Constructor arguments by name.
+
+        Returns
+        -------
+        UncertainLTI
+            A new model.
+        """
         arguments = {
             name: getattr(self, name)
             for name in (
@@ -343,28 +418,71 @@ class UncertainLTI:
     # --- other tools ---
 
     def to_control(self, dt: float | None = None, recorded: bool = False) -> Any:
-        """The nominal model as a `control.StateSpace`; see `interchange.to_control`."""
+        """The nominal model as a `control.StateSpace`; see `interchange.to_control`.
+
+        Parameters
+        ----------
+        dt : float, optional
+            As in `interchange.to_control`.
+        recorded : bool, default False
+            As in `interchange.to_control`.
+
+        Returns
+        -------
+        control.StateSpace
+            The nominal model.
+        """
         from uncertain_lti.model.interchange import to_control
 
         return to_control(self, dt, recorded)
 
     @staticmethod
     def from_control(system: Any, **options: Any) -> UncertainLTI:
-        """From a `control.StateSpace` and half-widths; see `interchange.from_control`."""
+        """From a `control.StateSpace` and half-widths; see `interchange.from_control`.
+
+        Parameters
+        ----------
+        system : control.StateSpace
+            As in `interchange.from_control`.
+        **options : object
+            Further arguments of `interchange.from_control`.
+
+        Returns
+        -------
+        UncertainLTI
+            The model.
+        """
         from uncertain_lti.model.interchange import from_control
 
         model: UncertainLTI = from_control(UncertainLTI, system, **options)
         return model
 
     def save_mat(self, path: str | os.PathLike[str]) -> None:
-        """Write a MATLAB file; see `interchange.save_mat`."""
+        """Write a MATLAB file; see `interchange.save_mat`.
+
+        Parameters
+        ----------
+        path : path
+            The file.
+        """
         from uncertain_lti.model.interchange import save_mat
 
         save_mat(self, path)
 
     @staticmethod
     def load_mat(path: str | os.PathLike[str]) -> UncertainLTI:
-        """Read a MATLAB file; see `interchange.load_mat`."""
+        """Read a MATLAB file; see `interchange.load_mat`.
+
+        Parameters
+        ----------
+        path : path
+            The file.
+
+        Returns
+        -------
+        UncertainLTI
+            The model.
+        """
         from uncertain_lti.model.interchange import load_mat
 
         model: UncertainLTI = load_mat(UncertainLTI, path)
@@ -373,7 +491,13 @@ class UncertainLTI:
     # --- the file ---
 
     def to_dict(self) -> dict[str, Any]:
-        """The structure of the model file, format "uncertain-lti/1"."""
+        """The structure of the model file, format "uncertain-lti/1".
+
+        Returns
+        -------
+        dict
+            Plain data for JSON; null for infinite ranges.
+        """
         states = [
             {key: getattr(s, key) for key in ("name", "topic", "type", "field", "unit", "steady", "scale")}
             for s in self.signals.states
@@ -418,6 +542,11 @@ class UncertainLTI:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model file; an existing file is replaced as a whole or not at all.
 
+        Parameters
+        ----------
+        path : path
+            The file.
+
         Raises
         ------
         ModelError
@@ -438,6 +567,16 @@ class UncertainLTI:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> UncertainLTI:
         """Read a model file.
+
+        Parameters
+        ----------
+        path : path
+            The file.
+
+        Returns
+        -------
+        UncertainLTI
+            The model.
 
         Raises
         ------
@@ -467,7 +606,25 @@ class UncertainLTI:
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "model") -> UncertainLTI:
-        """From the structure of a model file; raises ModelError naming source and field."""
+        """From the structure of a model file.
+
+        Parameters
+        ----------
+        data : object
+            As JSON gives it.
+        source : str, default "model"
+            What errors call it.
+
+        Returns
+        -------
+        UncertainLTI
+            The model.
+
+        Raises
+        ------
+        ModelError
+            It is not of that form; names source and field.
+        """
         try:
             return cls._from_dict(data, source)
         except RecursionError:

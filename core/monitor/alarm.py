@@ -16,6 +16,7 @@ class AlarmWindow:
     Parameters
     ----------
     rule : AlarmRule
+        m, n; its margin plays no part here.
 
     Attributes
     ----------
@@ -37,7 +38,18 @@ class AlarmWindow:
         self.alarm = False
 
     def push(self, violated: bool) -> bool:
-        """Take one verdict; returns the alarm after it."""
+        """Take one verdict.
+
+        Parameters
+        ----------
+        violated : bool
+            Whether it is a violation that counts.
+
+        Returns
+        -------
+        bool
+            The alarm after it.
+        """
         recent = self._recent
         if len(recent) == recent.maxlen:
             self._violations -= recent[0]
@@ -53,11 +65,14 @@ def raised(violated: NDArray[np.bool_], rule: AlarmRule) -> NDArray[np.bool_]:
     Parameters
     ----------
     violated : array of bool (K,)
+        Whether each verdict is a violation that counts.
     rule : AlarmRule
+        m and n.
 
     Returns
     -------
     array of bool (K,)
+        The alarm after each.
     """
     total = np.concatenate([[0], np.cumsum(violated)])
     ends = np.arange(1, len(total))

@@ -19,7 +19,19 @@ _WORDS = {"true": 1.0, "false": 0.0}
 
 @dataclass(frozen=True)
 class Condition:
-    """`TOPIC FIELD OPERATOR NUMBER`, for example `/engine/mode data == 3` or `/engine/state position[fan] > 0.2`."""
+    """`TOPIC FIELD OPERATOR NUMBER`, for example `/engine/mode data == 3` or `/engine/state position[fan] > 0.2`.
+
+    Parameters
+    ----------
+    topic : str
+        Topic of the field.
+    field : FieldPath
+        The field.
+    operator : str
+        One of == != < <= > >=.
+    value : float
+        What the field is compared with.
+    """
 
     topic: str
     field: FieldPath
@@ -28,7 +40,23 @@ class Condition:
 
     @classmethod
     def parse(cls, text: str) -> Condition | None:
-        """Read a condition; None where the text is empty. Raises ModelError for what is not one."""
+        """Read a condition.
+
+        Parameters
+        ----------
+        text : str
+            `TOPIC FIELD OPERATOR NUMBER`.
+
+        Returns
+        -------
+        Condition or None
+            None for an empty text.
+
+        Raises
+        ------
+        ModelError
+            The text is no condition.
+        """
         if not text.strip():
             return None
         match = _TEXT.fullmatch(text)
@@ -48,7 +76,18 @@ class Condition:
         return cls(match["topic"], path, match["operator"], value)
 
     def holds(self, value: float) -> bool | None:
-        """Whether it holds; None where the value is not a number."""
+        """Whether it holds; None where the value is not a number.
+
+        Parameters
+        ----------
+        value : float
+            Of the field.
+
+        Returns
+        -------
+        bool or None
+            None where the value is NaN.
+        """
         return _OPERATORS[self.operator](value, self.value) if value == value else None
 
     def __str__(self) -> str:
@@ -61,9 +100,10 @@ class Arming:
     Parameters
     ----------
     condition : Condition or None
+        None for alarms that always count.
     grace_ns : int
-        No alarm this long, in the samples' own time, after the first sample, after time jumped back, and after
-        the condition began to hold.
+        No alarm this long, ns, in the samples' own time, after the first sample, after time jumped back, and after the
+        condition began to hold.
     value : float or None
         What the condition's field said last, where that is known already.
 
@@ -87,7 +127,13 @@ class Arming:
         self._from: int | None = None  # the first instant that counts
 
     def learn(self, value: float) -> None:
-        """The condition's field has this value."""
+        """Take a value of the condition's field.
+
+        Parameters
+        ----------
+        value : float
+            NaN where it is no number.
+        """
         assert self.condition is not None
         self.value = value
         before, self.on = self.on, self.condition.holds(value)
@@ -95,7 +141,18 @@ class Arming:
             self._from = None
 
     def said_on(self, condition: Condition | None) -> float | None:
-        """What is known of the field that another condition asks for."""
+        """What is known of the field that another condition asks for.
+
+        Parameters
+        ----------
+        condition : Condition or None
+            The other condition.
+
+        Returns
+        -------
+        float or None
+            The value; None where it asks for another field, or nothing has come.
+        """
         same = condition and self.condition and (condition.topic, condition.field) == (
             self.condition.topic, self.condition.field
         )  # fmt: skip
@@ -106,7 +163,18 @@ class Arming:
         self._from = None
 
     def at(self, t_ns: int) -> bool:
-        """Whether a verdict at this instant counts."""
+        """Whether a verdict at this instant counts.
+
+        Parameters
+        ----------
+        t_ns : int
+            Instant of the sample, ns.
+
+        Returns
+        -------
+        bool
+            False within the grace time, and unless the condition holds.
+        """
         if not self.on:
             return False
         if self._from is None:
@@ -114,7 +182,13 @@ class Arming:
         return t_ns >= self._from
 
     def why_off(self) -> str:
-        """What keeps alarms off, in words; empty where they are on."""
+        """What keeps alarms off, in words; empty where they are on.
+
+        Returns
+        -------
+        str
+            A sentence, or an empty text.
+        """
         if self.on is None and self.value is not None and self.condition is not None:
             return f"alarms are off: {self.condition.topic} comes without a number in {self.condition.field.text}"
         if self.on is None:

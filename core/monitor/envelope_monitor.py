@@ -42,12 +42,20 @@ _OF_JUDGEMENT = {"lower": LOWER, "upper": UPPER, "utilisation": UTILISATION, "fl
 class Verdict:
     """What the monitor says of one clock message.
 
-    flags (n,): 0 contained, 1 violated, NaN no verdict. lower, upper, state (n,): the bounds that were judged and
-    the sample, in recorded units; NaN where there is none. utilisation (n,): (x_next - centre) / half with half
-    before the margin. outside_domain: z(t_k) lies outside the ranges seen in the fit. alarm: after this verdict.
+    Numbers of each state, n each, are computed when they are asked for, by `numbers`, by `packed`, or as a new array by
+    the attribute of that name: a live monitor makes one verdict per message, and often nobody asks for more than the
+    alarm. They are `flags` (0 contained, 1 violated, NaN no verdict), `lower`, `upper` and `state` (the bounds that
+    were judged and the sample, recorded units) and `utilisation` ((x_next - centre) / half, with half before the
+    margin); NaN where there is no verdict.
 
-    A live monitor makes one per message, and often nobody asks for more than the alarm: numbers are worked out where
-    they are asked for, by `numbers`, by `packed`, or as a new array by the attribute of that name.
+    Parameters
+    ----------
+    step : Step
+        The clock message.
+    alarm : bool
+        The alarm after this verdict.
+    judgement : Judgement or None
+        None where there is no verdict.
     """
 
     __slots__ = ("t_ns", "arrival_ns", "status", "outside_domain", "alarm", "_after", "_judgement")
@@ -82,7 +90,18 @@ class Verdict:
         return len(self._after)
 
     def numbers(self, name: str) -> list[float]:
-        """One of `NUMBERS`, n floats."""
+        """Numbers of one kind.
+
+        Parameters
+        ----------
+        name : str
+            One of `NUMBERS`.
+
+        Returns
+        -------
+        list of float (n,)
+            As the attribute of that name.
+        """
         if name == "state":
             return list(self._after)
         if self._judgement is None:
@@ -90,7 +109,18 @@ class Verdict:
         return list[float](self._judgement.numbers(_OF_JUDGEMENT[name]).tolist())
 
     def packed(self, name: str) -> bytes:
-        """The same as little-endian doubles."""
+        """The same as bytes.
+
+        Parameters
+        ----------
+        name : str
+            One of `NUMBERS`.
+
+        Returns
+        -------
+        bytes
+            Little-endian doubles.
+        """
         found = self._after
         if name != "state":
             if self._judgement is not None:
@@ -133,7 +163,24 @@ def _packer(n: int) -> Callable[..., bytes]:
 class Verdicts:
     """Verdicts over one transient, one row per sample k = 0..N; row k judges the arrival at t_k.
 
-    flags, lower, upper, utilisation (N+1, n) as in `Verdict`; judged, outside_domain, alarm (N+1,).
+    Parameters
+    ----------
+    transient : Transient
+        What was judged.
+    flags : array (N+1, n)
+        0 contained, 1 violated, NaN no verdict.
+    lower : array (N+1, n)
+        Lower bounds, recorded units; NaN without a verdict.
+    upper : array (N+1, n)
+        Upper bounds, likewise.
+    utilisation : array (N+1, n)
+        (x_next - centre) / half, with half before the margin.
+    judged : array (N+1,) of bool
+        Whether there is a verdict.
+    outside_domain : array (N+1,) of bool
+        z(t_{k-1}) lies outside the ranges seen in the fit.
+    alarm : array (N+1,) of bool
+        The alarm after each sample.
     """
 
     transient: Transient
@@ -189,9 +236,14 @@ class EnvelopeMonitor:
     Parameters
     ----------
     model : UncertainLTI
-    violations, window, margin : optional
-        In place of those in the model.
-    masked : sequence of str
+        Gives the bounds and the alarm rule.
+    violations : int, optional
+        In place of that of the model's rule.
+    window : int, optional
+        In place of that of the model's rule, in verdicts.
+    margin : float, optional
+        In place of that of the model's rule.
+    masked : sequence of str, optional
         States that are judged like the others, and whose violations never count for the alarm.
 
     Raises
@@ -252,17 +304,60 @@ class EnvelopeMonitor:
         self._window.reset()
 
     def predict(self, x: ArrayLike, u: ArrayLike, dt: float) -> tuple[Array, Array]:
-        """Bounds (lower, upper), each (n,), one step of dt s after x (n,), u (m,); all in recorded units."""
+        """Bounds one step ahead, recorded units.
+
+        Parameters
+        ----------
+        x : array (n,)
+            State, recorded units.
+        u : array (m,)
+            Control, recorded units.
+        dt : float
+            Step, s.
+
+        Returns
+        -------
+        array (n,)
+            Lower bound.
+        array (n,)
+            Upper bound.
+        """
         z = np.concatenate((np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)))
         verdict = self.expect(0, z.tolist(), dt)
         return verdict.lower, verdict.upper
 
     def expect(self, t_ns: int, z: Sequence[float], dt: float) -> Verdict:
-        """`predict` for the instant t_ns after z = [x; u]: lower and upper of a verdict that counts nowhere."""
+        """`predict` as a verdict that counts nowhere.
+
+        Parameters
+        ----------
+        t_ns : int
+            Instant for which the bounds are, ns.
+        z : sequence of float (n + m,)
+            [x; u] before it, recorded units.
+        dt : float
+            Step, s.
+
+        Returns
+        -------
+        Verdict
+            Its `lower` and `upper` are the bounds.
+        """
         return self.look(Step(Status.OK, t_ns, 0, dt, z, z[: self.model.n]))
 
     def look(self, step: Step) -> Verdict:
-        """Verdict on a complete step that counts nowhere."""
+        """Verdict on a complete step that counts nowhere.
+
+        Parameters
+        ----------
+        step : Step
+            With a complete transition.
+
+        Returns
+        -------
+        Verdict
+            With the alarm as it was.
+        """
         return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
     def judge(self, step: Step, armed: bool = True) -> Verdict:
@@ -271,8 +366,14 @@ class EnvelopeMonitor:
         Parameters
         ----------
         step : Step
-        armed : bool
+            Of the sampler.
+        armed : bool, default True
             Whether it may count for the alarm; otherwise there is none, and the window is empty afterwards.
+
+        Returns
+        -------
+        Verdict
+            With the alarm after it.
         """
         window = self._window
         if step.status is Status.RESET or not armed:
@@ -286,6 +387,16 @@ class EnvelopeMonitor:
 
     def check(self, transient: Transient) -> Verdicts:
         """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.
+
+        Parameters
+        ----------
+        transient : Transient
+            In recorded units.
+
+        Returns
+        -------
+        Verdicts
+            One row per sample.
 
         Raises
         ------

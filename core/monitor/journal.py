@@ -46,7 +46,7 @@ class Journal:
     Parameters
     ----------
     say : callable
-        Takes a level of `watch` (WARN for the alarm, OK for all else) and a line.
+        Takes a level of `session` (WARN for the alarm, OK for all else) and a line.
     """
 
     def __init__(self, say: Callable[[int, str], None]) -> None:
@@ -59,7 +59,15 @@ class Journal:
         self._cause = ("", 0.0)  # of no verdicts, and since when it is this one
 
     def begin(self, watch: Watch, now: float) -> None:
-        """A watch starts, with no sample."""
+        """A session starts, with no sample.
+
+        Parameters
+        ----------
+        watch : Watch
+            The session.
+        now : float
+            Steady time, s.
+        """
         self._alarm, self._unsaid = watch.alarm, 0
         self._counters, self._unreadable = Counter(watch.sampler.counters), Counter(watch.unreadable)
         self._ceased, self._judged = now, False
@@ -72,7 +80,19 @@ class Journal:
         return self._matters[name]
 
     def turned(self, watch: Watch, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
-        """The alarm may have turned; verdicts: those that did it; why: what else did."""
+        """Log the alarm if it has turned.
+
+        Parameters
+        ----------
+        watch : Watch
+            The session.
+        verdicts : iterable of Verdict
+            Those that may have turned it.
+        now : float
+            Steady time, s.
+        why : str, default ""
+            What else turned it, with the blank in front.
+        """
         if watch.alarm == self._alarm:
             return
         self._alarm = watch.alarm
@@ -96,10 +116,20 @@ class Journal:
     def look(
         self, watch: Watch, now: float, timeout: float, publishers: Mapping[str, int], problems: Sequence[str]
     ) -> None:
-        """Say what has changed since the last look.
+        """Log what has changed since the last look.
 
-        timeout: s without a verdict or a message after which that is said. publishers: how many each topic has.
-        problems: what keeps messages from coming, in words that stay the same while it lasts.
+        Parameters
+        ----------
+        watch : Watch
+            The session.
+        now : float
+            Steady time, s.
+        timeout : float
+            Time without a verdict or a message after which that is logged, s.
+        publishers : mapping of str to int
+            Topic -> number of publishers.
+        problems : sequence of str
+            What keeps messages from coming, in words that stay the same while it lasts.
         """
         self.turned(watch, (), now)
         if self._unsaid and self._matter("alarm").may(now):

@@ -34,10 +34,26 @@ MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
 
 @dataclass(frozen=True)
 class Rule:
-    """Alarm rule as the parameters give it; 0 stands for what the model says.
+    """Alarm rule as the parameters give it; 0 means what the model says.
 
-    masked: states that do not count, separated by commas; enable: see `Condition`, enable_type its topic's message
-    type, empty where the model or the graph tells; grace in s; latch: an alarm stands until it is reset.
+    Parameters
+    ----------
+    violations : int, default 0
+        m of the rule.
+    window : int, default 0
+        n of the rule, in verdicts.
+    margin : float, default 0.0
+        Multiplies the half-widths.
+    masked : str, default ""
+        States that do not count, separated by commas.
+    enable : str, default ""
+        See `Condition`; empty for none.
+    enable_type : str, default ""
+        Message type of its topic; empty where the model or the graph tells.
+    grace : float, default 0.0
+        Time of grace, s.
+    latch : bool, default False
+        Whether an alarm lasts until it is reset.
     """
 
     violations: int = 0
@@ -50,14 +66,42 @@ class Rule:
     latch: bool = False
 
     def monitor(self, model: UncertainLTI) -> EnvelopeMonitor:
-        """Monitor of this model under this rule; raises ModelError where the two do not fit."""
+        """Monitor of a model under this rule.
+
+        Parameters
+        ----------
+        model : UncertainLTI
+            The model.
+
+        Returns
+        -------
+        EnvelopeMonitor
+            With a cleared alarm.
+
+        Raises
+        ------
+        ModelError
+            The two do not fit.
+        """
         masked = [name.strip() for name in self.masked.split(",") if name.strip()]
         return EnvelopeMonitor(model, self.violations or None, self.window or None, self.margin or None, masked)
 
 
 @dataclass(frozen=True)
 class Report:
-    """One diagnostic status; values are texts, numbers among them as `repr` writes them."""
+    """One diagnostic status.
+
+    Parameters
+    ----------
+    level : int
+        OK, WARN, ERROR or STALE.
+    name : str
+        `monitor`, or the state.
+    message : str
+        A sentence.
+    values : mapping of str to str
+        Texts by name, numbers among them as `repr` writes them.
+    """
 
     level: int
     name: str
@@ -82,7 +126,21 @@ class _Period:
 
 
 def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> dict[str, str]:
-    """Message type of each topic that a model reads, with every field path held against it.
+    """Message type of each topic that a model reads, with every field path checked.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Fitted to a recording.
+    source : str
+        What errors call the model.
+    type_fields : callable
+        Type name -> {field name: FieldType}.
+
+    Returns
+    -------
+    dict of str to str
+        Topic -> type.
 
     Raises
     ------
@@ -121,11 +179,15 @@ class Watch:
     Parameters
     ----------
     model : UncertainLTI
+        Fitted to a recording.
     rule : Rule
-    types : mapping
+        The alarm rule.
+    types : mapping of str to str
         From `topic_types`.
-    type_fields : TypeFields
-    make_reader : MakeReader
+    type_fields : callable
+        Type name -> {field name: FieldType}.
+    make_reader : callable
+        Type name and paths -> `MessageReader`.
     now : float
         A steady time in s, as everywhere below.
     arming : Arming, optional
@@ -171,7 +233,13 @@ class Watch:
         self.restart(now)
 
     def restart(self, now: float) -> None:
-        """Forget every message, verdict and count; what the enable condition last said stands."""
+        """Forget every message, verdict and count; what the enable condition last said stands.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+        """
         self._anew()
         self.unreadable: Counter[str] = Counter()
         self.why_unreadable: dict[str, str] = {}
@@ -190,8 +258,15 @@ class Watch:
         self.arming.restart()
 
     def follow(self, rule: Rule) -> None:
-        """Judge by another alarm rule from now on; the alarm starts anew, and one that stands is latched where that
-        rule says so. The rule that there is changes nothing.
+        """Judge by another alarm rule from now on.
+
+        The alarm starts cleared, and one that is raised is latched where the rule says so. A rule equal to the one in
+        force changes nothing.
+
+        Parameters
+        ----------
+        rule : Rule
+            The alarm rule.
 
         Raises
         ------
@@ -216,6 +291,11 @@ class Watch:
         """Keep what the watch before knows: what is in force on topics that both read alike, and a latched alarm.
 
         States start anew; controls would not come again where they are sent on a change only.
+
+        Parameters
+        ----------
+        other : Watch
+            The session before.
         """
         mine, theirs = self.model.signals, other.model.signals
         for topic in self.types:
@@ -235,7 +315,20 @@ class Watch:
         self.latched = self.rule.latch and other.alarm
 
     def check(self, rule: Rule) -> None:
-        """Raise what `follow` would raise."""
+        """Raise what `follow` would raise.
+
+        Parameters
+        ----------
+        rule : Rule
+            The alarm rule.
+
+        Raises
+        ------
+        ModelError
+            As `follow`.
+        SignalError
+            As `follow`.
+        """
         self._prepared(rule)
 
     def _prepared(self, rule: Rule) -> tuple[EnvelopeMonitor, Condition | None, str, MessageReader | None]:
@@ -259,7 +352,20 @@ class Watch:
         return self._make_reader(type_name, [condition.field])
 
     def found_enable_type(self, type_name: str) -> None:
-        """The graph tells the type of the condition's topic; raises SignalError where its field is not in it."""
+        """Take the type of the condition's topic from the graph.
+
+        Parameters
+        ----------
+        type_name : str
+            As package/msg/Name.
+
+        Raises
+        ------
+        SignalError
+            The condition's field is not in it.
+        ModelError
+            The model has another type for the topic.
+        """
         assert self.arming.condition is not None
         self._reads_condition = self._condition_reader(self.arming.condition, type_name)
         self.enable_type = type_name
@@ -295,7 +401,26 @@ class Watch:
         self.failures += 1
 
     def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[Sequence[Verdict], bool]:
-        """Take one serialised message; return the clock messages it decided, and whether it opened a sample."""
+        """Take one serialised message.
+
+        Parameters
+        ----------
+        topic : str
+            Its topic.
+        arrival_ns : int
+            Its arrival, ns.
+        data : bytes
+            The message.
+        now : float
+            Steady time, s.
+
+        Returns
+        -------
+        sequence of Verdict
+            Verdicts on the clock messages that it decided.
+        bool
+            Whether it opened a sample.
+        """
         self.received[topic] += 1
         self._heard[topic] = now
         if topic == self.enable_topic and self._reads_condition is not None:
@@ -366,6 +491,11 @@ class Watch:
         """Bounds for one median step after the open sample, as `EnvelopeMonitor.expect` gives them.
 
         None where a signal is missing, or the model does not know its median step.
+
+        Returns
+        -------
+        Verdict or None
+            Its `lower` and `upper` are the bounds; None where there are none.
         """
         dt, latest = self.model.sampling.dt_median, self.sampler.latest()
         if dt is None or latest is None:
@@ -379,23 +509,78 @@ class Watch:
         return sum(count for name, count in self.sampler.counters.items() if name.startswith("late /"))
 
     def heard(self, topic: str) -> float | None:
-        """When the last message of a topic came; None where none has."""
+        """When the last message of a topic came.
+
+        Parameters
+        ----------
+        topic : str
+            The topic.
+
+        Returns
+        -------
+        float or None
+            Steady time, s; None where none has come.
+        """
         return self._heard.get(topic)
 
     def held(self, topic: str) -> float:
-        """Seconds that what a topic said last may be used for; infinite where the model sets no limit."""
+        """How long the last values of a topic may be used.
+
+        Parameters
+        ----------
+        topic : str
+            The topic.
+
+        Returns
+        -------
+        float
+            Seconds; infinite where the model sets no limit.
+        """
         return self._held.get(topic, math.inf)  # infinite for that of the enable condition
 
     def without_verdict(self, now: float) -> float:
-        """Seconds since the last verdict, or since the start."""
+        """Time since the last verdict, or since the start.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+
+        Returns
+        -------
+        float
+            Seconds.
+        """
         return now - max(self._judged, self._began)
 
     def silent_for(self, now: float) -> float:
-        """Seconds since the last message of the clock topic."""
+        """Time since the last message of the clock topic.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+
+        Returns
+        -------
+        float
+            Seconds.
+        """
         return now - self._heard.get(self.sampler.clock, self._began)
 
     def pass_over(self, now: float) -> _Period:
-        """The next report is of what happens from now on; returns what has happened until now."""
+        """Begin another period for `report`.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+
+        Returns
+        -------
+        _Period
+            The period that ends.
+        """
         period, self._period = self._period, _Period(now)
         self._period.alarm = self.alarm
         self._period.late = self.late
@@ -407,8 +592,20 @@ class Watch:
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
         """Statuses of the monitor and of each state since the last call.
 
-        A state without a verdict for state_timeout s is STALE, never contained. problems are what the outside has
-        to say (publishers that cannot be heard, lost messages); they make the monitor's status at least WARN.
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+        state_timeout : float
+            Time without a verdict, s, after which a state is STALE, never contained.
+        problems : sequence of str, optional
+            What the outside reports (publishers that cannot be heard, lost messages); they make the monitor's status at
+            least WARN.
+
+        Returns
+        -------
+        list of Report
+            That of the monitor first.
         """
         period = self.pass_over(now)
         without = self.without_verdict(now)
@@ -468,18 +665,41 @@ class Watch:
         return Report(level, "monitor", message, self.counts(now))
 
     def lacking(self, before: Counter[str]) -> list[str]:
-        """Signals that samples had no value of since the sampler's counters were these."""
+        """Signals that samples had no value of since some counters.
+
+        Parameters
+        ----------
+        before : Counter
+            Counters of the sampler then.
+
+        Returns
+        -------
+        list of str
+            Names.
+        """
         since = self.sampler.counters - before
         names = [signal.name for signal in self.model.signals.signals]
         return [name for name in names if since[f"missing {name}"] or since[f"stale {name}"]]
 
     def rule_text(self) -> str:
-        """The alarm rule in words."""
+        """The alarm rule in words.
+
+        Returns
+        -------
+        str
+            `at least 2 of 5 verdicts violated`, for example.
+        """
         rule = self.monitor.rule
         return f"at least {rule.violations} of {rule.window} verdicts violated"
 
     def whole_rule_text(self) -> str:
-        """The same with everything that it depends on."""
+        """The alarm rule in words, with everything that it depends on.
+
+        Returns
+        -------
+        str
+            One line.
+        """
         rule = self.rule
         parts = [f"alarm when {self.rule_text()}", f"margin {self.monitor.rule.margin:g}"]
         parts += [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
@@ -514,7 +734,18 @@ class Watch:
         return Report(level, name, f"{message} (masked)" if masked else message, values)
 
     def counts(self, now: float) -> dict[str, str]:
-        """Counters by name: what was received, judged, dropped, late and missing, and how old each topic is."""
+        """Counters by name: what was received, judged, dropped, late and missing, and how old each topic is.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+
+        Returns
+        -------
+        dict of str to str
+            Name -> number as text; ages in s.
+        """
         counters = self.sampler.counters
         rule = self.monitor.rule
         counts = {

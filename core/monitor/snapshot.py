@@ -42,12 +42,39 @@ class Told(Protocol):
         """The sample before lies outside the ranges seen in the fit."""
 
     def packed(self, name: str) -> bytes:
-        """One of `NUMBERS` as little-endian doubles."""
+        """Numbers of one kind.
+
+        Parameters
+        ----------
+        name : str
+            One of `NUMBERS`.
+
+        Returns
+        -------
+        bytes
+            Little-endian doubles.
+        """
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One message as it came, the clock messages it decided, and the alarm after it."""
+    """One message as it came, and what it led to.
+
+    Parameters
+    ----------
+    now : float
+        Steady time, s.
+    arrival_ns : int
+        Arrival, ns.
+    topic : str
+        Its topic.
+    data : bytes
+        Serialised message.
+    verdicts : sequence of Told
+        On the clock messages that it decided.
+    alarm : bool
+        The alarm after it.
+    """
 
     now: float
     arrival_ns: int
@@ -58,9 +85,16 @@ class Entry:
 
 
 class Recent:
-    """The messages of the last `seconds` s that fit into `limit` bytes; the oldest go first.
+    """The messages of the last seconds that fit into some bytes; the oldest go first.
 
-    Of each topic the last message before these is kept beside them: it is what was in force when they begin.
+    Of each topic the last message before these is kept as well: it is what was in force when they begin.
+
+    Parameters
+    ----------
+    seconds : float
+        How long a message is kept, s.
+    limit : int
+        Bytes at most.
     """
 
     def __init__(self, seconds: float, limit: int) -> None:
@@ -70,7 +104,13 @@ class Recent:
         self._bytes = 0
 
     def add(self, entry: Entry) -> None:
-        """Keep one more."""
+        """Keep one more.
+
+        Parameters
+        ----------
+        entry : Entry
+            The latest.
+        """
         entries = self._entries
         entries.append(entry)
         self._bytes += len(entry.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in entry.verdicts)
@@ -81,7 +121,13 @@ class Recent:
             self._bytes -= len(gone.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in gone.verdicts)
 
     def entries(self) -> list[Entry]:
-        """All, in order of arrival."""
+        """All, in order of arrival.
+
+        Returns
+        -------
+        list of Entry
+            In order of arrival.
+        """
         return [*sorted(self._before.values(), key=lambda entry: entry.now), *self._entries]
 
     def clear(self) -> None:
@@ -93,9 +139,22 @@ class Recent:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a file holds: entries, the names of the states, and the topics with their types.
+    """What a snapshot file holds.
 
-    definition tells the text of a message type, as a file carries it.
+    Parameters
+    ----------
+    entries : sequence of Entry
+        Messages in order of arrival.
+    names : sequence of str
+        Of the states.
+    inputs : mapping of str to str
+        Topic -> type of what came in.
+    outputs : mapping of str to str
+        Name of an output (flags, violation, lower, ...) -> its topic.
+    notes : mapping of str to str
+        Pairs for a metadata record.
+    definition : callable
+        Type name -> text of its definition.
     """
 
     entries: Sequence[Entry]
@@ -106,7 +165,23 @@ class Scene:
     definition: Callable[[str], str]
 
     def write(self, path: Path) -> int:
-        """Write an MCAP file; returns the number of messages. Raises OSError."""
+        """Write an MCAP file.
+
+        Parameters
+        ----------
+        path : Path
+            A file that does not exist.
+
+        Returns
+        -------
+        int
+            Messages written.
+
+        Raises
+        ------
+        OSError
+            The file cannot be written.
+        """
         count = 0
         plain, marked = NamedVector(self.names), NamedVector(self.names, velocities=True)
         with open(path, "xb") as stream:
@@ -150,6 +225,7 @@ class Album:
     folder : str
         Made where it is not there. Only files in it that bear this node's name and a time are ever removed.
     node_name : str
+        Begins the name of every file.
     keep : int
         Most files of this node; the oldest go first.
     limit : int
@@ -158,6 +234,7 @@ class Album:
     Attributes
     ----------
     written : int
+        Files written so far.
     last, problem : str
         Path of the last file, and why the last attempt failed; empty where there was none, or it did not.
 
@@ -192,7 +269,19 @@ class Album:
         return self._thread is not None and self._thread.is_alive()
 
     def take(self, scene: Scene, patience: float) -> str:
-        """Begin to write a file and wait this long, s; returns what became of it.
+        """Begin to write a file.
+
+        Parameters
+        ----------
+        scene : Scene
+            What it holds.
+        patience : float
+            How long to wait for it, s.
+
+        Returns
+        -------
+        str
+            What became of it, a sentence.
 
         Raises
         ------

@@ -38,6 +38,7 @@ class NamedVector:
     Parameters
     ----------
     names : sequence of str
+        Of the states.
     velocities : bool
         Whether `velocity` holds as many numbers as `position`, or none.
 
@@ -98,7 +99,7 @@ class VerdictRecords:
     ----------
     names : sequence of str
         Of the states.
-    channels : mapping
+    channels : mapping of str to int
         Number of the channel of each of `TOPICS`.
     """
 
@@ -132,9 +133,31 @@ class VerdictRecords:
         flags: Array,
         vectors: Mapping[str, Array],
     ) -> tuple[bytes, dict[int, bytes]]:
-        """Records, and the index that `McapWriter.chunk` takes, of K verdicts in rising log time.
+        """Records of K verdicts in rising log time.
 
-        log_time, t_ns (K,) ns; judged, outside_domain, alarm (K,); flags and each of `JUDGED` in vectors (K, n).
+        Parameters
+        ----------
+        log_time : array (K,) of int
+            ns.
+        t_ns : array (K,) of int
+            Instants of the samples, ns.
+        judged : array (K,) of bool
+            Whether there is a verdict.
+        outside_domain : array (K,) of bool
+            As in `Verdicts`.
+        alarm : array (K,) of bool
+            As in `Verdicts`.
+        flags : array (K, n)
+            As in `Verdicts`.
+        vectors : mapping of str to array (K, n)
+            The numbers of each of `JUDGED`.
+
+        Returns
+        -------
+        bytes
+            The records.
+        dict of int to bytes
+            The index that `McapWriter.chunk` takes.
         """
         count = len(log_time)
         rows = np.tile(self._row, (count, 1))

@@ -57,7 +57,15 @@ class _UnfitError(Exception):
 
 
 class Failure(NamedTuple):
-    """A message that cannot be decoded: which one of those given, and why."""
+    """A message that cannot be decoded.
+
+    Parameters
+    ----------
+    row : int
+        Which one of those given.
+    why : str
+        The reason.
+    """
 
     row: int
     why: str
@@ -371,14 +379,35 @@ def _merge_into(table: dict[_Key, _Wanted], other: Mapping[_Key, _Wanted]) -> No
 
 
 class Messages(NamedTuple):
-    """Encoded messages data[begin:end], (messages,) each; SLACK bytes around each can be read as well."""
+    """Encoded messages data[begin:end]; SLACK bytes around each can be read as well.
+
+    Parameters
+    ----------
+    data : bytearray
+        A buffer with all of them.
+    begin : array (messages,) of int
+        Where each begins.
+    end : array (messages,) of int
+        Where each ends.
+    """
 
     data: bytearray
     begin: Integers
     end: Integers
 
     def take(self, which: Mask | Integers | slice) -> Messages:
-        """Some of them."""
+        """Some of the messages.
+
+        Parameters
+        ----------
+        which : array of bool or int, or slice
+            Which.
+
+        Returns
+        -------
+        Messages
+            On the same buffer.
+        """
         return Messages(self.data, self.begin[which], self.end[which])
 
 
@@ -527,7 +556,20 @@ class _Some:
 
 
 def numbers_at(data: bytearray, kind: str) -> NDArray[Any]:
-    """Numbers of this kind that begin at every byte of a buffer."""
+    """Numbers of this kind that begin at every byte of a buffer.
+
+    Parameters
+    ----------
+    data : bytearray
+        The buffer.
+    kind : str
+        Type code of numpy with its byte order, `<f8` for example.
+
+    Returns
+    -------
+    array (bytes - size + 1,)
+        A view.
+    """
     size = np.dtype(kind).itemsize
     numbers: NDArray[Any] = np.ndarray((len(data) - size + 1,), kind, data, strides=(1,))
     return numbers
@@ -616,7 +658,15 @@ def _moves(numbers: Sequence[_Number]) -> list[_Move]:
 
 
 class FieldReader:
-    """Reads the paths of one topic from its messages; learns their layouts as it meets them."""
+    """Reads the paths of one topic from its messages; learns their layouts as it meets them.
+
+    Parameters
+    ----------
+    definition : Definition
+        Of the messages.
+    paths : sequence of FieldPath
+        To read; checked against the type.
+    """
 
     def __init__(self, definition: Definition, paths: Sequence[FieldPath]) -> None:
         self.definition, self.paths = definition, paths
@@ -630,14 +680,21 @@ class FieldReader:
             pass
 
     def read(self, messages: Messages, values: Values, stamps: Integers) -> list[Failure]:
-        """Fill in a row of values and a stamp for each message; returns those that cannot be decoded.
+        """Fill in a row of values and a stamp for each message.
 
         Parameters
         ----------
         messages : Messages
+            To read.
         values : array (messages, paths)
-        stamps : array (messages,)
-            ns, NO_STAMP for none.
+            Takes the values.
+        stamps : array (messages,) of int
+            Takes the header stamps, ns; NO_STAMP for none.
+
+        Returns
+        -------
+        list of Failure
+            The messages that cannot be decoded.
 
         Raises
         ------

@@ -49,9 +49,11 @@ class MessageReader:
     Parameters
     ----------
     type_name : str
+        As package/msg/Name.
     paths : sequence of FieldPath
         Checked against the type.
-    type_fields : TypeFields
+    type_fields : callable
+        Type name -> {field name: FieldType}.
     decode : callable
         Serialised message -> message; may raise anything where that is not one.
 
@@ -72,7 +74,19 @@ class MessageReader:
         self._budget = _BUDGET
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]]:
-        """Header stamp in ns (None without a header, or where it is zero) and one value per path.
+        """Header stamp and one value per path.
+
+        Parameters
+        ----------
+        data : bytes
+            Serialised message.
+
+        Returns
+        -------
+        int or None
+            Stamp, ns; None without a header, or where it is zero.
+        sequence of float
+            Values.
 
         Raises
         ------

@@ -18,12 +18,12 @@ def to_ns(seconds: float) -> int:
     Parameters
     ----------
     seconds : float
-        Any, not finite included.
+        A duration, s; infinite or NaN for one without end.
 
     Returns
     -------
     int
-        `LONGEST_NS` at most.
+        Nanoseconds.
     """
     return min(round(seconds * 1e9), LONGEST_NS) if math.isfinite(seconds) else LONGEST_NS
 
@@ -36,15 +36,15 @@ def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) 
 
     Parameters
     ----------
-    instants : sequence of int array (messages,)
+    instants : sequence of array (messages,) of int
         Of each recording, ns.
-    min_step_ns : int
-        ns.
+    min_step_ns : int, default 0
+        Shortest step that counts, ns.
 
     Returns
     -------
     int or None
-        ns; None if there is no step.
+        Nanoseconds, or None.
     """
     pooled = np.concatenate([np.empty(0, np.int64), *(_forward_steps(i, min_step_ns) for i in instants)])
     return int(np.median(pooled)) if pooled.size else None

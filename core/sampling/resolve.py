@@ -25,7 +25,7 @@ def resolve(
     Parameters
     ----------
     signals : SignalMap
-        What it states is kept.
+        The map as the file says it.
     instants : mapping
         Per topic the instants of its messages in each recording, (messages,) ns, by that topic's time source.
     time : mapping
@@ -34,7 +34,7 @@ def resolve(
     Returns
     -------
     SignalMap
-        The same with clock, max_gap and every time source.
+        The map without anything open but steady states and scales.
 
     Raises
     ------

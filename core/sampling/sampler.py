@@ -34,11 +34,25 @@ KEPT_OVER_A_JUMP = 100
 
 
 class Step:
-    """One decided clock message: the sample k+1 at t_ns and the transition that ends in it.
+    """One decided clock message: the sample k+1 and the transition that ends in it.
 
-    before (n + m) holds x and u of sample k, after (n) holds x of sample k+1, all in recorded units, with NaN for
-    what is missing; x (n,), u (m,) and x_next (n,) are the same as arrays. dt is Δt_k in s. Without a sample k
-    (first, reset) x and u are all NaN and dt is NaN; for a dropped message x_next is NaN as well.
+    All values are in recorded units, with NaN for what is missing. Without a sample k (first, reset) x and u are all
+    NaN and dt is NaN; for a dropped message x_next is NaN as well.
+
+    Parameters
+    ----------
+    status : Status
+        What became of the message.
+    t_ns : int
+        Instant t_{k+1}, ns.
+    arrival_ns : int
+        Arrival of the message, ns.
+    dt : float
+        Δt_k, s.
+    before : sequence of float (n + m,)
+        x and u of sample k.
+    after : sequence of float (n,)
+        x of sample k+1.
     """
 
     __slots__ = ("status", "t_ns", "arrival_ns", "dt", "before", "after")
@@ -268,8 +282,8 @@ class Sampler:
     Parameters
     ----------
     signals : SignalMap
-        With clock, max_gap and a time source for every topic resolved (`bag.read_transients` and the model
-        file do that).
+        With clock, max_gap and a time source for every topic resolved (`reading.read_transients` and the model file do
+        that).
 
     Attributes
     ----------
@@ -328,7 +342,7 @@ class Sampler:
         self._history = {}
 
     def push(self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]) -> list[Step]:
-        """Take one message; return the clock messages that it decided (none, one, or seldom two).
+        """Take one message.
 
         Parameters
         ----------
@@ -340,6 +354,16 @@ class Sampler:
             Header stamp; None, zero or less where there is none. Ignored for topics that go by log time.
         values : sequence of float
             The topic's signals in the order of `signals.on(topic)`.
+
+        Returns
+        -------
+        list of Step
+            The clock messages that it decided: none, one, or seldom two.
+
+        Raises
+        ------
+        ValueError
+            The number of values is not that of the topic's signals.
         """
         state: _Topic = self._topics[topic]
         stamp: cython.longlong = stamp_ns if state.header and stamp_ns is not None and stamp_ns > 0 else 0
@@ -472,7 +496,18 @@ class Sampler:
             z[i] = value
 
     def kept(self, topic: str) -> list[tuple[int, int, list[float]]]:
-        """Stamp (0 for none), arrival and values of the messages of a topic that may still be chosen, oldest first."""
+        """Messages of a topic that may still be chosen, oldest first.
+
+        Parameters
+        ----------
+        topic : str
+            One of `signals.topics`.
+
+        Returns
+        -------
+        list of (int, int, list of float)
+            Stamp (0 for none) and arrival, ns, and values.
+        """
         state: _Topic = self._topics[topic]
         message: _Message
         found = []
@@ -481,14 +516,31 @@ class Sampler:
         return found
 
     def latest(self) -> tuple[int, list[float]] | None:
-        """(t_ns, [x; u] (n + m)) of the open sample with what is known so far; None before the first sample."""
+        """The open sample with what is known so far.
+
+        Returns
+        -------
+        (int, list of float) or None
+            Its instant, ns, and [x; u] (n + m); None before the first sample.
+        """
         if self._open is None:
             return None
         return _instant(self._open), self._fix(self._open, False, False)
 
 
 def all_finite(values: Sequence[float]) -> bool:
-    """Whether all are finite."""
+    """Whether all are finite.
+
+    Parameters
+    ----------
+    values : sequence of float
+        Any numbers.
+
+    Returns
+    -------
+    bool
+        True without a number.
+    """
     return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum of finite numbers may overflow
 
 

@@ -33,9 +33,18 @@ _FAR = 2**62  # ns, longer than any recording
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of one recording: t_ns (N,), x (N, n), u (N, m) with NaN for what is missing; counters of the Sampler.
+    """Samples of one recording.
 
-    u[k] acts from t[k] on; it is NaN where nothing follows that it leads to.
+    Parameters
+    ----------
+    t_ns : array (N,) of int
+        Instants, ns.
+    x : array (N, n)
+        States; NaN for what is missing.
+    u : array (N, m)
+        Controls; u[k] acts from t[k] on, and is NaN where nothing follows that it leads to.
+    counters : Counter
+        Those of the `Sampler`.
     """
 
     t_ns: Integers
@@ -48,8 +57,14 @@ class Samples:
 class Decisions:
     """What became of each clock message of a recording, in the order in which it was decided.
 
-    arrival (M,) ns is that of the message that decided it, t_ns (M,) its own instant; dropped (M,) says that it made
-    no sample. The others are the samples of `sample_arrays`, one after the other.
+    Parameters
+    ----------
+    arrival : array (M,) of int
+        Arrival of the message that decided it, ns.
+    t_ns : array (M,) of int
+        Its own instant, ns.
+    dropped : array (M,) of bool
+        It made no sample. The others are the samples of `sample_arrays`, one after the other.
     """
 
     arrival: Integers
@@ -70,11 +85,19 @@ def sample_arrays(
     ----------
     signals : SignalMap
         Resolved as the Sampler wants it.
-    topic, arrival, stamp : arrays (messages,)
-        Of each message in order of arrival: position in `signals.topics`, log time and header stamp in ns, the
-        latter zero or less where there is none.
-    values : sequence of arrays
-        Per topic (messages, signals on it).
+    topic : array (messages,) of int
+        Position in `signals.topics` of each message, in order of arrival.
+    arrival : array (messages,) of int
+        Log time, ns.
+    stamp : array (messages,) of int
+        Header stamp, ns; zero or less where there is none.
+    values : sequence of array (messages of the topic, signals on it)
+        One array per topic.
+
+    Returns
+    -------
+    Samples or None
+        None where the messages have to be pushed one by one.
     """
     if (arrival[1:] < arrival[:-1]).any():
         return None
@@ -87,10 +110,28 @@ def sample_arrays(
 def decided(
     signals: SignalMap, topic: Integers, arrival: Integers, stamp: Integers, values: Sequence[Values]
 ) -> Decisions:
-    """When the `Sampler` decides each clock message; arguments as for `sample_arrays`, in any order of time.
+    """When the `Sampler` decides each clock message.
 
     A sample is decided by its own message, or, where states span several topics, by the next one that opens a sample;
     without a next one it is not decided. A message that is dropped is decided at once.
+
+    Parameters
+    ----------
+    signals : SignalMap
+        As for `sample_arrays`.
+    topic : array (messages,) of int
+        As for `sample_arrays`, in any order of time.
+    arrival : array (messages,) of int
+        As for `sample_arrays`.
+    stamp : array (messages,) of int
+        As for `sample_arrays`.
+    values : sequence of array (messages of the topic, signals on it)
+        As for `sample_arrays`.
+
+    Returns
+    -------
+    Decisions
+        In the order in which they were decided.
     """
     sampling = _Sampling(signals, topic, arrival, stamp, values)
     clock = sampling.topics[signals.clock or ""]
