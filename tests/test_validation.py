@@ -413,11 +413,11 @@ def test_detection_of_a_stated_fault_is_that_of_a_monitor(validation, runs):
 @pytest.mark.slow
 @pytest.mark.parametrize("study", list(validity.STUDIES))
 def test_intervals_contain_the_truth_as_often_as_they_say(study):
-    """The first 40 plants of `benchmarks/validity.py`: as few would fail by chance once in a hundred."""
-    held = validity.STUDIES[study](range(40))
+    """The first plants of `benchmarks/validity.py`: as few would fail by chance once in a hundred."""
+    held = validity.STUDIES[study](range(validity.SLOW.get(study, 40)))
     assert min(len(hits) for hits in held.values()) >= 10
     vain = {what: hits for what, hits in held.items() if what.startswith(validity.IN_VAIN)}
-    for what in held.keys() - vain.keys():
+    for what in [w for w in held if not w.startswith((validity.IN_VAIN, validity.NEITHER))]:
         hits = held[what]
         least = stats.binom.ppf(0.01, len(hits), validity.CONFIDENCE)
         assert sum(hits) >= least, f"{what}: the 90 % interval holds in {sum(hits)} of {len(hits)} only"
