@@ -16,7 +16,8 @@ from uncertain_lti.recordings.bag_arrays import in_reach, read_columns
 from uncertain_lti.recordings.bag_files import parts_of
 from uncertain_lti.recordings.bag_seams import not_one_recording
 from uncertain_lti.recordings.mcap_index import outline_or_scan
-from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages, read_block, scan
+from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages, read_block
+from uncertain_lti.recordings.mcap_scan import scan
 from uncertain_lti.recordings.message_types import define, lines_of, normal_name, undefined
 from uncertain_lti.recordings.raw_messages import RawMessage, RecordedChannel
 from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo

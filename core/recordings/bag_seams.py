@@ -6,7 +6,8 @@ import itertools
 from collections.abc import Sequence
 
 from uncertain_lti.recordings.bag_files import stem_and_index
-from uncertain_lti.recordings.mcap_records import Contents, messages, read_block, scan
+from uncertain_lti.recordings.mcap_records import Contents, messages, read_block
+from uncertain_lti.recordings.mcap_scan import scan
 from uncertain_lti.recordings.message_types import normal_name
 
 

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.cdr_arrays import SLACK, numbers_at
-from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, most_records, parse, walk
+from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, parse, walk
+from uncertain_lti.recordings.mcap_scan import most_records
 from uncertain_lti.recordings.unreadable import os_error
 
 _BATCH = 1 << 22  # bytes; small blocks are put together until they reach this

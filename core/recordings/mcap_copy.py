@@ -1,7 +1,7 @@
 """Copies of MCAP files, record by record: messages, definitions, attachments and metadata as they stand.
 
 Chunks go over as they are, compressed bytes included, as long as their numbers of schemas and channels are free in
-the copy. What `mcap_records.scan` could not read of a damaged file is not in the copy; messages outside chunks are put
+the copy. What `mcap_scan.scan` could not read of a damaged file is not in the copy; messages outside chunks are put
 into chunks, because readers that use the index see no others.
 """
 

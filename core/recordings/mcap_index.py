@@ -2,7 +2,7 @@
 
 What is read by it afterwards is compared with it (`mcap_batches`): the head of every chunk, its checksum, the
 number of messages of every channel. Where anything is not as stated, the file is walked instead
-(`mcap_records.scan`), so a damaged file reads the same either way. Damage to what is not read stays unseen.
+(`mcap_scan.scan`), so a damaged file reads the same either way. Damage to what is not read stays unseen.
 """
 
 from __future__ import annotations
@@ -27,12 +27,10 @@ from uncertain_lti.recordings.mcap_records import (
     Contents,
     Tally,
     crc32,
-    most_inflated,
-    most_records,
     parse,
-    scan,
     walk,
 )
+from uncertain_lti.recordings.mcap_scan import most_inflated, most_records, scan
 from uncertain_lti.recordings.unreadable import os_error
 
 _DATA_END_SIZE = RECORD.size + 4

@@ -1,98 +1,39 @@
-"""MCAP container: a file as blocks of raw messages, whatever is missing from it or damaged.
-
-A file is walked once from its beginning (`scan`), without need of summary, index or footer, and then read
-block by block (`read_block`, `messages`). A block is a chunk, or a stretch of records outside chunks.
-
-What counts when a file is not whole:
-
-- Cut (no footer): everything before the cut counts, also what can be decompressed of a chunk that the cut
-  goes through.
-- A chunk whose checksum or sizes are wrong, or that cannot be decompressed, is left out altogether: a number
-  with a flipped bit does more harm than a gap.
-- A record whose length cannot be: reading goes on at the next chunk that the summary knows, if it does.
-- Sizes stated in the file never decide how much memory or time is taken. A record is compared with the size of the
-  file before it is read; a chunk is decompressed piece by piece up to the size it states, at most 256 MiB; all
-  chunks together give at most 1000 times the size of the file (or 1 GiB), and at most one record per byte of it (or
-  2^20). What goes beyond is left out.
-
-Each of these is reported in `Contents.warnings`.
-"""
+"""Records of an MCAP file: how they are laid out, and how blocks of them are read."""
 
 from __future__ import annotations
 
-import bisect
 import struct
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.records import Channel, DataEnd, Footer, Schema, Statistics
+from mcap.records import Channel, Schema
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.files import MAGIC
-from uncertain_lti.recordings.unreadable import not_mcap, os_error
+from uncertain_lti.recordings.unreadable import os_error
 
 try:
     from isal.isal_zlib import crc32 as crc32
 except ImportError:
     from zlib import crc32 as crc32
 
+
 LARGEST_CHUNK = 1 << 28  # bytes, decompressed; recorders write chunks of 1 to 10 MB
-_BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
-_PIECE = 1 << 24
+PIECE = 1 << 24  # bytes that are read or decompressed at once
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
 FOOTER_SIZE = RECORD.size + 20
 PRIVATE = 0x80  # opcodes from here on mean something to their maker alone
 LATEST = 2**63 - 1  # ns; times are kept with a sign
-_CHUNK_AT = struct.Struct("<16xQ")  # in a chunk's index
-_FIRST_WARNINGS = 3  # of a kind that are reported one by one
-_LEAST_RECORDS = 1 << 20
-_LEAST_INFLATED = 1 << 30
-_LARGEST_RATIO = 1000
-_LARGEST_DEFINITION = 1 << 24  # bytes
-_LARGEST_DEFINITIONS = 1 << 26  # bytes, all of a file
-
-
-def most_records(size: int) -> int:
-    """Records that compressed chunks may hold together; one of a recording takes several bytes.
-
-    Parameters
-    ----------
-    size : int
-        Bytes of the file.
-
-    Returns
-    -------
-    int
-        At most this many.
-    """
-    return max(_LEAST_RECORDS, size)
-
-
-def most_inflated(size: int) -> int:
-    """Bytes that compressed chunks may have together when they are decompressed.
-
-    Parameters
-    ----------
-    size : int
-        Bytes of the file.
-
-    Returns
-    -------
-    int
-        At most this many.
-    """
-    return max(_LEAST_INFLATED, _LARGEST_RATIO * size)
 
 
 class Block(NamedTuple):
@@ -198,36 +139,6 @@ class Contents:
     def count(self) -> int:
         """Messages that can be read."""
         return sum(entry.count for entry in self.tally.values())
-
-
-def scan(path: Path) -> Contents:
-    """Walk a file once and note where its messages are.
-
-    Parameters
-    ----------
-    path : Path
-        An MCAP file, whole or cut.
-
-    Returns
-    -------
-    Contents
-        Where its messages are.
-
-    Raises
-    ------
-    BagError
-        The file is not MCAP, or the operating system does not let it be read.
-    """
-    try:
-        with open(path, "rb", buffering=1 << 18) as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
-            head = stream.read(4096)
-            if not head.startswith(MAGIC):
-                raise not_mcap(path, head)
-            return _Scanner(path, stream, size).run()
-    except OSError as error:
-        raise os_error(path, error) from None
 
 
 def read_block(path: Path, block: Block) -> bytes:
@@ -341,7 +252,7 @@ def inflate(compression: str, data: memoryview, limit: int) -> tuple[bytes | mem
         return b"", f"its compression {compression[:20]!r} is not known (zstd, lz4 and none are)"
     pieces, total = [], 0
     try:
-        while total <= limit and (piece := read(min(_PIECE, limit + 1 - total))):
+        while total <= limit and (piece := read(min(PIECE, limit + 1 - total))):
             pieces.append(piece)
             total += len(piece)
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
@@ -378,310 +289,6 @@ def parse(kind: type[Any], content: bytes | memoryview) -> Any:
         return kind.read(_Exact(BytesIO(content)))
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
         return None
-
-
-class _Scanner:
-    bare_begin: int
-    bare_end: int
-    bare: dict[int, Tally]  # of the block outside chunks that is being walked
-
-    def __init__(self, path: Path, stream: BinaryIO, size: int) -> None:
-        self.stream = stream
-        self.found = Contents(path, size)
-        self.sums = 0  # checksum of everything before the current record
-        self.statistics: Statistics | None = None
-        self.summary_schemas: dict[int, Schema] = {}
-        self.summary_channels: dict[int, Channel] = {}
-        self.known: list[int] = []  # where chunks begin that the summary knows
-        self.warned = {"place": 0, "chunk": 0, "definition": 0}  # warnings of each kind
-        self.chunk_warnings: list[str] = []
-        self.damaged = False
-        self.odd_records = 0
-        self.records_left = most_records(size)  # in chunks
-        self.bytes_left = most_inflated(size)
-        self.definitions_left = _LARGEST_DEFINITIONS
-        self._forget_bare()
-
-    def run(self) -> Contents:
-        found, path = self.found, self.found.path
-        self.closed = self._at(found.size - len(MAGIC), len(MAGIC)) == MAGIC and found.size >= 2 * len(MAGIC)
-        if self.closed:
-            self._summary()
-        ended = self._data_section()
-        self._end_bare()
-        found.schemas = self.summary_schemas | found.schemas
-        found.channels = self.summary_channels | found.channels
-        lost = self._orphans()
-        if ended and not self.closed:
-            found.warnings.append(
-                f"{path}: no footer at its end; all its {count(found.count, 'message')} could be read"
-            )
-        elif not self.closed:
-            found.warnings.append(f"{path}: cut after {count(found.count, 'message')} (no footer); read up to the cut")
-        found.warnings += self.chunk_warnings
-        for kind, what in (
-            ("place", "left out as damaged"),
-            ("chunk", "left out for reasons like these"),
-            ("definition", "that contradicts an earlier one"),
-        ):
-            if (more := self.warned[kind] - _FIRST_WARNINGS) > 0:
-                found.warnings.append(f"{path}: {count(more, f'more {kind}')} {what}")
-        if self.odd_records:
-            found.warnings.append(
-                f"{path}: {count(self.odd_records, 'record')} that cannot be read left out; "
-                f"the recorder or the disk damaged the file"
-            )
-        if lost:
-            found.warnings.append(f"{path}: {count(lost, 'message')} of channels that are nowhere described left out")
-        stated = self.statistics.message_count if self.statistics else 0
-        if stated > found.count:
-            found.warnings.append(f"{path}: its summary counts {count(stated, 'message')}, {found.count} could be read")
-        return found
-
-    # --- the data section -----------------------------------------------------------------------------------
-
-    def _data_section(self) -> bool:
-        """Walk all records up to the end of the data section; False where the file ends before."""
-        size, offsets = self.found.size, self.known
-        position = len(MAGIC)
-        self.sums = crc32(MAGIC)
-        self.stream.seek(position)
-        while True:
-            header = self.stream.read(RECORD.size)
-            if len(header) < RECORD.size:
-                return False
-            opcode, length = RECORD.unpack(header)
-            begin, end = position + RECORD.size, position + RECORD.size + length
-            later = bisect.bisect_right(offsets, position)
-            following = offsets[later] if later < len(offsets) else size
-            ends = opcode == Opcode.DATA_END or opcode == Opcode.FOOTER
-            if opcode == 0 or end > following or (ends and following < size):
-                if self.closed or opcode == 0:
-                    self._damage(position, following)
-                elif opcode == Opcode.CHUNK:
-                    self._chunk(position, begin, self.stream.read(size - begin), cut=True)
-                if following == size:
-                    return False
-                position = following
-                self.stream.seek(position)
-                continue
-            if ends:
-                self._data_end(parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None)
-                return True
-            self.sums = crc32(header, self.sums)
-            if opcode == Opcode.MESSAGE or opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
-                content = self.stream.read(length)
-                self.sums = crc32(content, self.sums)
-                self._bare(position, opcode, content)
-            elif opcode == Opcode.CHUNK:
-                content = self.stream.read(length)
-                self.sums = crc32(content, self.sums)
-                self._chunk(position, begin, content)
-            else:  # attachments, metadata, indexes, private records: only their bytes and their place count
-                if opcode in (Opcode.ATTACHMENT, Opcode.METADATA) or opcode >= PRIVATE:
-                    self.found.others.append(position)
-                left = length
-                while left and (piece := self.stream.read(min(left, _PIECE))):
-                    self.sums = crc32(piece, self.sums)
-                    left -= len(piece)
-            position = end
-
-    def _data_end(self, record: DataEnd | None) -> None:
-        if record and record.data_section_crc not in (0, self.sums) and not self.damaged:
-            self.found.warnings.append(
-                f"{self.found.path}: the checksum of the file is wrong, so a number in it may be; "
-                f"copy it again if you can"
-            )
-
-    def _damage(self, position: int, following: int) -> None:
-        self.damaged = True
-        if self._first("place"):
-            rest = "the rest is" if following == self.found.size else f"{count(following - position, 'byte')} are"
-            self.found.warnings.append(f"{self.found.path}: damaged at byte {position}; {rest} left out")
-
-    def _first(self, kind: str) -> bool:
-        """Whether a warning of this kind is one of the first, which are reported one by one."""
-        self.warned[kind] += 1
-        return self.warned[kind] <= _FIRST_WARNINGS
-
-    def _bare(self, position: int, opcode: int, content: bytes) -> None:
-        """A record outside chunks: continues the current block or begins one."""
-        end = position + RECORD.size + len(content)
-        if self.bare_end != position or end - self.bare_begin > _BARE_BLOCK:
-            self._end_bare()
-            self.bare_begin = position
-        self.bare_end = end
-        if opcode == Opcode.MESSAGE:
-            self._message(content, 0, len(content), self.bare)
-        else:
-            self._definition(opcode, content)
-
-    def _end_bare(self) -> None:
-        if self.bare:
-            size = self.bare_end - self.bare_begin
-            self._block(self.bare_begin, size, "", size, self.bare)
-        self._forget_bare()
-
-    def _forget_bare(self) -> None:
-        self.bare_begin, self.bare_end = -1, -1
-        self.bare = {}
-
-    def _chunk(self, position: int, begin: int, content: bytes, cut: bool = False) -> None:
-        if len(content) < CHUNK.size:
-            self._leave_out(position, "its record is too short", cut)
-            return
-        first, last, stated, checksum, name_length = CHUNK.unpack_from(content)
-        where = f"{position} (log time {seconds(first)} to {seconds(last)} s)"
-        data_begin = CHUNK.size + name_length + 8
-        if len(content) < data_begin:
-            self._leave_out(where, "its sizes contradict each other", cut)
-            return
-        compression = content[CHUNK.size : CHUNK.size + name_length].decode(errors="replace")
-        (length,) = struct.unpack_from("<Q", content, data_begin - 8)
-        data = memoryview(content)[data_begin : data_begin + length]
-        if not cut and (data_begin + length != len(content) or (not compression and length != stated)):
-            self._leave_out(where, "its sizes contradict each other")
-            return
-        if compression and stated > LARGEST_CHUNK and not cut:
-            self._leave_out(
-                where,
-                f"it states {count(stated, 'byte')} decompressed, and at most {LARGEST_CHUNK >> 20} MiB are taken",
-            )
-            return
-        stated = min(stated, max(LARGEST_CHUNK, len(data)))
-        if compression and stated > self.bytes_left:
-            self._leave_out(where, f"with it the file is over {_LARGEST_RATIO} times its size when decompressed", cut)
-            return
-        records, trouble = inflate(compression, data, stated)
-        self.bytes_left -= len(records) if compression else 0
-        if cut:
-            records = records[:stated]
-        else:
-            if not trouble and len(records) != stated:
-                trouble = f"it holds {'more' if len(records) > stated else 'less'} than it states"
-            if not trouble and checksum not in (0, crc32(records)):
-                trouble = "its checksum is wrong"
-            if trouble:
-                self._leave_out(where, trouble)
-                return
-        tally: dict[int, Tally] = {}
-        end = 0
-        for opcode, start, stop in walk(records):
-            if compression:
-                if not self.records_left:
-                    self._leave_out(where, "with it the file holds more records than bytes", cut)
-                    return
-                self.records_left -= 1
-            end = stop
-            if opcode == Opcode.MESSAGE:
-                self._message(records, start, end, tally)
-            elif opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
-                self._definition(opcode, records[start:end])
-        self.odd_records += end < len(records) and not cut
-        if tally:
-            self._block(begin + data_begin, len(data), compression, end, tally, cut)
-
-    def _leave_out(self, where: object, why: str, cut: bool = False) -> None:
-        if not cut:  # what little a cut leaves of a chunk's beginning is reported with the cut
-            self.damaged = True
-            if self._first("chunk"):
-                path = self.found.path
-                self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
-
-    def _message(self, records: bytes | memoryview, begin: int, end: int, tally: dict[int, Tally]) -> None:
-        if end - begin < MESSAGE.size:
-            self.odd_records += 1
-            return
-        channel, _, time, _ = MESSAGE.unpack_from(records, begin)
-        if entry := tally.get(channel):
-            entry.count += 1
-            if time > entry.last:
-                entry.last = time
-            elif time < entry.first:
-                entry.first = time
-        else:
-            tally[channel] = Tally(1, time, time)
-
-    def _block(
-        self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally], cut: bool = False
-    ) -> None:
-        self.found.blocks.append(
-            Block(
-                offset,
-                size,
-                compression,
-                length,
-                start=min(entry.first for entry in tally.values()),
-                end=max(entry.last for entry in tally.values()),
-                channels=frozenset(tally),
-                cut=cut,
-            )
-        )
-        for channel, entry in tally.items():
-            if total := self.found.tally.get(channel):
-                total.count += entry.count
-                total.first, total.last = min(total.first, entry.first), max(total.last, entry.last)
-            else:
-                self.found.tally[channel] = entry
-
-    def _definition(self, opcode: int, content: bytes | memoryview) -> None:
-        record = None
-        if len(content) <= _LARGEST_DEFINITION:
-            record = parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
-        if record is None:
-            self.odd_records += 1
-            return
-        table: dict[int, Any] = self.found.schemas if isinstance(record, Schema) else self.found.channels
-        if (known := table.get(record.id)) is None:
-            self.definitions_left -= len(content)
-            if self.definitions_left >= 0:
-                table[record.id] = record
-            else:
-                self.odd_records += 1
-        elif known != record and not self.damaged and self._first("definition"):
-            what = "schema" if isinstance(record, Schema) else f"channel ({record.topic})"
-            self.found.warnings.append(
-                f"{self.found.path}: {what} {record.id} is defined twice, differently; the first one counts"
-            )
-
-    def _orphans(self) -> int:
-        """Messages whose channel has no record, for example because its chunk is damaged, are no topic's."""
-        lost = [channel for channel in self.found.tally if channel not in self.found.channels]
-        return sum(self.found.tally.pop(channel).count for channel in lost)
-
-    # --- the summary ----------------------------------------------------------------------------------------
-
-    def _summary(self) -> None:
-        """Definitions, statistics and places of chunks, where the file states them and their checksum holds."""
-        footer_at = self.found.size - len(MAGIC) - FOOTER_SIZE
-        tail = self._at(footer_at, FOOTER_SIZE)
-        if len(tail) < FOOTER_SIZE or tail[:9] != RECORD.pack(Opcode.FOOTER, 20):
-            return
-        footer = parse(Footer, tail[RECORD.size :])
-        if not footer or not len(MAGIC) <= footer.summary_start < footer_at:
-            return
-        records = self._at(footer.summary_start, footer_at - footer.summary_start)
-        if footer.summary_crc not in (0, crc32(tail[:-4], crc32(records))):
-            self.found.warnings.append(f"{self.found.path}: the checksum of its summary is wrong; read without it")
-            return
-        for opcode, begin, end in walk(records):
-            if opcode == Opcode.SCHEMA and (schema := parse(Schema, records[begin:end])):
-                self.summary_schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL and (channel := parse(Channel, records[begin:end])):
-                self.summary_channels[channel.id] = channel
-            elif opcode == Opcode.STATISTICS:
-                self.statistics = parse(Statistics, records[begin:end])
-            elif opcode == Opcode.CHUNK_INDEX:
-                offset = _CHUNK_AT.unpack_from(records, begin)[0] if end - begin >= _CHUNK_AT.size else 0
-                if len(MAGIC) <= offset < footer_at and self._at(offset, 1) == bytes([Opcode.CHUNK]):
-                    self.known.append(offset)
-        self.known.sort()
-
-    def _at(self, offset: int, size: int) -> bytes:
-        if offset < 0 or offset >= self.found.size:
-            return b""
-        self.stream.seek(offset)
-        return self.stream.read(min(size, self.found.size - offset))
 
 
 def count(number: int, what: str) -> str:

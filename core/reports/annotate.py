@@ -25,7 +25,8 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.monitor.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of
-from uncertain_lti.recordings.mcap_records import LATEST, Contents, scan
+from uncertain_lti.recordings.mcap_records import LATEST, Contents
+from uncertain_lti.recordings.mcap_scan import scan
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
 from uncertain_lti.recordings.recording import Progress, Recording
