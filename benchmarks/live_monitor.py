@@ -3,6 +3,10 @@
     ./run python benchmarks/live_monitor.py                        # the table: rates 500 Hz and 1 kHz, n = 5 and 50
     ./run python benchmarks/live_monitor.py --left 0.003           # the same, three in a thousand samples out of bounds
     ./run python benchmarks/live_monitor.py --soak 600             # ten minutes at 1 kHz: memory and counters
+    ./run python benchmarks/live_monitor.py --before FOLDER        # beside the monitor of another checkout
+
+FOLDER is a checkout of another version, with its compiled part built in it: `git worktree add FOLDER REVISION`, then
+`python setup.py build_ext --inplace` in it.
 
 What the ratios are held against: with every output heard at most 0.6 times the CPU of the bare node on the default
 executor and 1.5 times that on the events executor, with only ~/violation heard 1.1 times; the flags at most 1 ms
@@ -311,33 +315,44 @@ def status(domain: int) -> dict[str, Any]:
 class Run:
     """One subject, one rate, one size: the processes, and what was measured of them."""
 
-    def __init__(self, n: int, rate: float, seconds: float, left: float = 0.0) -> None:
-        self.n, self.rate, self.seconds, self.left = n, rate, seconds, left
+    def __init__(self, n: int, rate: float, seconds: float, left: float = 0.0, before: str = "") -> None:
+        self.n, self.rate, self.seconds, self.left, self.before = n, rate, seconds, left, before
         self.domain = random.randint(1, 100)
         self.env = os.environ | {
             "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         }  # fmt: skip
         self.children: list[Child] = []
 
-    def child(self, *command: str) -> Child:
-        self.children.append(Child(self.env, *command))
+    def child(self, *command: str, **environment: str) -> Child:
+        self.children.append(Child(self.env | environment, *command))
         return self.children[-1]
 
     def part(self, *arguments: str) -> Child:
         return self.child(__file__, "--part", *arguments)
 
-    def monitor(self, folder: str) -> Child:
+    def monitor(self, folder: str, which: str = "") -> Child:
+        """The monitor of this checkout, or of the other one; `which` may name "before" and "uncompiled"."""
         path = Path(folder) / "bench.model.json"
         save_model(path, self.n, self.rate)
         code = "import sys; from uncertain_lti_ros.envelope_monitor import main; sys.exit(main())"
-        return self.child("-c", code, "--ros-args", "-p", f"model:={path}", "-p", "violations:=1")
+        environment = {"UNCERTAIN_LTI_PURE_PYTHON": "yes"} if "uncompiled" in which else {}
+        if "before" in which:
+            checkout = str(Path(self.before).resolve() / "tests" / "checkout")
+            environment["PYTHONPATH"] = os.pathsep.join(filter(None, [checkout, os.environ.get("PYTHONPATH")]))
+        return self.child(
+            "-P", "-c", code, "--ros-args", "-p", f"model:={path}", "-p", "violations:=1", **environment
+        )  # fmt: skip
 
     def measure(self, kind: str, executor: str, outputs: list[str], delays: bool = False) -> dict[str, Any]:
         try:
             with tempfile.TemporaryDirectory() as folder:
                 hearer = None
                 if kind in ("monitor", "relay"):
-                    subject = self.monitor(folder) if kind == "monitor" else self.part("relay", str(self.n), *outputs)
+                    subject = (
+                        self.monitor(folder, executor)
+                        if kind == "monitor"
+                        else self.part("relay", str(self.n), *outputs)
+                    )
                     hearer = self.part("hear", *outputs)
                     hearer.line()
                     if kind == "monitor":
@@ -378,6 +393,13 @@ class Run:
 
 
 BARE = "bare, default executor", "bare, events executor"
+VERSIONS = {
+    f"{when}{how}, {heard}": ("monitor", f"{when}{how}", outputs)
+    for how in ("", " uncompiled")
+    for when in ("before", "now")
+    for heard, outputs in (("all outputs heard", OUTPUTS), ("~/violation heard", ["violation"]))
+}
+"""The monitor of another checkout beside that of this one, by `--before`."""
 LIMITS = (
     ("monitor, all outputs heard", "bare, default executor", 0.6),
     ("monitor, all outputs heard", "bare, events executor", 1.5),
@@ -435,6 +457,34 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, 
     print(table(head, rows))
     print()
     print(table(["n", "Hz", "", "at most", "measured", "turns", "held", "publishing only"], held))
+
+
+def compare_versions(before: str, rates: list[float], sizes: list[int], seconds: float, repeats: int) -> None:
+    """CPU per sample of this checkout's monitor over that of another one, turn by turn."""
+    from uncertain_lti.reports.tables import table
+
+    rows = []
+    for n in sizes:
+        for rate in rates:
+            cpu: dict[str, list[float]] = {name: [] for name in VERSIONS}
+            for _ in range(repeats):
+                for name, subject in VERSIONS.items():
+                    found = Run(n, rate, seconds, before=before).measure(*subject)
+                    assert found["missed"] == 0, f"{name}: {found['missed']} verdicts missing"
+                    cpu[name].append(found["cpu"])
+            for name in VERSIONS:
+                if name.startswith("now"):
+                    ours, theirs = np.array(cpu[name]), np.array(cpu[name.replace("now", "before")])
+                    each = ours / theirs
+                    rows.append(
+                        [
+                            f"{n}", f"{rate:g}", name.removeprefix("now").strip(" ,") or "compiled",
+                            f"{np.median(theirs):.0f}", f"{np.median(ours):.0f}", f"{np.median(each):.2f}",
+                            f"{each.min():.2f} to {each.max():.2f}",
+                        ]
+                    )  # fmt: skip
+                    print("  ".join(rows[-1]), file=sys.stderr, flush=True)
+    print(table(["n", "Hz", "", "before, µs/sample", "now", "ratio", "turns"], rows))
 
 
 def soak(seconds: float, rate: float, n: int) -> dict[str, Any]:
@@ -498,6 +548,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[5, 50], choices=list(CONTROLS))
     parser.add_argument("--left", type=float, default=0.0, metavar="SHARE", help="of samples out of bounds")
     parser.add_argument("--soak", type=float, metavar="S", help="instead, run the monitor for S seconds at 1 kHz")
+    parser.add_argument("--before", metavar="FOLDER", help="instead, beside the monitor of another checkout")
     parser.add_argument("--part", nargs="+", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.part:
@@ -514,6 +565,8 @@ def main() -> None:
         found = soak(args.soak, 1000.0, args.sizes[0])
         if not (found["exact"] and found["growth"] < 1.0):
             raise SystemExit(1)
+    elif args.before:
+        compare_versions(args.before, args.rates, args.sizes, args.seconds, args.repeats)
     else:
         compare(args.rates, args.sizes, args.seconds, args.repeats, args.left)
 
