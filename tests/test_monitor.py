@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.domain import Domain
+from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.sampling.sampler import Sampler, Step
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import Signal
@@ -327,3 +327,20 @@ def test_each_check_starts_from_a_cleared_alarm() -> None:
     transient = Transient([0.0, 1.0, 2.0], [0.0, 5.0, 5.0], [])
     first, second = monitor.check(transient), monitor.check(transient)
     assert first.alarm.tolist() == second.alarm.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("dt_ms, judged", [(4, False), (5, True), (10, True), (40, True), (41, False), (9999, False)])
+def test_a_step_that_the_fit_never_saw_has_no_verdict(dt_ms: int, judged: bool) -> None:
+    """An input that runs a thousand times too fast must not be called contained."""
+    model = a_model(2, 1, 3, sampling=Sampling(dt_median=0.015, dt_min=0.01, dt_max=0.02))
+    t = np.array([0, 15, 15 + dt_ms, 30 + dt_ms]) * 1_000_000
+    transient = Transient(t, np.zeros((4, 2)), np.zeros((4, 1)), max_gap=100.0)
+    monitor = EnvelopeMonitor(model)
+    whole = monitor.check(transient)
+    assert whole.judged.tolist() == [False, True, judged, True]
+    assert whole.unfitted_step.tolist() == [False, False, not judged, False]
+    expected = Status.OK if judged else Status.STEP
+    assert whole.statuses()[1:] == [Status.OK, expected, Status.OK]
+    verdicts = judge(EnvelopeMonitor(model), transient)
+    assert [v.status for v in verdicts] == [Status.OK, expected, Status.OK]
+    assert verdicts[1].judged is judged and bool(np.isnan(verdicts[1].flags).all()) is not judged

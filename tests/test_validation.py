@@ -624,7 +624,7 @@ def test_go2_blocks(recordings, signals_folder):
     from uncertain_lti import read_transients
 
     data = validate(read_transients(recordings / "go2/test_3.mcap", signals_folder / "go2_joint.yaml")).to_dict()
-    assert data["kind"] == "blocks" and data["verdicts"] == 6541
+    assert data["kind"] == "blocks" and data["verdicts"] == 6539  # two steps are longer than any other block has
     assert data["inside"] > 0.99 and data["inside_interval"][0] > 0.97
     assert all(0.5 < s["left_out_to_full"] < 2 for s in data["states"].values())
 

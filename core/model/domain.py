@@ -47,6 +47,12 @@ class Sampling:
     min_step: float = 0.0
     max_skew: float | None = None
 
+    @property
+    def step_range(self) -> tuple[float, float]:
+        """Shortest and longest step that is judged, s: half of and twice those that the model was fitted to."""
+        least = 0.0 if self.dt_min is None else 0.5 * self.dt_min
+        return least, np.inf if self.dt_max is None else 2.0 * self.dt_max
+
 
 @dataclass(frozen=True)
 class Domain:

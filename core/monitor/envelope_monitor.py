@@ -60,8 +60,8 @@ class Verdict:
 
     __slots__ = ("t_ns", "arrival_ns", "status", "outside_domain", "alarm", "_after", "_judgement")
 
-    def __init__(self, step: Step, alarm: bool, judgement: Judgement | None) -> None:
-        self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, step.status
+    def __init__(self, step: Step, alarm: bool, judgement: Judgement | None, status: Status | None = None) -> None:
+        self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, status or step.status
         self._after = step.after
         self.outside_domain = judgement is not None and judgement.outside_domain
         self.alarm = alarm
@@ -181,6 +181,8 @@ class Verdicts:
         z(t_{k-1}) lies outside the ranges seen in the fit.
     alarm : array (N+1,) of bool
         The alarm after each sample.
+    unfitted_step : array (N+1,) of bool
+        The step is out of the fitted range, so there is no verdict.
     """
 
     transient: Transient
@@ -191,6 +193,7 @@ class Verdicts:
     judged: NDArray[np.bool_]
     outside_domain: NDArray[np.bool_]
     alarm: NDArray[np.bool_]
+    unfitted_step: NDArray[np.bool_]
 
     def __repr__(self) -> str:
         judged, left = int(self.judged.sum()), int(self.violated.sum())
@@ -219,6 +222,11 @@ class Verdicts:
             )
         return html_table(repr(self), ("state", "violations", "inside", "mean width", "largest", "first"), rows)
 
+    def statuses(self) -> list[Status]:
+        """What became of each sample, (N+1,): `Transient.statuses`, and which steps were out of range."""
+        kinds = self.transient.statuses()
+        return [Status.STEP if odd else kind for odd, kind in zip(self.unfitted_step.tolist(), kinds, strict=True)]
+
     @property
     def violated(self) -> NDArray[np.bool_]:
         """Whether some state left its bounds, (N+1,)."""
@@ -231,7 +239,8 @@ class EnvelopeMonitor:
 
     A sample is contained when lower <= x_next <= upper in the normalised quantities, nothing else (Leibov (2006),
     eqs. (8)(9)). The alarm looks at the last `window` verdicts (messages without a verdict do not count) and
-    starts anew when time jumps back.
+    starts anew when time jumps back. A step shorter than half of, or longer than twice, those that the model was
+    fitted to has no verdict.
 
     Parameters
     ----------
@@ -286,6 +295,7 @@ class EnvelopeMonitor:
             self._counted,
         )
         self._window = AlarmWindow(self.rule)
+        self._shortest, self._longest = model.sampling.step_range
 
     def __repr__(self) -> str:
         rule = self.rule
@@ -380,6 +390,8 @@ class EnvelopeMonitor:
             window.reset()
         if step.status is not Status.OK:
             return Verdict(step, window.alarm, None)
+        if not contained(self._shortest, step.dt, self._longest):
+            return Verdict(step, window.alarm, None, Status.STEP)
         judgement = self._judge.judge(step.before, step.after, step.dt)
         if armed:
             window.push(judgement.violation)
@@ -412,6 +424,11 @@ class EnvelopeMonitor:
             )
         steps = transient.transitions()
         count, n = len(transient), model.n
+        fitted = np.asarray(contained(self._shortest, steps.dt, self._longest))
+        unfitted_step = np.zeros(count, dtype=bool)
+        if not fitted.all():
+            unfitted_step[steps.k[~fitted] + 1] = True
+            steps = steps.take(fitted)
         arrival = steps.k + 1
         flags, lower = np.full((count, n), np.nan), np.full((count, n), np.nan)
         upper, utilisation = np.full((count, n), np.nan), np.full((count, n), np.nan)
@@ -429,7 +446,7 @@ class EnvelopeMonitor:
             after = raised(violated[start:stop][judged[start:stop]], self.rule)
             held = np.concatenate([[False], after])  # without a verdict the last one stands
             alarm[start:stop] = held[np.cumsum(judged[start:stop])]
-        return Verdicts(transient, flags, lower, upper, utilisation, judged, outside, alarm)
+        return Verdicts(transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step)
 
     def _judge_all(self, x: Array, u: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array]:
         """flags, lower, upper (normalised), utilisation of transitions (K, n), (K, m), (K,), (K, n)."""

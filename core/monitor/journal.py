@@ -193,7 +193,7 @@ class Journal:
         since = watch.sampler.counters - self._counters
         if signals := watch.lacking(self._counters):
             found.append(f"{', '.join(signals)} missing, stale or not finite")
-        for status, name in ((Status.GAP, "gaps"), (Status.RESET, "resets")):
+        for status, name in ((Status.GAP, "gaps"), (Status.RESET, "resets"), (Status.STEP, Status.STEP.value)):
             if since[name]:
                 found.append(WHY[status])
         dropped = [status.value for status in Status if status.dropped and since[status.value]]

@@ -472,6 +472,8 @@ class Watch:
         period = self._period
         if verdict.status is not Status.OK:  # looking up one of these is slow
             period.statuses[verdict.status] += 1
+            if verdict.status is Status.STEP:  # the sampler does not know the model's range
+                self.sampler.counters[Status.STEP.value] += 1
         alarm = self.alarm
         self.alarms += alarm and not alarm_before
         period.alarm |= alarm
@@ -621,7 +623,7 @@ class Watch:
         complaints, calm = list(problems), list[str]()
         if period.outside:
             complaints.append(f"outside the fitted domain in {period.outside} of {period.verdicts} verdicts")
-        for status in (Status.GAP, Status.RESET, Status.MISSING):
+        for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP):
             if period.statuses[status]:
                 which = ""
                 if status is Status.MISSING:
@@ -780,4 +782,5 @@ WHY = {
     Status.GAP: "the step is longer than max_gap",
     Status.RESET: "time stepped back",
     Status.MISSING: "a signal is missing, stale or not finite",
+    Status.STEP: "the step is shorter or longer than those that the model was fitted to",
 }

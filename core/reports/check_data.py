@@ -13,6 +13,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.sampling.reading import unused
+from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 
 UNVOUCHED = 0.2
@@ -44,7 +45,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     """
     transient = verdicts.transient
     t = transient.t_ns
-    judged = int(verdicts.judged.sum())
+    judged, odd = int(verdicts.judged.sum()), int(verdicts.unfitted_step.sum())
     width = np.where(verdicts.judged[:, None], verdicts.upper - verdicts.lower, np.nan)
     states = {}
     for i, name in enumerate(model.state_names):
@@ -68,7 +69,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "recording": transient.name,
         "samples": len(transient),
         "verdicts": judged,
-        "no_verdict": unused(transient),
+        "no_verdict": [*unused(transient), *([f"{odd} {Status.STEP.value}"] if odd else [])],
         "violated": int(verdicts.violated.sum()),
         "inside": None if not judged else 1.0 - int(verdicts.violated.sum()) / judged,
         "outside_domain": int(verdicts.outside_domain.sum()),
@@ -101,7 +102,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
                 "outside_domain": bool(verdicts.outside_domain[k]),
                 "alarm": bool(verdicts.alarm[k]),
             }
-            for k, status in enumerate(transient.statuses())
+            for k, status in enumerate(verdicts.statuses())
         ]
     return data
 

@@ -47,6 +47,21 @@ class Transitions:
     u: Array
     x_next: Array
 
+    def take(self, which: NDArray[np.bool_]) -> Transitions:
+        """Some of them.
+
+        Parameters
+        ----------
+        which : array of bool (N,)
+            Those that are wanted.
+
+        Returns
+        -------
+        Transitions
+            In the same order.
+        """
+        return Transitions(self.k[which], self.dt[which], self.x[which], self.u[which], self.x_next[which])
+
 
 class Transient:
     """One recorded run: samples (t, x, u), the steps between them, and where they may not be joined.

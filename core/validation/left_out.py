@@ -433,6 +433,7 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
     verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
     judged = verdicts.judged
     steps = transient.transitions()
+    steps = steps.take(judged[steps.k + 1])
     width = (verdicts.upper - verdicts.lower)[judged]
     point = full.operating_point
     low, high = full.bounds(point.normalise_x(steps.x), point.normalise_u(steps.u), steps.dt)
