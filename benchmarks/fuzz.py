@@ -1,13 +1,16 @@
 """Damaged recordings and messages, seeded: each must give a clear error or a correct reading, soon and in bounds.
 
-    ./run python benchmarks/fuzz.py                            # 10 000 files, and as many serialised messages
+    ./run python benchmarks/fuzz.py                            # 10 000 of each kind: files, structures, messages
+    ./run python benchmarks/fuzz.py --kinds structures --count 2000
     ./run python benchmarks/fuzz.py --count 1 --seed 4711      # one case again
 
 A case fails when anything but an error meant for a person comes out of it, when it takes over 5 s of processor time or
 a minute, when it asks for over 1 GiB of memory, or when its reading is wrong. A reading is wrong when the readers
-disagree (by message and by arrays, or layout and middleware), or when a chunk whose checksum holds gives a message that
-was never written. Cases run in processes of their own, in batches, so that what kills a process or hangs in C is
-noticed as well.
+disagree (by message and by arrays, or layout and middleware), when a chunk whose checksum holds gives a message that
+was never written, or when an annotated copy holds other messages than were read, or another library cannot walk it.
+Files are damaged after they are written; structures are made to hurt (`tests/hostile_writer.py`): lengths that reach
+over their neighbours, the smallest records repeated, chunks in chunks, schemas without end, an index that lies. Cases
+run in processes of their own, in batches, so that what kills a process or hangs in C is noticed as well.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ if not any("uncertain_lti" in str(p) for p in sys.path):
     sys.path.insert(0, str(ROOT / "tests" / "checkout"))
 
 from bag_writer import Layout, Message, Topic, cdr, float64, header, message, places, write  # noqa: E402
+from hostile_writer import hostile_file  # noqa: E402
 
 LIMIT_CPU_S = 5.0  # of processor time, which a busy machine does not lengthen
 LIMIT_S = 60.0
@@ -188,22 +192,80 @@ def damaged_file(rng: random.Random) -> tuple[bytes, bool]:
 
 def read_file(rng: random.Random, folder: Path) -> str:
     """Every way in which a recording is read; returns what became of it."""
-    from uncertain_lti import SignalMap
-    from uncertain_lti.base.errors import UncertainLTIError
-    from uncertain_lti.cli.main import main
-    from uncertain_lti.recordings.bag import Bag
-    from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
-
     path = folder / "damaged.mcap"
     data, checked = damaged_file(rng)
     path.write_bytes(data)
-    signals = SignalMap.load(folder / "signals.yaml")
-    outcome = "read"
+    return read_every_way(path, checked)
+
+
+def read_structure(rng: random.Random, folder: Path) -> str:
+    """Every way in which a recording is read, and its annotated copy."""
+    path = folder / "hostile.mcap"
+    path.write_bytes(hostile_file(rng, TOPICS, messages_of_a_run()))
+    outcome = read_every_way(path, False)
+    if outcome == "read":
+        compare_with_copy(path)
+    return outcome
+
+
+def compare_with_copy(path: Path) -> None:
+    """Annotate a recording; what was read of it has to be in the copy, and the mcap library has to walk that."""
+    from mcap.stream_reader import StreamReader
+
+    from uncertain_lti import SignalMap, UncertainLTI
+    from uncertain_lti.base.errors import UncertainLTIError
+    from uncertain_lti.recordings.bag import Bag
+    from uncertain_lti.sampling.reading import read_transients
+
+    model, copy = path.parent / "m.model.json", path.parent / "copy.mcap"
+    copy.unlink(missing_ok=True)
+    try:
+        (run,) = read_transients([path], SignalMap.load(path.parent / "signals.yaml"))
+    except UncertainLTIError:
+        return
+    UncertainLTI(np.zeros((3, 3)), np.zeros((3, 1)), np.eye(3), np.ones((3, 1)), signals=run.signals).save(model)
+    status, text = command(["check", str(model), str(path), "--write", str(copy)])
+    if status not in (0, 1, 2) or "Traceback" in text:
+        raise WrongError(f"check ended with {status}: {text[-500:]}")
+    if not copy.exists():
+        return
+    bag, copied = Bag(path), Bag(copy)
+    in_time = [name for name, info in bag.topics.items() if info.last is None or info.last < 2**63]
+    one, other = ([(m.topic, m.log_time_ns, m.data) for m in b.raw_messages(in_time)] for b in (bag, copied))
+    if sorted(one) != sorted(other):
+        raise WrongError(f"{len(one)} messages were read, and the copy has {len(other)}, or others")
+    with open(copy, "rb") as stream:
+        number = sum(type(r).__name__ == "Message" for r in StreamReader(stream, validate_crcs=True).records)
+    if number != sum(part.count for part in copied.contents):
+        raise WrongError("the mcap library finds another number of messages in the copy")
+
+
+def command(arguments: list[str]) -> tuple[int, str]:
+    """Exit status and output of a command."""
+    from uncertain_lti.cli.main import main
+
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        status = main(["topics", str(path)])
-    if status not in (0, 2) or "Traceback" in said.getvalue():
-        raise WrongError(f"topics ended with {status}: {said.getvalue()[-500:]}")
+        status = main(arguments)
+    text = said.getvalue()
+    if odd := [c for c in text if not c.isprintable() and c != "\n"]:
+        raise WrongError(f"{arguments[0]} prints {odd[0]!r}")
+    return status, text
+
+
+def read_every_way(path: Path, checked: bool) -> str:
+    """Read one file; checked: every message in it that has a checksum which holds was written like that."""
+    from uncertain_lti import SignalMap
+    from uncertain_lti.base.errors import UncertainLTIError
+    from uncertain_lti.recordings.bag import Bag
+    from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
+
+    folder = path.parent
+    signals = SignalMap.load(folder / "signals.yaml")
+    outcome = "read"
+    status, text = command(["topics", str(path)])
+    if status not in (0, 2) or "Traceback" in text:
+        raise WrongError(f"topics ended with {status}: {text[-500:]}")
     try:
         bag = Bag(path)
         bag.facts()
@@ -216,7 +278,7 @@ def read_file(rng: random.Random, folder: Path) -> str:
     readings: list[Any] = []
     for read in (read_stream, read_stream_by_message):
         try:
-            stream = read(Bag(path), signals)
+            stream = read(Bag(path, indexed=read is read_stream), signals)
             readings.append([stream.topic, stream.arrival, stream.stamp, *stream.values])
         except UncertainLTIError as error:
             if "\n" in str(error) or len(str(error)) > 2000:
@@ -318,7 +380,11 @@ def read_recorded(kind: str, paths: list[Any], messages: list[bytes]) -> tuple[i
     return None if stamps[-1] == NO_STAMP else int(stamps[-1]), values[-1].tobytes()
 
 
-KINDS: dict[str, Callable[[random.Random, Path], str]] = {"files": read_file, "messages": read_messages}
+KINDS: dict[str, Callable[[random.Random, Path], str]] = {
+    "files": read_file,
+    "structures": read_structure,
+    "messages": read_messages,
+}
 
 
 # --- many cases ---------------------------------------------------------------------------------------------

@@ -346,3 +346,26 @@ def test_messages_out_of_order_are_held_up_to_a_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(bag_module, "_MOST_HELD", 100_000)
     with pytest.raises(BagError, match="mcap sort"):
         list(Bag(path).raw_messages())
+
+
+def test_chunks_of_several_compressions_in_one_file(tmp_path, model):
+    """Far from each other, so each is read alone; a compressed one behind one that is not raised an error."""
+    apart = record(0x80, bytes(1 << 17))
+    kinds = ("", "zstd", "lz4", "", "lz4", "zstd")
+    parts = [chunk_record(DEFINED + said(5, begin=5 * k), kind) for k, kind in enumerate(kinds)]
+    path = save(tmp_path / "mixed.mcap", raw_file(*(piece for part in parts for piece in (part, apart)), summary=b""))
+    signals = UncertainLTI.load(model).signals
+    assert read_stream(Bag(path), signals).values[0][:, 0].tolist() == list(range(30))
+
+
+def test_a_damaged_definition_in_the_summary_alone_hurts_nothing(tmp_path, model):
+    """Without checksums the index is gone by until something in it is wrong; the chunks have the definition whole."""
+    file = write([TOPIC], ramp("/a", range(0, 20 * STEP, STEP)), Layout("none", checksums=False)).data
+    last = file.rindex(b"float64 data")
+    assert last > file.index(b"float64 data")
+    signals = UncertainLTI.load(model).signals
+    for wrong in (b"float64 dat\x01", b"float64 dato"):
+        path = save(tmp_path / "wrong.mcap", file[:last] + wrong + file[last + 12 :])
+        assert Bag(path, indexed=True).indexed
+        for indexed in (True, False):
+            assert read_stream(Bag(path, indexed=indexed), signals).values[0][:, 0].tolist() == list(range(20))

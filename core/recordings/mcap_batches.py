@@ -271,9 +271,9 @@ class _Loader:
 
     def _room(self, number: int, length: int) -> memoryview:
         """Room for a run as it is in the file; it is wanted until its blocks are placed."""
-        if number == len(self.packed):
-            self.packed.append(bytearray(length))
-        elif len(self.packed[number]) < length:
+        while number >= len(self.packed):  # runs that are read as they stand have none
+            self.packed.append(bytearray())
+        if len(self.packed[number]) < length:
             self.packed[number] = bytearray(length)
         return memoryview(self.packed[number])[:length]
 

@@ -126,6 +126,8 @@ def read_stream_by_message(bag: Recording, signals: SignalMap, progress: Progres
 def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
     """Field paths per topic; every problem of the map is found before the long read.
 
+    What the index of a file says is wrong is looked for in the file itself before it is reported: they may differ.
+
     Parameters
     ----------
     bag : Recording
@@ -143,10 +145,22 @@ def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
     SignalError
         A path is not in the message type, or is not one number.
     """
-    for name in signals.topics:
-        if name in bag.topics and bag.topics[name].readable:
-            signals.check(name, bag.topics[name].type, bag.type_fields(name))
+    if bag.indexed:
+        try:
+            if not _fits(bag, signals):
+                bag.walk()
+        except SignalError:
+            bag.walk()
+    _fits(bag, signals)
     return [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics]
+
+
+def _fits(bag: Recording, signals: SignalMap) -> bool:
+    """Whether every topic can be read; raises SignalError where a path of one that can be does not fit its type."""
+    readable = [name for name in signals.topics if name in bag.topics and bag.topics[name].readable]
+    for name in readable:
+        signals.check(name, bag.topics[name].type, bag.type_fields(name))
+    return len(readable) == len(signals.topics)
 
 
 def _refuse_absent(
