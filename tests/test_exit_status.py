@@ -284,3 +284,16 @@ def test_every_command_says_the_exit_statuses():
     page = (Path(__file__).resolve().parents[1] / "docs" / "reference" / "commands.md").read_text()
     for status in ("0 done", "1 the alarm", "2 bad usage", "70", "130", "141"):
         assert status in page
+
+
+@pytest.mark.parametrize("value", [1e308, -1e160, 1e60])
+def test_recorded_values_whose_squares_overflow_are_refused_by_a_fit(folder, tmp_path, capsys, value):
+    """Before, the solvers were left alone with them, for minutes; a check judges them as any other value."""
+    path = engine_bag(
+        tmp_path / "huge.mcap", change=lambda k, x: np.where(np.arange(len(x)) == 0, value, x) if k == 50 else x
+    )
+    capsys.readouterr()
+    line = ["fit", str(path), "--signals", str(folder / "signals.yaml"), "--output", str(tmp_path / "m.model.json")]
+    assert main(line) == 2
+    assert f"'fan' reaches {abs(value):.3g}" in capsys.readouterr().err
+    assert main(["check", str(folder / "m.model.json"), str(path)]) == 1

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient
 
@@ -504,7 +505,8 @@ def assemble(
     Raises
     ------
     FitError
-        No transitions; weights of a wrong shape, not positive, not symmetric or not positive definite.
+        No transitions; values whose squares overflow; weights of a wrong shape, not positive, not symmetric or not
+        positive definite.
     """
     n = len(point.x_s)
     steps = [t.transitions() for t in transients]
@@ -527,6 +529,7 @@ def assemble(
         _normalise(s.x, point.x_s, point.X, z[:n, part])
         _normalise(s.u, point.u_s, point.U, z[n:, part])
         _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
+    _refuse_overflow(transients, z, x_next)
     columns = Columns.of(additive, is_constant(dt))
     chosen = _weights(weights, transients, k, source, n)
     factors = _factors(transient_weights, count, source, len(transients))
@@ -534,6 +537,23 @@ def assemble(
         factors = factors[source]
         chosen = factors[:, None] * chosen if chosen.ndim < 3 else factors[:, None, None] * chosen
     return Problem(z, x_next, dt, source, k, chosen, columns)
+
+
+def _refuse_overflow(transients: Sequence[Transient], z: Array, x_next: Array) -> None:
+    """Refuse values whose squares overflow; raises FitError naming signal and recording."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        if np.vdot(z, z) <= LARGEST**2 and np.vdot(x_next, x_next) <= LARGEST**2:
+            return
+    largest, name, recording = 0.0, "", ""
+    for t in transients:
+        for signal, values in zip((*t.state_names, *t.control_names), (*t.x.T, *t.u.T), strict=True):
+            here = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+            if here > largest:
+                largest, name, recording = here, signal, t.name
+    raise FitError(
+        f"{recording}: '{name}' reaches {largest:.3g}, over its scale more than the arithmetic can carry; leave out "
+        f"the recording, or mend the sensor or the scale"
+    )
 
 
 def _without_values(transients: Sequence[Transient]) -> str:
