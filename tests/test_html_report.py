@@ -311,3 +311,48 @@ def test_the_headline_is_no_better_than_the_model():
     assert (good["rely"]["answer"], wide["rely"]["answer"]) == (YES, NO)
     assert "Nothing left its bounds<" in _first_screen("m", good) and "at every violation" in _first_screen("m", good)
     assert "Nothing left its bounds, which says little here<" in _first_screen("m", wide)
+
+
+def sways(amplitude, seed=0, name="run"):
+    """A state that follows its control by half a step, with sensor noise; it moves as far as the control does."""
+    rng = np.random.default_rng(seed)
+    u = amplitude * np.repeat(rng.uniform(-1, 1, 50), 20)
+    x = np.zeros(1000)
+    for k in range(999):
+        x[k + 1] = x[k] + 0.5 * (u[k] - x[k])
+    x = x + 0.02 * rng.standard_normal(1000)
+    return Transient(np.arange(1000) * 0.1, x[:, None], u[:, None], name=name)
+
+
+def test_the_report_is_as_tight_as_the_fit():
+    """A recording that moves ten times as far makes no wide bounds narrow."""
+    model = fit([sways(0.05)], additive="noise")
+    share = float(model.fit_summary["mean_width"][0] / (model.domain.x_max - model.domain.x_min)[0])
+    assert 0.5 < share and any(f"({share:.0%})" in m for m in model.fit_summary["messages"])  # the fit says so
+    for amplitude in (0.05, 0.5):
+        facts = findings(model, "m", [EnvelopeMonitor(model).check(sways(amplitude, 1))])
+        (reason,) = [r for r in facts["rely"]["reasons"] if r["about"] == "tightness"]
+        assert reason["weight"] == NO and f"({share:.0%})" in reason["text"] and "in the fit" in reason["text"]
+
+
+def test_a_model_that_most_data_leaves_and_nothing_vouches_for_is_refused():
+    model = fit([sways(1.0)], additive="noise")
+    other = Transient(np.arange(1000) * 0.1, sways(1.0, 2).x[::-1].copy() * 1.5, sways(1.0, 3).u)
+    checked = EnvelopeMonitor(model).check(other)
+    facts = findings(model, "m", [checked])
+    if checked.violated.sum() <= 0.5 * checked.judged.sum():
+        pytest.fail("the recording is to leave the model")
+    assert facts["rely"]["answer"] == NO
+    vouched = model.replace(
+        validation={**validated(10, 10, 1.0), "states": {"x1": validated(10, 10, 1.0)["states"]["x1"]}}
+    )
+    reasons = findings(vouched, "m", [EnvelopeMonitor(vouched).check(other)])["rely"]["reasons"]
+    assert not any("cannot tell a fault" in r["text"] for r in reasons)  # then it may well be one
+
+
+def test_what_weighs_most_is_printed_first():
+    from uncertain_lti.reports.findings_text import findings_text
+
+    text = findings_text(judged([0.9, 0.9], validated(9, 10, 0.9999))).splitlines()
+    weights = [line.split(":")[0].strip() for line in text[1:] if not line.startswith("what")]
+    assert text[0] == "may I rely on it? no" and weights[0] == "no"

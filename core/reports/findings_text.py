@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from uncertain_lti.reports.reliance import WEIGHTS
+
 
 def findings_text(facts: dict[str, Any]) -> str:
     """The answers of `findings.findings`, with the reasons, for a person.
@@ -16,10 +18,11 @@ def findings_text(facts: dict[str, Any]) -> str:
     Returns
     -------
     str
-        Both answers, a reason per line.
+        Both answers, a reason per line, what weighs most first.
     """
     lines = [f"may I rely on it? {facts['rely']['answer']}"]
-    lines += [f"  {r['weight']}: {r['text']}" for r in facts["rely"]["reasons"]]
+    reasons = sorted(facts["rely"]["reasons"], key=lambda r: WEIGHTS.index(r["weight"]))
+    lines += [f"  {r['weight']}: {r['text']}" for r in reasons]
     lines.append("what happened?")
     lines += [f"  {h['recording']}: {h['text']}" for h in facts["happened"]]
     return "\n".join(lines)

@@ -11,6 +11,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.reports.model_text import eigenvalues_text
+from uncertain_lti.reports.reliance import TOO_FEW_INSIDE
 from uncertain_lti.reports.tables import number, table
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
@@ -149,7 +150,15 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
     share = np.asarray(facts["mean_width"]) / np.where(span > 0, span, np.inf)
     widest = int(np.argmax(share))
     inside = None if left_out is None else left_out.get("inside")
-    if share[widest] > WIDE:
+    outside = (
+        ""
+        if inside is None or inside >= 0.99
+        else f"{1 - inside:.1%} of what was left out falls outside, so expect false alarms; record more of what the "
+        f"machine will do, or let validate --false-alarms find an alarm rule that stays quiet"
+    )
+    if inside is not None and inside < TOO_FEW_INSIDE:
+        worry = outside
+    elif share[widest] > WIDE:
         worry = (
             f"the bounds of '{model.state_names[widest]}' are {share[widest]:.0%} as wide as its range, so only gross "
             f"faults would be seen: "
@@ -158,11 +167,8 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
             remedies(facts.get("messages", []), facts["additive"], model.state_names[widest])
             or "what moves it may be missing among the controls"
         )
-    elif inside is not None and inside < 0.99:
-        worry = (
-            f"{1 - inside:.1%} of what was left out falls outside, so expect false alarms; record more of what the "
-            f"machine will do, or let validate --false-alarms find an alarm rule that stays quiet"
-        )
+    elif outside:
+        worry = outside
     elif facts.get("messages"):
         worry = facts["messages"][0]
     elif facts["transients"] == 1:

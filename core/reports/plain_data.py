@@ -21,6 +21,8 @@ def numbers_of(value: Any, count: int) -> list[float] | None:
     list of float or None
         None if the value is not that.
     """
+    if hasattr(value, "tolist"):  # of a model that was not written yet
+        value = value.tolist()
     good = isinstance(value, (list, tuple)) and len(value) == count and all(isinstance(v, (int, float)) for v in value)
     return [float(v) for v in value] if good else None
 
