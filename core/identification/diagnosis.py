@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
@@ -84,7 +83,11 @@ def check_solvable(problem: Problem, transients: Sequence[Transient], names: Seq
         raise FitError(too_few(problem.N, unknowns))
     if columns.disturbance or columns.noise:
         return
-    rest: NDArray[np.bool_] = np.asarray(~problem.z.any(axis=1))
+    rest = np.ones(problem.N, dtype=bool)
+    for column in problem.z_columns:
+        rest &= column == 0.0
+        if not rest.any():
+            return
     moving = rest[:, None] & (problem.x_next != problem.z[:, : problem.n])
     where = np.argwhere(moving)
     if len(where):
@@ -123,7 +126,7 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
                 f"rank deficient: {_list(part)} move together in every transition, so their columns cannot be told "
                 f"apart and share the effect; record them moving independently, or leave one out"
             )
-    moved = np.ptp(problem.z, axis=0)
+    moved = sums.high - sums.low
     for j in np.flatnonzero((moved == 0) & ~dead[: problem.p]):
         messages.append(
             f"'{names[j]}' is constant ({problem.z[0, j]:.4g}) in every transition, so its column cannot be told from "

@@ -19,7 +19,7 @@ from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Judged, Moments
-from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble
+from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, median_step
 from uncertain_lti.identification.repair import repair
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import GOOD, LEAST, InfeasibleError, Solution, WorkingSet
@@ -170,7 +170,7 @@ def fit(
             method=method,
             alarm_rule=alarm_rule,
             progress=progress,
-            dt_median=float(np.median(problem.dt)),
+            dt_median=median_step(problem.dt),
             describe_on=problem if describe_data else None,
             transients=transients,
             discarded=len(discarded),

@@ -466,7 +466,26 @@ def is_constant(dt: Array) -> bool:
     bool
         True without a step.
     """
-    return bool(np.ptp(dt) <= 1e-6 * np.median(dt)) if dt.size else True
+    if not dt.size or (dt == dt[0]).all():
+        return True
+    return bool(np.ptp(dt) <= 1e-6 * np.median(dt))
+
+
+def median_step(dt: Array) -> float:
+    """Median of Δt; without a sort where all steps are the same.
+
+    Parameters
+    ----------
+    dt : array (N,)
+        Steps, s; at least one.
+
+    Returns
+    -------
+    float
+        In s.
+    """
+    first = float(dt[0])
+    return first if (dt == first).all() else float(np.median(dt))
 
 
 def assemble(
@@ -524,11 +543,16 @@ def assemble(
     x_next = np.empty((n, len(dt)))
     start = 0
     for s in steps:
-        part = slice(start, start + len(s.dt))
-        start = part.stop
+        stop = start + len(s.dt)
+        part = slice(start, stop)
+        start = stop
         _normalise(s.x, point.x_s, point.X, z[:n, part])
         _normalise(s.u, point.u_s, point.U, z[n:, part])
-        _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
+        if s.consecutive:  # the next sample is the next column: computed once
+            x_next[:, part][:, :-1] = z[:n, part][:, 1:]
+            _normalise(s.x_next[-1:], point.x_s, point.X, x_next[:, stop - 1 : stop])
+        else:
+            _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
     _refuse_overflow(transients, z, x_next)
     columns = Columns.of(additive, is_constant(dt))
     chosen = _weights(weights, transients, k, source, n)
@@ -596,10 +620,12 @@ def _factors(
 
 def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> None:
     """(recorded - steady) / scale as `OperatingPoint` does it, into columns; (K, n) to (n, K)."""
-    for row, values, a, b in zip(out, recorded.T, steady, scale, strict=True):
-        np.subtract(values, a, out=row)
-        if b != 1.0:
-            row /= b
+    for start in range(0, len(recorded), BLOCK):  # a piece of the rows stays in the cache while they become columns
+        part = slice(start, start + BLOCK)
+        for row, values, a, b in zip(out[:, part], recorded[part].T, steady, scale, strict=True):
+            np.subtract(values, a, out=row)
+            if b != 1.0:
+                row /= b
 
 
 def _weights(

@@ -62,6 +62,11 @@ class Transitions:
         """
         return Transitions(self.k[which], self.dt[which], self.x[which], self.u[which], self.x_next[which])
 
+    @property
+    def consecutive(self) -> bool:
+        """None is missing between the first and the last, so x_next of one is x of the next."""
+        return len(self.k) > 0 and int(self.k[-1] - self.k[0]) + 1 == len(self.k)
+
 
 class Transient:
     """One recorded run: samples (t, x, u), the steps between them, and where they may not be joined.
@@ -166,9 +171,11 @@ class Transient:
         """Whether the transition k -> k+1 lies in one segment and is finite at both ends, (N,)."""
         if len(self.t_ns) < 2:
             return np.zeros(0, dtype=bool)
+        same = self.segment[1:] == self.segment[:-1]
+        if np.isfinite(self.x).all() and np.isfinite(self.u).all():  # the usual case, in a fraction of the time
+            return np.asarray(same)
         finite_x = np.asarray(np.isfinite(self.x).all(axis=1))
         finite_u = np.asarray(np.isfinite(self.u).all(axis=1))
-        same = self.segment[1:] == self.segment[:-1]
         usable: NDArray[np.bool_] = same & finite_x[:-1] & finite_u[:-1] & finite_x[1:]
         return usable
 
