@@ -4,6 +4,7 @@ import struct
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from bag_writer import (
     Layout,
     Message,
     Topic,
+    cdr,
     channel_record,
     chunk_index,
     chunk_record,
     float64,
+    header,
     message_record,
     ramp,
     raw_file,
@@ -27,13 +30,16 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 from test_annotate import held
 
-from uncertain_lti import SignalMap, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.main import main
 from uncertain_lti.recordings import bag as bag_module
 from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.mcap_index import outline
 from uncertain_lti.recordings.message_types import define
+from uncertain_lti.reports.annotate import annotate
+from uncertain_lti.sampling.reading import read_as_fitted_with_decisions
 from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
 
 TOPIC = Topic("/a")
@@ -369,3 +375,24 @@ def test_a_damaged_definition_in_the_summary_alone_hurts_nothing(tmp_path, model
         assert Bag(path, indexed=True).indexed
         for indexed in (True, False):
             assert read_stream(Bag(path, indexed=indexed), signals).values[0][:, 0].tolist() == list(range(20))
+
+
+def test_a_copy_without_any_sample(tmp_path):
+    """Something is decided on every clock message, and none of them is a sample."""
+    kind = "sensor_msgs/msg/JointState"
+    empty = np.empty(0)
+    data = cdr(kind, header=header(0), name=["a"], position=np.array([1.0]), velocity=empty, effort=empty)
+    stamped = cdr(kind, header=header(10**9), name=["a"], position=np.array([1.0]), velocity=empty, effort=empty)
+    state = {"name": "x", "topic": "/x", "field": "position[0]", "type": kind}
+    signals = SignalMap.from_dict(
+        {"states": [state], "clock": "/x", "max_gap": 5.0, "topics": {"/x": {"time": "header"}}}
+    )
+    model = UncertainLTI([[0.0]], np.zeros((1, 0)), [[1.0]], np.zeros((1, 0)), v=[2.0], signals=signals)
+    bodies = [data, stamped, data]
+    path = write([Topic("/x", kind)], [Message("/x", k, b) for k, b in enumerate(bodies)]).save(tmp_path / "x.mcap")
+    (bag,) = group_recordings([path])
+    transient, decisions = read_as_fitted_with_decisions(bag, signals)
+    every = replace(decisions, dropped=np.ones_like(decisions.dropped))
+    none = Transient(np.empty(0, np.int64), np.empty((0, 1)), np.empty((0, 0)), signals=signals)
+    annotate(bag.parts, EnvelopeMonitor(model).check(none), every, tmp_path / "copy.mcap", model)
+    assert [m.data for m in Bag(tmp_path / "copy.mcap").raw_messages(["/x"])] == bodies

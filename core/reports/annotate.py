@@ -14,10 +14,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti import __version__
+from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.alarm_rule import AlarmRule
@@ -246,21 +249,24 @@ class _VerdictStream:
         v, row, kept = self._verdicts, self._row[chosen], self._kept[chosen]
         known = row >= 0  # before the first sample nothing is, and no alarm
         at = np.maximum(row, 0)
-        if not len(v.judged):
-            at = np.empty(0, dtype=np.int64)
         times = self._log_time[chosen]
-        judged = kept & v.judged[at]
+        judged = kept & _rows(v.judged, at)
         arrays = {"lower": v.lower, "upper": v.upper, "state": v.transient.x, "utilisation": v.utilisation}
         records, index = self._records.encode(
             times,
             self._t_ns[chosen],
             judged,
-            v.outside_domain[at],
-            known & v.alarm[at],
-            np.where(judged[:, None], v.flags[at], np.nan),
-            {name: arrays[name][at] for name in JUDGED},
+            _rows(v.outside_domain, at),
+            known & _rows(v.alarm, at),
+            np.where(judged[:, None], _rows(v.flags, at), np.nan),
+            {name: _rows(arrays[name], at) for name in JUDGED},
         )
         self._writer.chunk(records, index, (int(times[0]), int(times[-1])))
+
+
+def _rows(values: NDArray[Any], at: Integers) -> NDArray[Any]:
+    """Rows of an array; zeros where it has none, as every clock message was dropped."""
+    return values[at] if len(values) else np.zeros((len(at), *values.shape[1:]), values.dtype)
 
 
 def _compression(contents: Sequence[Contents]) -> str:
