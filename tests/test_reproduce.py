@@ -71,8 +71,9 @@ def test_the_published_model_can_be_checked_simulated_and_drawn(tmp_path):
     verdicts = EnvelopeMonitor(model).check(run)
     assert not verdicts.violated.any()
     assert model.simulate(run.x[0], run.u[:-1], run.dt).shape == run.x.shape
-    save(envelope_figure(model, verdicts), tmp_path / "f.png")
-    assert (tmp_path / "f.png").stat().st_size > 10_000
+    figure = envelope_figure(model, verdicts)
+    assert [axes.get_title("left").split()[0] for axes in figure.axes] == [s.name for s in model.signals.states]
+    save(figure, tmp_path / "f.png")
     narrower = UncertainLTI(model.A, model.B, 0.5 * model.dA, 0.5 * model.dB, signals=model.signals)
     assert EnvelopeMonitor(narrower).check(replace_name(run)).violated.any()
 
