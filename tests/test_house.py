@@ -109,3 +109,12 @@ def test_nothing_cites_a_document_that_is_not_here():
         if path.suffix in (".py", ".md", ".yaml", ".toml", ".cfg") and "_build" not in path.parts:
             cited = set(re.findall(r"\b[A-Z]{4,}\.md\b", path.read_text(encoding="utf-8")))
             assert cited <= known, f"{path} cites {cited - known}"
+
+
+def test_recipes_name_files_that_are_there_and_at_most_four_each():
+    recipes = (ROOT / "CONTRIBUTING.md").read_text().split("\n### ")[1:]
+    assert len(recipes) == 6
+    for recipe in recipes:
+        steps = re.findall(r"^\d+\. `([^`]+)`", recipe, re.MULTILINE)
+        assert 1 <= len(steps) <= 4, recipe
+        assert all("NAME" in step or (ROOT / step).is_file() for step in steps), steps

@@ -56,6 +56,8 @@ class Verdict:
         The alarm after this verdict.
     judgement : Judgement or None
         None where there is no verdict.
+    status : Status, optional
+        In place of that of the step, where the monitor gives no verdict on it.
     """
 
     __slots__ = ("t_ns", "arrival_ns", "status", "outside_domain", "alarm", "_after", "_judgement")
@@ -223,7 +225,13 @@ class Verdicts:
         return html_table(repr(self), ("state", "violations", "inside", "mean width", "largest", "first"), rows)
 
     def statuses(self) -> list[Status]:
-        """What became of each sample, (N+1,): `Transient.statuses`, and which steps were out of range."""
+        """What became of each sample.
+
+        Returns
+        -------
+        list of Status
+            N+1, as of `Transient.statuses`, with STEP where a step is out of the range of the fit.
+        """
         kinds = self.transient.statuses()
         return [Status.STEP if odd else kind for odd, kind in zip(self.unfitted_step.tolist(), kinds, strict=True)]
 
