@@ -40,6 +40,8 @@ from typing import Any
 
 import numpy as np
 
+from uncertain_lti.monitor.outputs import OUTPUTS
+
 STATE, CONTROL = "/bench/state", "/bench/control"
 TYPE = "sensor_msgs/msg/JointState"
 CONTROLS = {5: 2, 50: 10}
@@ -276,13 +278,13 @@ class Child:
         self.process.wait()
 
 
-OUTPUTS = "flags violation lower upper state utilisation predicted_lower predicted_upper".split()
+TOPICS = [output.name for output in OUTPUTS]
 SUBJECTS = {
     "bare, default executor": ("take", "default", []),
     "bare, events executor": ("take", "events", []),
-    "publishing only, all outputs": ("relay", "", OUTPUTS),
+    "publishing only, all outputs": ("relay", "", TOPICS),
     "publishing only, ~/violation": ("relay", "", ["violation"]),
-    "monitor, all outputs heard": ("monitor", "", OUTPUTS),
+    "monitor, all outputs heard": ("monitor", "", TOPICS),
     "monitor, ~/violation heard": ("monitor", "", ["violation"]),
 }
 
@@ -493,7 +495,7 @@ def soak(seconds: float, rate: float, n: int) -> dict[str, Any]:
     try:
         with tempfile.TemporaryDirectory() as folder:
             subject = run.monitor(folder)
-            hearer = run.part("hear", *OUTPUTS)
+            hearer = run.part("hear", *TOPICS)
             hearer.line()
             status(run.domain)
             publisher = run.part("publish", str(n), str(rate), str(seconds), "0", "hearer")

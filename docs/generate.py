@@ -1,16 +1,16 @@
-"""Parts of the reference that come from the program itself: every command, and every parameter of the node."""
+"""Parts of the reference that come from the program: every command, and every parameter and output of the node."""
 
 import argparse
 import os
 import re
 from pathlib import Path
 
-COMMANDS, PARAMETERS = "commands.generated.md", "parameters.generated.md"
+COMMANDS, PARAMETERS, TOPICS = "commands.generated.md", "parameters.generated.md", "topics.generated.md"
 
 
 def write(folder: Path) -> None:
-    """Write both parts to a folder, where they differ from what is there."""
-    for name, text in ((COMMANDS, commands()), (PARAMETERS, parameters())):
+    """Write all parts to a folder, where they differ from what is there."""
+    for name, text in ((COMMANDS, commands()), (PARAMETERS, parameters()), (TOPICS, topics())):
         path = folder / name
         if not path.exists() or path.read_text() != text:
             path.write_text(text)
@@ -68,4 +68,13 @@ def parameters() -> str:
         default = '""' if p.default == "" else str(p.default).lower() if isinstance(p.default, bool) else str(p.default)
         limits = "" if p.low is None else f"{p.low:g} to {p.high:g}"
         rows.append(f"| `{p.name}` | `{default}` | {limits} | {'no' if p.fixed else 'yes'} | {_escape(p.text)} |")
+    return "\n".join(rows) + "\n"
+
+
+def topics() -> str:
+    """Markdown table of the topics that envelope_monitor publishes."""
+    from uncertain_lti.monitor.outputs import OUTPUTS
+
+    rows = ["| topic | type | content |", "|---|---|---|"]
+    rows += [f"| `{o.name}` | {o.type.replace('/msg/', '/')} | {o.text} |" for o in OUTPUTS]
     return "\n".join(rows) + "\n"

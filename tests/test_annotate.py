@@ -25,7 +25,8 @@ from test_sampler_arrays import columns
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli.main import main
-from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, NODE, TOPICS, TRUE, NamedVector, VerdictRecords
+from uncertain_lti.monitor.outputs import JUDGED, NODE, RECORDED
+from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, NamedVector, VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
@@ -35,6 +36,7 @@ from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.sampler_arrays import Decisions, decided
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
+TOPICS = {output.name: output.type for output in RECORDED}
 SIGNALS_FOLDER = BAGS.parent / "config" / "signals"
 
 
@@ -119,8 +121,8 @@ def same_verdicts(model, verdicts, path, base=NODE):
     for name in rows:
         assert all(list(m.name) == list(model.state_names) for _, m in found[name])
     kept = np.isin(stamps["flags"], transient.t_ns)
-    arrays = {"lower": verdicts.lower, "upper": verdicts.upper, "utilisation": verdicts.utilisation}
-    for name, array in (*arrays.items(), ("state", transient.x)):
+    for output in JUDGED:
+        name, array = output.name, getattr(verdicts, output.position)
         assert stamps[name].tolist() == transient.t_ns[judged].tolist()
         assert rows[name].tobytes() == array[judged].tobytes()
     flags = rows["flags"]
@@ -268,7 +270,9 @@ def test_everything_recorded_is_in_the_copy(engine, tmp_path, compression, chunk
     with open(tmp_path / "out.mcap", "rb") as stream:  # by the index as well, in order of log time
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
-        assert summary.statistics.message_count == made.messages + 2 * made.verdicts + 4 * int(verdicts.judged.sum())
+        assert summary.statistics.message_count == (
+            made.messages + 2 * made.verdicts + len(JUDGED) * int(verdicts.judged.sum())
+        )
         assert len(summary.attachment_indexes) == 1 and len(summary.metadata_indexes) == 3
         assert [a.data for a in reader.iter_attachments()] == [b"\x00\x01" * 700_000]
         times = [m.log_time for _, _, m in reader.iter_messages(log_time_order=True)]
@@ -371,9 +375,10 @@ def test_records_of_many_verdicts_are_those_of_one_at_a_time():
             times = np.sort(rng.integers(0, 2**62, count))
             stamps = rng.integers(0, 2**62, count)
             judged, outside, alarm = rng.random((3, count)) < 0.5
-            vectors = {name: rng.normal(size=(count, n)) for name in JUDGED}
+            vectors = {output.position: rng.normal(size=(count, n)) for output in JUDGED}
             flags = np.where(judged[:, None], rng.integers(0, 2, (count, n)).astype(float), np.nan)
-            data, index = records.encode(times, stamps, judged, outside, alarm, flags, vectors)
+            numbers = {"flags": flags, "outside_domain": outside, **vectors}
+            data, index = records.encode(times, stamps, judged, alarm, numbers)
             expected = []
             for k in range(count):
                 mark = np.full(n, float(outside[k]) if judged[k] else np.nan)
@@ -381,7 +386,8 @@ def test_records_of_many_verdicts_are_those_of_one_at_a_time():
                 expected.append((1, TRUE if alarm[k] else FALSE))
                 if judged[k]:
                     expected += [
-                        (2 + i, plain(int(stamps[k]), vectors[name][k].tobytes())) for i, name in enumerate(JUDGED)
+                        (2 + i, plain(int(stamps[k]), vectors[output.position][k].tobytes()))
+                        for i, output in enumerate(JUDGED)
                     ]
             read, at, places = [], 0, {}
             while at < len(data):

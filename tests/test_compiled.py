@@ -36,7 +36,8 @@ from uncertain_lti.model import bounds
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.monitor.envelope_monitor import NUMBERS
-from uncertain_lti.monitor.snapshot import Recent, Told
+from uncertain_lti.monitor.snapshot import Recent
+from uncertain_lti.monitor.verdict_messages import AnyVerdict
 from uncertain_lti.sampling import sampler as sampler_module
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti_ros import envelope_monitor as node_module
@@ -138,7 +139,7 @@ class Node(node_module.EnvelopeMonitorNode):
         }
 
 
-def told(verdict: Told) -> tuple[Any, ...]:
+def told(verdict: AnyVerdict) -> tuple[Any, ...]:
     said = [verdict.packed(name) for name in NUMBERS] if verdict.judged else []
     return verdict.t_ns, verdict.n, verdict.judged, verdict.outside_domain, said
 

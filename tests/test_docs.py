@@ -35,6 +35,7 @@ from processes import own_domain
 
 from uncertain_lti import SignalMap, UncertainLTI
 from uncertain_lti.identification.structure import Structure
+from uncertain_lti.monitor.outputs import OUTPUTS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "generated" not in p.name)]
@@ -350,7 +351,8 @@ def test_the_pages_build_without_a_warning(tmp_path):
     theory = (tmp_path / "html" / "theory.html").read_text()
     assert theory.count("<math") > 20 and "cdn" not in theory.lower()
     reference = {
-        page: read_text(tmp_path / "html" / "reference" / f"{page}.html") for page in ("commands", "parameters")
+        page: read_text(tmp_path / "html" / "reference" / f"{page}.html")
+        for page in ("commands", "parameters", "topics")
     }
     commands = re.findall(r"^    (\w+)(?: |$)", help_of().partition("COMMAND\n")[2], re.MULTILINE)
     assert len(commands) > 10
@@ -360,6 +362,8 @@ def test_the_pages_build_without_a_warning(tmp_path):
     for parameter in yaml.safe_load((ROOT / "config" / "envelope_monitor.yaml").read_text()).values():
         for key in flat(parameter["ros__parameters"]):
             assert key in reference["parameters"].split(), f"{key} is not on the built page"
+    for output in OUTPUTS:
+        assert output.name in reference["topics"].split(), f"{output.name} is not on the built page"
 
 
 def help_of(*command: str) -> str:

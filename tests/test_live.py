@@ -17,6 +17,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.monitor.envelope_monitor import Verdict
+from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.sampling.sampler import Sampler
@@ -204,7 +205,7 @@ class Outputs:
 
     @classmethod
     def of(cls, world: World, *more: str) -> Outputs:
-        names = ("flags", "lower", "upper", "state", "utilisation", *more)
+        names = ("flags", *(output.name for output in JUDGED), *more)
         topics = {name: world.listen(JointState, f"/envelope_monitor/{name}") for name in names}
         topics["violation"] = world.listen(Bool, "/envelope_monitor/violation")
         for topic in topics.values():
@@ -223,10 +224,10 @@ class Outputs:
             assert tuple(message.name) == names
             if verdict.status is not Status.UNSTAMPED:  # without a stamp, the time of receipt stands in
                 assert stamp_of(message) == verdict.t_ns
-        for name in ("lower", "upper", "state", "utilisation"):
-            got = self.topics[name].count(len(judged))
+        for output in JUDGED:
+            got = self.topics[output.name].count(len(judged))
             assert [stamp_of(m) for m in got] == [v.t_ns for v in judged]
-            assert [bits(m.position) for m in got] == [bits(getattr(v, name)) for v in judged]
+            assert [bits(m.position) for m in got] == [bits(getattr(v, output.position)) for v in judged]
         time.sleep(0.3)
         assert len(self.topics["flags"].messages) == len(verdicts), "more flags than clock messages"
         assert self.topics["violation"].messages[-1].data == verdicts[-1].alarm

@@ -6,7 +6,6 @@ import gc
 import json
 import math
 import os
-import struct
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
@@ -26,8 +25,6 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.compiled import why_not
@@ -36,9 +33,10 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.journal import Journal
+from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED, VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Watch, topic_types
 from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
-from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TRUE
+from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti_ros.arguments import declare, run_node
@@ -54,8 +52,6 @@ _SUMMARY = (
     "~/violation is the alarm. Needs the parameter model. Services: ~/status, ~/reset, ~/reload, ~/snapshot "
     "(std_srvs/srv/Trigger) and those of a managed node."
 )
-VECTORS = ("flags", *JUDGED, "predicted_lower", "predicted_upper")
-"""Topics below the node's name that carry one number per state as sensor_msgs/JointState."""
 _TICK = 0.2  # s between two looks at what goes by time
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
 _NOTE = 0.05  # s between two looks for what the log should say
@@ -63,7 +59,6 @@ _OUTPUT_DEPTH = 1000
 _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 _LOGGED = 5.0  # s between two log entries on unexpected errors
 _MIB = 1 << 20
-_NAN = float("nan")
 
 _TRANSITIONS = {
     getattr(Transition, name): name.removeprefix("TRANSITION_").lower()
@@ -73,7 +68,7 @@ _TRANSITIONS = {
 _type_fields = cache(live_fields)
 
 
-class _Output:
+class _Publisher:
     """One topic of the node, and how many listen to it; takes serialised messages."""
 
     def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
@@ -89,6 +84,10 @@ class _Output:
     def look(self) -> None:
         """Ask how many listen; events tell as well, and sooner."""
         self.listeners = self.publisher.get_subscription_count()
+
+
+_Vector = tuple[_Publisher, Callable[[AnyVerdict], bytes]]
+"""A publisher, and what makes its message of a verdict."""
 
 
 def _failures_noted(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
@@ -118,7 +117,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self._inputs: dict[str, MatchedSubscription] = {}
         self._told: dict[str, tuple[int, int]] = {}  # topic: lost and late messages that the last report told of
-        self._outputs: dict[str, _Output] = {}
+        self._outputs: dict[str, _Publisher] = {}
         self._enable_problem = ""
         self._candidate: Watch | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
@@ -295,10 +294,11 @@ class EnvelopeMonitorNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         self._reason = ""
         qos = QoSProfile(depth=_OUTPUT_DEPTH)
-        for name in VECTORS:
-            self._outputs[name] = _Output(self, JointState, name, qos)
         beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=self._real("heartbeat")))
-        self._outputs["violation"] = _Output(self, Bool, "violation", beat)
+        for output in OUTPUTS:
+            kind = message_class(output.type)
+            self._outputs[output.name] = _Publisher(self, kind, output.name, beat if output is VIOLATION else qos)
+        self._violation = self._outputs[VIOLATION.name]
         self._prepare_outputs()
         self.get_logger().info(f"configured with {Path(path).name}: {self.watch.model}")
         if self.watch.model.sampling.dt_median is None:
@@ -325,10 +325,14 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _prepare_outputs(self) -> None:
         assert self.watch is not None
         names = self.watch.model.state_names
-        self._plain, self._marked = sendable(names), sendable(names, velocities=True)
-        n = len(names)
-        self._marks = {mark: struct.pack(f"<{n}d", *[mark] * n) for mark in (0.0, 1.0)}
-        self._no_mark = struct.pack(f"<{n}d", *[_NAN] * n)
+        encode = VerdictMessages(names, sendable).encode
+
+        def vectors(*when: str) -> list[_Vector]:
+            chosen = [output.name for output in OUTPUTS if output.position and output.when in when]
+            return [(self._outputs[name], encode[name]) for name in chosen]
+
+        self._vectors = vectors("message"), vectors("message", "judged")
+        self._predicted = vectors("predicted")
 
     @_failures_noted
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -537,27 +541,21 @@ class EnvelopeMonitorNode(LifecycleNode):
         First everything is laid out, then all of it is sent in one go: threads of the middleware that are woken by
         one message then find the others as well, and need not be woken again.
         """
-        outputs = self._outputs
         messages = []
         for verdict in verdicts:
-            t_ns, judged = verdict.t_ns, verdict.judged
-            if outputs["flags"].listeners:
-                mark = self._marks[verdict.outside_domain] if judged else self._no_mark
-                messages.append((outputs["flags"].send, self._marked(t_ns, verdict.packed("flags"), mark)))
-            if not judged:
-                continue
-            turned |= outputs["violation"].listeners > 0
-            for name in JUDGED:
-                if outputs[name].listeners:
-                    messages.append((outputs[name].send, self._plain(t_ns, verdict.packed(name))))
-        wanted = [name for name in ("lower", "upper") if outputs[f"predicted_{name}"].listeners]
-        if opened and wanted and (expected := watch.predict()) is not None:
-            for name in wanted:
-                message = self._plain(expected.t_ns, expected.packed(name))
-                messages.append((outputs[f"predicted_{name}"].send, message))
+            judged = verdict.judged
+            for publisher, encode in self._vectors[judged]:
+                if publisher.listeners:
+                    messages.append((publisher.send, encode(verdict)))
+            turned |= judged and self._violation.listeners > 0
+        if opened and any(publisher.listeners for publisher, _ in self._predicted):
+            expected = watch.predict()
+            for publisher, encode in self._predicted:
+                if publisher.listeners and expected is not None:
+                    messages.append((publisher.send, encode(expected)))
         if turned:
             self._published = now
-            messages.append((outputs["violation"].send, TRUE if watch.alarm else FALSE))
+            messages.append((self._violation.send, TRUE if watch.alarm else FALSE))
         for send, message in messages:
             send(message)
 
@@ -569,7 +567,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _beat(self) -> None:
         assert self.watch is not None
         self._published = time.monotonic()
-        self._outputs["violation"].send(TRUE if self.watch.alarm else FALSE)
+        self._violation.send(TRUE if self.watch.alarm else FALSE)
 
     # --- heartbeat, graph, diagnostics ---
 
@@ -665,7 +663,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._recent.entries(),
             watch.model.state_names,
             watch.types,
-            {name: self.resolve_topic_name(f"~/{name}") for name in ("flags", "violation", *JUDGED)},
+            {output.name: self.resolve_topic_name(f"~/{output.name}") for output in RECORDED},
             {
                 "node": self.get_fully_qualified_name(),
                 "why": why,

@@ -236,6 +236,11 @@ class Verdicts:
         return [Status.STEP if odd else kind for odd, kind in zip(self.unfitted_step.tolist(), kinds, strict=True)]
 
     @property
+    def state(self) -> Array:
+        """The samples, in recorded units (N+1, n)."""
+        return self.transient.x
+
+    @property
     def violated(self) -> NDArray[np.bool_]:
         """Whether some state left its bounds, (N+1,)."""
         left: NDArray[np.bool_] = (self.flags == 1.0).any(axis=1)

@@ -12,6 +12,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Arming, Condition
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
+from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
 from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.sampler import Sampler, all_finite
@@ -716,8 +717,7 @@ class Watch:
         values["masked"] = str(int(masked))
         violated = period.violations[i]
         if self.last is not None:
-            for key in ("state", "lower", "upper", "utilisation"):
-                values[key] = repr(self.last.numbers(key)[i])
+            values |= {output.name: repr(self.last.numbers(output.position)[i]) for output in JUDGED}
             if not period.verdicts:  # the clock is slower than the reports
                 violated = int(self.last.numbers("flags")[i] == 1.0)
         age = f"last verdict {without:.1f} s ago: "

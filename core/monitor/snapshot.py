@@ -1,10 +1,9 @@
-"""Snapshots: the last seconds of what came in and of what was said of it, kept in memory and written to MCAP files."""
+"""Snapshots: the last seconds of messages and their verdicts, kept in memory and written to MCAP files."""
 
 from __future__ import annotations
 
 import os
 import re
-import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -12,48 +11,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Protocol
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.monitor.verdict_messages import FALSE, JUDGED, TOPICS, TRUE, NamedVector
+from uncertain_lti.monitor.outputs import FLAG_TYPE, RECORDED
+from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
 from uncertain_lti.recordings.mcap_writer import McapWriter
 
 _OVERHEAD = 800  # bytes that one kept message takes beside its data, a verdict on it included
 _PER_STATE = 200  # and for each state of a verdict
-
-
-class Told(Protocol):
-    """What a file tells of a verdict; `Verdict` is one."""
-
-    @property
-    def t_ns(self) -> int:
-        """The sample's instant."""
-
-    @property
-    def n(self) -> int:
-        """Number of states."""
-
-    @property
-    def judged(self) -> bool:
-        """Whether there is a verdict."""
-
-    @property
-    def outside_domain(self) -> bool:
-        """The sample before lies outside the ranges seen in the fit."""
-
-    def packed(self, name: str) -> bytes:
-        """Numbers of one kind.
-
-        Parameters
-        ----------
-        name : str
-            One of `NUMBERS`.
-
-        Returns
-        -------
-        bytes
-            Little-endian doubles.
-        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +35,7 @@ class Entry:
         Its topic.
     data : bytes
         Serialised message.
-    verdicts : sequence of Told
+    verdicts : sequence of AnyVerdict
         On the clock messages that it decided.
     alarm : bool
         The alarm after it.
@@ -80,7 +45,7 @@ class Entry:
     arrival_ns: int
     topic: str
     data: bytes
-    verdicts: Sequence[Told]
+    verdicts: Sequence[AnyVerdict]
     alarm: bool
 
 
@@ -160,7 +125,7 @@ class Scene:
     entries: Sequence[Entry]
     names: Sequence[str]
     inputs: Mapping[str, str]
-    outputs: Mapping[str, str]  # flags, violation, lower, ...: topic
+    outputs: Mapping[str, str]
     notes: Mapping[str, str]
     definition: Callable[[str], str]
 
@@ -183,14 +148,15 @@ class Scene:
             The file cannot be written.
         """
         count = 0
-        plain, marked = NamedVector(self.names), NamedVector(self.names, velocities=True)
+        encode = VerdictMessages(self.names).encode
         with open(path, "xb") as stream:
             writer = McapWriter(stream, "uncertain-lti")
             writer.metadata("uncertain_lti", self.notes)
             inputs = {t: writer.channel(t, kind, self.definition(kind)) for t, kind in self.inputs.items()}
             outputs = {
-                name: writer.channel(topic, TOPICS[name], self.definition(TOPICS[name]))
-                for name, topic in self.outputs.items()
+                output: writer.channel(self.outputs[output.name], output.type, self.definition(output.type))
+                for output in RECORDED
+                if output.name in self.outputs
             }
             log_time = 0
             for entry in self.entries:
@@ -202,14 +168,12 @@ class Scene:
                 for verdict in entry.verdicts:
                     if verdict.n != len(self.names):
                         continue
-                    outside = float(verdict.outside_domain) if verdict.judged else float("nan")
-                    velocity = struct.pack("<d", outside) * verdict.n
-                    writer.message(outputs["flags"], log_time, marked(verdict.t_ns, verdict.packed("flags"), velocity))
-                    writer.message(outputs["violation"], log_time, TRUE if entry.alarm else FALSE)
-                    count += 2
-                    for name in JUDGED if verdict.judged else ():
-                        data = plain(verdict.t_ns, verdict.packed(name))
-                        writer.message(outputs[name], log_time, data)
+                    for output, channel in outputs.items():
+                        if output.when == "judged" and not verdict.judged:
+                            continue
+                        alarm = TRUE if entry.alarm else FALSE
+                        data = alarm if output.type == FLAG_TYPE else encode[output.name](verdict)
+                        writer.message(channel, log_time, data)
                         count += 1
             writer.finish()
             stream.flush()

@@ -1,4 +1,4 @@
-"""Messages that tell verdicts, in serialised form: laid out once, then only stamps and numbers are filled in.
+"""Messages of verdicts in serialised form: laid out once, then only stamps and numbers are filled in.
 
 The live node, its snapshots and annotated recordings carry the same topics, types and bytes.
 """
@@ -6,22 +6,15 @@ The live node, its snapshots and annotated recordings carry the same topics, typ
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.monitor.outputs import FLAG_TYPE, OUTPUTS, RECORDED, Output
 from uncertain_lti.recordings.mcap_writer import INDEX_ENTRY, MESSAGE_HEAD
-
-VECTOR_TYPE, FLAG_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
-JUDGED = ("lower", "upper", "state", "utilisation")
-"""Topics that say something only where there is a verdict."""
-TOPICS: Mapping[str, str] = {"flags": VECTOR_TYPE, "violation": FLAG_TYPE} | dict.fromkeys(JUDGED, VECTOR_TYPE)
-"""What is told of every clock message, below the node's name: topic and type."""
-NODE = "/envelope_monitor"
-"""Name of the node unless it is given another."""
 
 _ENCAPSULATION = 4
 TRUE, FALSE = b"\x00\x01\x00\x00\x01", b"\x00\x01\x00\x00\x00"
@@ -47,7 +40,7 @@ class NamedVector:
     template : bytes
         The message with zeros for stamp and numbers.
     position, velocity : int
-        Where in it their numbers stand.
+        Byte at which their numbers begin.
 
     Raises
     ------
@@ -72,7 +65,7 @@ class NamedVector:
         _numbers(body, 0)
         self.template = bytes((0, 1, 0, 0)) + bytes(body)
         width = 8 * len(names)
-        # What stands before, between and after stamp, position and velocity.
+        # The bytes before, between and after stamp, position and velocity.
         self._start = self.template[:_ENCAPSULATION]
         self._names = self.template[_ENCAPSULATION + _STAMP.size : self.position]
         self._between = self.template[self.position + width : self.velocity]
@@ -92,31 +85,105 @@ class NamedVector:
         return self._start + _STAMP.pack(max(_FIRST_S, min(seconds, _LAST_S)), nanoseconds) + self._names
 
 
+class AnyVerdict(Protocol):
+    """What messages take from a verdict; `Verdict` is one."""
+
+    @property
+    def t_ns(self) -> int:
+        """The sample's instant."""
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+
+    @property
+    def judged(self) -> bool:
+        """Whether there is a verdict."""
+
+    @property
+    def outside_domain(self) -> bool:
+        """The sample before lies outside the ranges seen in the fit."""
+
+    def packed(self, name: str) -> bytes:
+        """Numbers of one kind.
+
+        Parameters
+        ----------
+        name : str
+            One of `NUMBERS`.
+
+        Returns
+        -------
+        bytes
+            Little-endian doubles.
+        """
+
+
+class VerdictMessages:
+    """Messages of one verdict after another, for each vector of `OUTPUTS`.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the states.
+    make_vector : callable, default NamedVector
+        Makes the messages from names and `velocities`; raises ModelError.
+
+    Attributes
+    ----------
+    encode : dict
+        Of each vector of `OUTPUTS`, by name, the function that makes the message of a verdict.
+    """
+
+    def __init__(self, names: Sequence[str], make_vector: Callable[[Sequence[str], bool], NamedVector] = NamedVector):
+        self._plain, self._marked = make_vector(names, False), make_vector(names, True)  # shared: their stamps repeat
+        n = len(names)
+        self._marks = {mark: struct.pack(f"<{n}d", *[mark] * n) for mark in (False, True)}
+        self._no_mark = struct.pack(f"<{n}d", *[_NAN] * n)
+        self.encode = {output.name: self._encoder(output) for output in OUTPUTS if output.position}
+
+    def _encoder(self, output: Output) -> Callable[[AnyVerdict], bytes]:
+        plain, marked, marks, no_mark = self._plain, self._marked, self._marks, self._no_mark
+        position, velocity = output.position, output.velocity
+
+        def encode(verdict: AnyVerdict) -> bytes:
+            return plain(verdict.t_ns, verdict.packed(position))
+
+        def encode_marked(verdict: AnyVerdict) -> bytes:
+            mark = marks[getattr(verdict, velocity)] if verdict.judged else no_mark
+            return marked(verdict.t_ns, verdict.packed(position), mark)
+
+        return encode_marked if velocity else encode
+
+
 class VerdictRecords:
-    """MCAP message records of many verdicts at once, with the bytes that `NamedVector` gives one by one.
+    """MCAP message records of many verdicts at once, with the bytes that `VerdictMessages` gives one by one.
 
     Parameters
     ----------
     names : sequence of str
         Of the states.
     channels : mapping of str to int
-        Number of the channel of each of `TOPICS`.
+        Number of the channel of each of `RECORDED`, by name.
     """
 
     def __init__(self, names: Sequence[str], channels: Mapping[str, int]) -> None:
         self._n = len(names)
-        self._channels = [channels[name] for name in TOPICS]
-        self._count = [0] * len(TOPICS)
-        plain, marked = NamedVector(names), NamedVector(names, velocities=True)
-        self._vectors = {name: plain for name in JUDGED} | {"flags": marked}
+        self._channels = [channels[output.name] for output in RECORDED]
+        self._count = [0] * len(RECORDED)
+        vectors = NamedVector(names), NamedVector(names, velocities=True)
+        self._vectors = {output.name: vectors[bool(output.velocity)] for output in RECORDED if output.position}
         row = bytearray()
         self._begins: list[int] = []
-        for name, channel in zip(TOPICS, self._channels, strict=True):
-            data = FALSE if name == "violation" else self._vectors[name].template
+        self._unjudged = 0  # bytes of the records without a verdict, which come first
+        for output, channel in zip(RECORDED, self._channels, strict=True):
+            data = FALSE if output.type == FLAG_TYPE else self._vectors[output.name].template
             self._begins.append(len(row))
             row += MESSAGE_HEAD.pack(_MESSAGE, MESSAGE_HEAD.size - 9 + len(data), channel, 0, 0, 0) + data
+            if output.when == "message":
+                assert self._unjudged == self._begins[-1], "OUTPUTS has those of every clock message first"
+                self._unjudged = len(row)
         self._row = np.frombuffer(bytes(row), dtype=np.uint8)
-        self._unjudged = self._begins[len(TOPICS) - len(JUDGED)]  # bytes of what is said without a verdict
 
     @property
     def size(self) -> int:
@@ -128,10 +195,8 @@ class VerdictRecords:
         log_time: NDArray[np.int64],
         t_ns: NDArray[np.int64],
         judged: NDArray[np.bool_],
-        outside_domain: NDArray[np.bool_],
         alarm: NDArray[np.bool_],
-        flags: Array,
-        vectors: Mapping[str, Array],
+        numbers: Mapping[str, NDArray[np.generic]],
     ) -> tuple[bytes, dict[int, bytes]]:
         """Records of K verdicts in rising log time.
 
@@ -142,15 +207,11 @@ class VerdictRecords:
         t_ns : array (K,) of int
             Instants of the samples, ns.
         judged : array (K,) of bool
-            Whether there is a verdict.
-        outside_domain : array (K,) of bool
-            As in `Verdicts`.
+            Whether there is a verdict; the numbers of the others are published as NaN.
         alarm : array (K,) of bool
             As in `Verdicts`.
-        flags : array (K, n)
-            As in `Verdicts`.
-        vectors : mapping of str to array (K, n)
-            The numbers of each of `JUDGED`.
+        numbers : mapping of str to array
+            Of each `position` in `RECORDED` the numbers (K, n), of each `velocity` the truth values (K,).
 
         Returns
         -------
@@ -163,28 +224,28 @@ class VerdictRecords:
         rows = np.tile(self._row, (count, 1))
         seconds, nanoseconds = np.divmod(t_ns, 1_000_000_000)
         seconds = np.clip(seconds, _FIRST_S, _LAST_S)
-        outside = np.where(judged, outside_domain, _NAN)
         lengths = np.where(judged, self.size, self._unjudged)
         starts = np.cumsum(lengths) - lengths
         index: dict[int, bytes] = {}
-        for kind, (name, begin) in enumerate(zip(TOPICS, self._begins, strict=True)):
-            said = judged if name in JUDGED else np.ones(count, dtype=bool)
-            _fill(rows, begin + 11, (self._count[kind] + np.cumsum(said) - 1).astype("<u4"))
-            self._count[kind] += int(said.sum())
+        for kind, (output, begin) in enumerate(zip(RECORDED, self._begins, strict=True)):
+            published = judged if output.when == "judged" else np.ones(count, dtype=bool)
+            _fill(rows, begin + 11, (self._count[kind] + np.cumsum(published) - 1).astype("<u4"))
+            self._count[kind] += int(published.sum())
             for place in (begin + 15, begin + 23):
                 _fill(rows, place, log_time.astype("<u8"))
             data = begin + MESSAGE_HEAD.size
-            if name == "violation":
+            if output.type == FLAG_TYPE:
                 rows[:, data + 4] = alarm
             else:
-                vector = self._vectors[name]
+                vector = self._vectors[output.name]
                 _fill(rows, data + 4, seconds.astype("<i4"))
                 _fill(rows, data + 8, nanoseconds.astype("<u4"))
-                _fill(rows, data + vector.position, (flags if name == "flags" else vectors[name]).astype("<f8"))
-                if name == "flags":
-                    velocity = np.repeat(outside[:, None], self._n, axis=1)
-                    _fill(rows, data + vector.velocity, velocity.astype("<f8"))
-            entries = np.column_stack([log_time[said], starts[said] + begin]).astype("<u8")
+                position = np.where(judged[:, None], numbers[output.position], _NAN)
+                _fill(rows, data + vector.position, position.astype("<f8"))
+                if output.velocity:
+                    velocity = np.where(judged, numbers[output.velocity], _NAN)
+                    _fill(rows, data + vector.velocity, np.repeat(velocity[:, None], self._n, axis=1).astype("<f8"))
+            entries = np.column_stack([log_time[published], starts[published] + begin]).astype("<u8")
             if len(entries):
                 index[self._channels[kind]] = entries.tobytes()
             assert INDEX_ENTRY.size == 8 * entries.shape[1]
@@ -205,7 +266,7 @@ def _counted(body: bytearray, count: int) -> None:
 
 
 def _numbers(body: bytearray, count: int) -> int:
-    """Add a sequence of doubles; returns where in the message its numbers stand."""
+    """Add a sequence of doubles; returns the byte of the message at which its numbers begin."""
     _counted(body, count)
     if count:
         body += b"\x00" * (-len(body) % 8)

@@ -26,7 +26,8 @@ from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
-from uncertain_lti.monitor.verdict_messages import JUDGED, NODE, TOPICS, VerdictRecords
+from uncertain_lti.monitor.outputs import NODE, RECORDED
+from uncertain_lti.monitor.verdict_messages import VerdictRecords
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of
 from uncertain_lti.recordings.mcap_records import LATEST, Contents
 from uncertain_lti.recordings.mcap_scan import scan
@@ -177,8 +178,8 @@ def annotate(
             numbers = [copier.declare(part) for part in contents]
             base = _base({c.topic for part in contents for c in part.channels.values()})
             channels = {
-                name: copier.channel(_schema(copier, contents, kind), f"{base}/{name}", "cdr", {})
-                for name, kind in TOPICS.items()
+                output.name: copier.channel(_schema(copier, contents, output.type), f"{base}/{output.name}", "cdr", {})
+                for output in RECORDED
             }
             writer.metadata(METADATA, _about(contents, base, model, model_file, rule))
             verdict_stream = _VerdictStream(writer, VerdictRecords(model.state_names, channels), verdicts, decisions)
@@ -251,15 +252,13 @@ class _VerdictStream:
         at = np.maximum(row, 0)
         times = self._log_time[chosen]
         judged = kept & _rows(v.judged, at)
-        arrays = {"lower": v.lower, "upper": v.upper, "state": v.transient.x, "utilisation": v.utilisation}
+        names = {name for output in RECORDED for name in (output.position, output.velocity) if name}
         records, index = self._records.encode(
             times,
             self._t_ns[chosen],
             judged,
-            _rows(v.outside_domain, at),
             known & _rows(v.alarm, at),
-            np.where(judged[:, None], _rows(v.flags, at), np.nan),
-            {name: _rows(arrays[name], at) for name in JUDGED},
+            {name: _rows(getattr(v, name), at) for name in names},
         )
         self._writer.chunk(records, index, (int(times[0]), int(times[-1])))
 
@@ -280,7 +279,7 @@ def _compression(contents: Sequence[Contents]) -> str:
 def _base(topics: set[str]) -> str:
     """Beginning of the topics, under which none of the recording is."""
     base, number = NODE, 1
-    while any(f"{base}/{name}" in topics for name in TOPICS):
+    while any(f"{base}/{output.name}" in topics for output in RECORDED):
         base = f"{NODE}_check" if number == 1 else f"{NODE}_check_{number}"
         number += 1
     return base

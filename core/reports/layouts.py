@@ -14,12 +14,20 @@ from xml.sax.saxutils import quoteattr
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import may_replace, whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.verdict_messages import NODE
+from uncertain_lti.monitor.outputs import NODE, OUTPUTS, Output
 from uncertain_lti.signals.signal_map import Signal
 
 BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"
 """Distinguished by colour-blind people, on light and on dark ground (Okabe and Ito 2008)."""
 _PAGE = 6  # states that one page shows
+_BOUNDS = tuple(output for output in OUTPUTS if output.view in ("bound", "sample"))
+_STATES = tuple(output for output in OUTPUTS if output.view == "states")
+_STEPS = tuple(output for output in OUTPUTS if output.view == "steps")
+_ALARMS = tuple(output for output in OUTPUTS if output.view == "alarm")
+
+
+def _colour(output: Output) -> str:
+    return BOUND if output.view == "bound" else RECORDED
 
 
 def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any]:
@@ -52,42 +60,35 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any
     pages = []
     for page, begin in enumerate(range(0, len(states), _PAGE)):
         rows = []
-        for i, state in list(enumerate(states))[begin : begin + _PAGE]:
+        shown = list(enumerate(states))[begin : begin + _PAGE]
+        for i, state in shown:
             title = f"{state.name} [{state.unit}]" if state.unit else state.name
-            lines = (("lower", BOUND, 1.5), ("upper", BOUND, 1.5), ("state", RECORDED, 1.5))
-            paths = [_line(f"{base}/{topic}.position[{i}]", topic, colour, size) for topic, colour, size in lines]
+            paths = [_line(f"{base}/{o.name}.position[{i}]", o.name, _colour(o), 1.5) for o in _BOUNDS]
             rows.append(plot(f"bounds{i}", title, paths))
-        paths = [
-            _line(f"{base}/utilisation.position[{i}]", state.name)
-            for i, state in list(enumerate(states))[begin : begin + _PAGE]
-        ]
-        limits = [_line("1", "upper bound", VIOLATED, 1.0), _line("-1", "lower bound", VIOLATED, 1.0)]
-        utilisation = plot(f"utilisation{page}", "utilisation: -1 and 1 at the bounds", paths + limits)
-        flags = panel(
-            "StateTransitions",
-            f"flags{page}",
-            "0 contained, 1 violated",
-            {
-                "isSynced": True,
-                "paths": [
-                    {"value": f"{base}/flags.position[{i}]", "label": state.name, "timestampMethod": "receiveTime"}
-                    for i, state in list(enumerate(states))[begin : begin + _PAGE]
-                ],
-            },
-        )
-        pages.append(_split("row", _stack(rows), _stack([utilisation, flags]), 60))
+        together = []
+        for output in _STATES:
+            paths = [_line(f"{base}/{output.name}.position[{i}]", state.name) for i, state in shown]
+            limits = [_line(f"{value:g}", label, VIOLATED, 1.0) for label, value in output.limits]
+            together.append(plot(f"{output.name}{page}", output.title, paths + limits))
+        for output in _STEPS:
+            paths = [_change(f"{base}/{output.name}.position[{i}]", state.name) for i, state in shown]
+            steps = {"isSynced": True, "paths": paths}
+            together.append(panel("StateTransitions", f"{output.name}{page}", output.title, steps))
+        pages.append(_split("row", _stack(rows), _stack(together), 60))
     if len(pages) == 1:
         body: Any = pages[0]
     else:
         titles = [f"{i * _PAGE + 1} to {min((i + 1) * _PAGE, len(states))}" for i in range(len(pages))]
         tabs = [{"title": title, "layout": page} for title, page in zip(titles, pages, strict=True)]
         body = panel("Tab", "states", "states", {"activeTabIdx": 0, "tabs": tabs})
+    (violation,) = _ALARMS
+    value = f"{base}/{violation.name}.data"
     alarm = panel(
         "Indicator",
         "alarm",
         "alarm",
         {
-            "path": f"{base}/violation.data",
+            "path": value,
             "style": "background",
             "fallbackColor": UNKNOWN,
             "fallbackLabel": "no verdict yet",
@@ -97,15 +98,8 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any
             ],
         },
     )
-    raised = panel(
-        "StateTransitions",
-        "alarm",
-        "alarm",
-        {
-            "isSynced": True,
-            "paths": [{"value": f"{base}/violation.data", "label": "alarm", "timestampMethod": "receiveTime"}],
-        },
-    )
+    steps = {"isSynced": True, "paths": [_change(value, "alarm")]}
+    raised = panel("StateTransitions", "alarm", "alarm", steps)
     return {
         "configById": panels,
         "globalVariables": {},
@@ -136,17 +130,17 @@ def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
         plots = []
         for state in page:
             title = f"{state.name} [{state.unit}]" if state.unit else state.name
-            curves = (("lower", BOUND), ("upper", BOUND), ("state", RECORDED))
-            plots.append((title, [(f"{base}/{topic}/{state.name}/position", colour) for topic, colour in curves]))
+            plots.append((title, [(f"{base}/{o.name}/{state.name}/position", _colour(o)) for o in _BOUNDS]))
         some = len(states) > _PAGE
         numbers = f" {begin + 1} to {begin + len(page)}" if some else ""
         tabs.append((f"bounds{numbers}", plots))
         colours = _cycle(len(page))
-        flags_and_reasons = [
-            (title, [(f"{base}/{topic}/{s.name}/position", c) for s, c in zip(page, colours, strict=True)])
-            for topic, title in (("utilisation", "utilisation: -1 and 1 at the bounds"), ("flags", "1: violated"))
+        verdicts = [
+            (o.title, [(f"{base}/{o.name}/{s.name}/position", c) for s, c in zip(page, colours, strict=True)])
+            for o in (*_STATES, *_STEPS)
         ]
-        tabs.append((f"verdicts{numbers}", [*flags_and_reasons, ("alarm", [(f"{base}/violation/data", VIOLATED)])]))
+        verdicts += [("alarm", [(f"{base}/{o.name}/data", VIOLATED)]) for o in _ALARMS]
+        tabs.append((f"verdicts{numbers}", verdicts))
     lines = [
         "<?xml version='1.0' encoding='UTF-8'?>",
         "<root>",
@@ -236,6 +230,10 @@ def foxglove_text(states: Sequence[Signal], base: str = NODE) -> str:
 def _line(value: str, label: str, colour: str = "", size: float = 1.0) -> dict[str, Any]:
     line = {"value": value, "label": label, "enabled": True, "timestampMethod": "receiveTime", "lineSize": size}
     return line | ({"color": colour} if colour else {})
+
+
+def _change(value: str, label: str) -> dict[str, Any]:
+    return {"value": value, "label": label, "timestampMethod": "receiveTime"}
 
 
 def _split(direction: str, first: Any, second: Any, percentage: float) -> dict[str, Any]:

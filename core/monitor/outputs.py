@@ -1,0 +1,104 @@
+"""Output topics in one table: name, message type, when each is published, and which number of a verdict it carries.
+
+Publishers of the node, snapshots, annotated recordings, layouts of viewers and the reference take them from `OUTPUTS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+VECTOR_TYPE, FLAG_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
+NODE = "/envelope_monitor"
+"""Name of the node unless it is given another."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """One topic below the node's name.
+
+    Parameters
+    ----------
+    name : str
+        Last part of the topic's name.
+    type : str
+        Message type: `VECTOR_TYPE` with one number per state, or `FLAG_TYPE` with the alarm.
+    when : {"message", "judged", "predicted"}
+        For every clock message, for those with a verdict, or for the prediction after an open sample.
+    text : str
+        What it says, for the reference (Markdown).
+    position : str
+        The number of a verdict that `position` holds, one of `envelope_monitor.NUMBERS`; empty without one.
+    velocity : str
+        Attribute of a verdict, true or false, that `velocity` repeats for each state; empty without one.
+    view : {"", "bound", "sample", "states", "steps", "alarm"}
+        How viewers draw it: a bound or the sample in the plot of each state, all states in one plot, changes in time,
+        or the alarm. Empty: not at all.
+    title : str
+        Title of its plot, for the views "states" and "steps".
+    limits : tuple of (str, float)
+        Constant lines of its plot, for the view "states".
+    """
+
+    name: str
+    type: str
+    when: Literal["message", "judged", "predicted"]
+    text: str
+    position: str = ""
+    velocity: str = ""
+    view: Literal["", "bound", "sample", "states", "steps", "alarm"] = ""
+    title: str = ""
+    limits: tuple[tuple[str, float], ...] = ()
+
+
+FLAGS = Output(
+    "flags",
+    VECTOR_TYPE,
+    "message",
+    "for every clock message: `position` 0 contained, 1 violated, NaN no verdict, per state; `velocity` 1: the sample "
+    "before lies outside the fitted domain",
+    position="flags",
+    velocity="outside_domain",
+    view="steps",
+    title="0 contained, 1 violated",
+)
+VIOLATION = Output(
+    "violation",
+    FLAG_TYPE,
+    "message",
+    "the alarm: m of the last n verdicts violated; false also while nothing is known; every verdict, and at least "
+    "every `heartbeat`, with a deadline offered",
+    view="alarm",
+)
+OUTPUTS = (
+    FLAGS,
+    VIOLATION,
+    Output("lower", VECTOR_TYPE, "judged", "the lower bound that was judged", position="lower", view="bound"),
+    Output("upper", VECTOR_TYPE, "judged", "the upper bound that was judged", position="upper", view="bound"),
+    Output("state", VECTOR_TYPE, "judged", "the sample that was judged", position="state", view="sample"),
+    Output(
+        "utilisation",
+        VECTOR_TYPE,
+        "judged",
+        "where between its bounds each state lies, -1 to 1 inside",
+        position="utilisation",
+        view="states",
+        title="utilisation: -1 and 1 at the bounds",
+        limits=(("upper bound", 1.0), ("lower bound", -1.0)),
+    ),
+    Output(
+        "predicted_lower",
+        VECTOR_TYPE,
+        "predicted",
+        "on receipt of a sample, the lower bound one median step on, with the control known so far; only while "
+        "somebody subscribes",
+        position="lower",
+    ),
+    Output("predicted_upper", VECTOR_TYPE, "predicted", "the same for the upper bound", position="upper"),
+)
+"""Every output, those of every clock message first."""
+
+RECORDED = tuple(output for output in OUTPUTS if output.when != "predicted")
+"""The outputs that files hold: all that depend on verdicts alone."""
+JUDGED = tuple(output for output in OUTPUTS if output.when == "judged")
+"""The outputs that only a verdict has."""

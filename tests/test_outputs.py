@@ -1,0 +1,69 @@
+"""The table of output topics: what a verdict publishes, one row each."""
+
+import numpy as np
+import pytest
+
+from uncertain_lti import EnvelopeMonitor, Transient
+from uncertain_lti.model.domain import Domain
+from uncertain_lti.monitor.envelope_monitor import NUMBERS
+from uncertain_lti.monitor.outputs import FLAG_TYPE, OUTPUTS, RECORDED, VECTOR_TYPE, VIOLATION, Output
+from uncertain_lti.monitor.verdict_messages import NamedVector, VerdictMessages, VerdictRecords
+from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.sampling.sampler import Step
+from uncertain_lti.sampling.status import Status
+
+
+@pytest.mark.parametrize("output", OUTPUTS, ids=[output.name for output in OUTPUTS])
+def test_every_row_is_whole(output: Output) -> None:
+    """A vector carries a number that verdicts have, one by one and over a transient; a flag carries the alarm."""
+    assert output.text and output.type in (VECTOR_TYPE, FLAG_TYPE)
+    assert bool(output.position) == (output.type == VECTOR_TYPE) == (output is not VIOLATION)
+    assert bool(output.title) == (output.view in ("states", "steps"))
+    if output.position:
+        assert output.position in NUMBERS
+        model = leibov2006()
+        verdicts = EnvelopeMonitor(model).check(Transient(np.arange(3.0), np.ones((3, 5)), np.ones((3, 4))))
+        assert getattr(verdicts, output.position).shape == (3, model.n)
+        assert not output.velocity or getattr(verdicts, output.velocity).shape == (3,)
+
+
+def test_names_are_unique_and_those_of_every_message_come_first() -> None:
+    assert len({output.name for output in OUTPUTS}) == len(OUTPUTS)
+    every = [output.when == "message" for output in RECORDED]
+    assert every == sorted(every, reverse=True)
+
+
+def test_one_message_and_many_records_have_the_same_bytes() -> None:
+    """Of a judged sample, one outside the domain, and one without a verdict, for every vector of the table."""
+    model = leibov2006()
+    model = model.replace(domain=Domain(*(sign * np.ones(k) for k in (model.n, model.m) for sign in (-1.0, 1.0))))
+    monitor, names = EnvelopeMonitor(model), model.state_names
+    inside, outside = [0.0] * (model.n + model.m), [1e6] * (model.n + model.m)
+    steps = [
+        Step(Status.OK, 5, 7, 0.1, inside, inside[: model.n]),
+        Step(Status.OK, 6, 8, 0.1, outside, inside[: model.n]),
+        Step(Status.MISSING, 7, 9, 0.1, inside, inside[: model.n]),
+    ]
+    verdicts = [monitor.judge(step) for step in steps]
+    assert [v.judged for v in verdicts] == [True, True, False] and verdicts[1].outside_domain
+    encode = VerdictMessages(names).encode
+    numbers = {o.position: np.array([v.numbers(o.position) for v in verdicts]) for o in RECORDED if o.position}
+    numbers |= {o.velocity: np.array([getattr(v, o.velocity) for v in verdicts]) for o in RECORDED if o.velocity}
+    records = VerdictRecords(names, {output.name: i for i, output in enumerate(RECORDED)})
+    times = np.arange(3)
+    data, _ = records.encode(
+        times,
+        np.array([v.t_ns for v in verdicts]),
+        np.array([v.judged for v in verdicts]),
+        np.array([v.alarm for v in verdicts]),
+        numbers,
+    )
+    for output in RECORDED:
+        for verdict in verdicts:
+            if output.position:
+                message = encode[output.name](verdict)
+                assert (message in data) == (output.when == "message" or verdict.judged)
+    marks = NamedVector(names, velocities=True)
+    flags = [encode["flags"](verdict) for verdict in verdicts]
+    velocities = [np.frombuffer(f[marks.velocity : marks.velocity + 8 * model.n], "<f8") for f in flags]
+    np.testing.assert_array_equal(velocities, np.repeat([[0.0], [1.0], [np.nan]], model.n, axis=1))
