@@ -345,15 +345,9 @@ def read_messages(rng: random.Random, _: Path) -> str:
 
 
 def told_apart(kind: str, data: bytes) -> bool:
-    """Whether live and in a recording a message may read otherwise.
-
-    Live, bytes behind a big-endian message are passed over, a name ends with the first zero in it, and of equal names
-    the first one counts.
-    """
-    if not data[1] & 1:
-        return True
+    """Whether names repeat: live the first one counts, and a recording is read by message then."""
     names = [] if kind == ODOMETRY else recorded_definition(kind).decode(data).name
-    return "\0" in "".join(names) or len(set(names)) < len(names)
+    return len(set(names)) < len(names)
 
 
 @cache

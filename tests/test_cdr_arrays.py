@@ -46,7 +46,7 @@ NUMBERS = {
     "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
 QUATERNION = [("x", "", None), ("y", "", None), ("z", "", None), ("w", "", None)]
-NAMES = ["fan", "rotor", "läufer", ""]
+NAMES = ["fan", "rotor", "läufer", "", "wheel\0s", "rotor\0"]
 LAYOUTS = st.builds(
     Layout,
     compression=st.sampled_from(sorted(COMPRESSIONS)),

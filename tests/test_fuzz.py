@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import fuzz
+import numpy as np
 import pytest
 
 
@@ -21,13 +22,21 @@ def test_damage_gives_a_clear_error_or_a_correct_reading(kind: str) -> None:
     assert outcome.counts["read"] > 30 and outcome.counts["refused"] > 5, "the damage is too small or too great"
 
 
-def framed(frame_id: bytes, start: bytes = b"\0\1\0\0", more: int = 0) -> bytes:
-    """A JointState with this frame_id, as it stands there."""
-    body = struct.pack("<iII", 5, 7, len(frame_id)) + frame_id
-    body += bytes(-len(body) % 4) + struct.pack("<III", 1, 2, ord("a")) + struct.pack("<I", 1)
-    return start + body + bytes(-len(body) % 8) + struct.pack("<dII", 1.5, 0, 0) + bytes(more)
+def framed(
+    frame_id: bytes, start: bytes = b"\0\1\0\0", more: int = 0, name: bytes = b"a\0", repeated: bool = False
+) -> bytes:
+    """A JointState with this frame_id and this name, as they stand there."""
+    order = "<" if start[1] else ">"
+    body = struct.pack(f"{order}iII", 5, 7, len(frame_id)) + frame_id
+    names = [name, name] if repeated else [name]
+    body += bytes(-len(body) % 4) + struct.pack(f"{order}I", len(names))
+    for one in names:
+        body += bytes(-len(body) % 4) + struct.pack(f"{order}I", len(one)) + one
+    body += bytes(-len(body) % 4) + struct.pack(f"{order}I", 1)
+    return start + body + bytes(-len(body) % 8) + struct.pack(f"{order}dII", 1.5, 0, 0) + bytes(more)
 
 
+BIG = b"\0\0\0\0"
 READ = {
     "regular": framed(b"base\0"),
     "Latin-1": framed(b"Tr\xe4ger\0"),
@@ -36,9 +45,17 @@ READ = {
     "zeros": framed(b"base\0\0\0\0"),
     "more room": framed(b"base\0", more=8),
     "filled up": framed(b"base\0", more=11),
+    "a name that ends early": framed(b"base\0", name=b"a\0b\0"),
+    "a name without a closing zero": framed(b"base\0", name=b"a"),
+    "another name that ends early": framed(b"base\0", name=b"a\0\xff\0"),
+    "big-endian": framed(b"base\0", start=BIG),
+    "big-endian, filled up": framed(b"base\0", start=BIG, more=11),
+    "parameter list": framed(b"base\0", start=b"\0\3\0\0"),
 }
 REFUSED = {
     "bytes behind": framed(b"base\0", more=12),
+    "bytes behind big-endian": framed(b"base\0", start=BIG, more=12),
+    "bytes behind names that repeat": framed(b"base\0", more=12, repeated=True),
     "bytes behind odd text": framed(b"", more=12),
     "a length that lies": framed(b"base\0").replace(b"\5\0\0\0base", b"\xff\0\0\0base"),
     "another encapsulation": framed(b"base\0", start=b"\0\7\0\0"),
@@ -66,6 +83,26 @@ def test_odd_messages_read_alike_live_and_from_recordings() -> None:
         for before in ([], [READ["regular"]] * 3, list(READ.values()), list(REFUSED.values())):
             recorded = fuzz.read_recorded(fuzz.JOINT_STATE, paths, [*before, data])
             assert recorded == ((5_000_000_007, struct.pack("<d", 1.5)) if what in READ else None), what
+
+
+@pytest.mark.parametrize("start", [b"\0\1\0\0", BIG, b"\0\3\0\0"])
+def test_bytes_that_rclpy_leaves_behind_cost_no_layout(start: bytes) -> None:
+    """Also where the sequences that they are reserved for are not always empty."""
+    from uncertain_lti.recordings.cdr_arrays import SLACK, FieldReader, Messages
+    from uncertain_lti.signals.field_path import FieldPath
+
+    order = "<" if start[1] else ">"
+    filled = framed(b"base\0", start=start)[:-8] + struct.pack(f"{order}IIdI4x", 1, 0, 2.5, 0)
+    some = [framed(b"base\0", start=start, more=8), filled, framed(b"longer\0", start=start, more=8), filled]
+    messages = [some[i % 4] for i in range(200)]
+    ends = SLACK + np.cumsum([len(data) for data in messages])
+    buffer = bytearray(bytes(SLACK) + b"".join(messages) + bytes(SLACK))
+    reader = FieldReader(fuzz.recorded_definition(fuzz.JOINT_STATE), [FieldPath("position[a]")])
+    values, stamps = np.empty((200, 1)), np.empty(200, np.int64)
+    begins = ends - [len(data) for data in messages]
+    assert not reader.read(Messages(buffer, begins, ends), values, stamps)
+    assert (values == 1.5).all() and (stamps == 5_000_000_007).all()
+    assert reader.alone < 3
 
 
 def test_whatever_goes_wrong_is_noticed(tmp_path: Path) -> None:

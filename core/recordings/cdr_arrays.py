@@ -12,19 +12,32 @@ message; a layout is used only after it gave these for the message it was made f
 
 from __future__ import annotations
 
-import itertools
+import functools
 import math
-from collections.abc import Mapping, Sequence
+from bisect import bisect
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Nodetype
-from rosbags.typesys.base import normalize_fieldname
 
-from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.message_types import CODES, Definition
+from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.recordings.cdr_layout import (
+    ENCAPSULATION,
+    ENCAPSULATIONS,
+    PADDING,
+    RESERVED,
+    SIZES,
+    STAMP,
+    Number,
+    Role,
+    UnfitError,
+    Walk,
+    Wanted,
+    wanted,
+)
+from uncertain_lti.recordings.message_types import Definition
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.functions import FieldFunction
@@ -33,27 +46,19 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Values = NDArray[np.float64]
 
-_Key = TypeVar("_Key", str, int)
-
 NO_STAMP = -1
 _TEXT = -1
-_STAMP = -1  # stands for a path where the header stamp is meant
 SLACK = 64
 _MOST_LAYOUTS = 64
-_MOST_PARTS = 20_000  # of a message that a layout is made from
 _MOST_WORDS = 1024  # that are compared in each message
 _PATIENCE = 300  # messages without a layout that are looked into before no more are
 _GAP = 128  # bytes between two wanted places that are copied along rather than left out
 _SHORT_TEXT = 64  # bytes; longer texts that change are looked at one by one
-_ENCAPSULATION = 4
+_MEANT = {*"xyzw", "header", "stamp", "sec", "nanosec"}  # what is read by a field's name
 
 
 class RepeatedNamesError(Exception):
     """A name that a path looks up stands twice: which one counts depends on the messages before."""
-
-
-class _UnfitError(Exception):
-    """These messages have to be decoded one by one."""
 
 
 class Failure(NamedTuple):
@@ -71,118 +76,7 @@ class Failure(NamedTuple):
     why: str
 
 
-# --- what is wanted of a message ----------------------------------------------------------------------------
-
-
-@dataclass
-class _Wanted:
-    """What paths want of one value of a message.
-
-    goals are (path, part): the value itself; every: the same for all elements of an array, part after part.
-    """
-
-    fields: dict[str, _Wanted] = field(default_factory=dict)
-    elements: dict[int, _Wanted] = field(default_factory=dict)
-    named: dict[str, _Wanted] = field(default_factory=dict)
-    goals: list[tuple[int, int]] = field(default_factory=list)
-    every: list[int] = field(default_factory=list)
-
-
-def _wanted(definition: Definition, paths: Sequence[FieldPath]) -> _Wanted:
-    """Raises _UnfitError where the paths are not those of plain numbers."""
-    top = _Wanted()
-    for number, path in enumerate(paths):
-        here, type_name, is_array, is_message = top, definition.type_name, False, True
-        parent: Mapping[str, tuple[Any, Any]] = {}
-        for kind, key in path.steps:
-            if kind == "attribute":
-                if not is_message or is_array:
-                    raise _UnfitError
-                parent = _fields(definition, type_name)
-                node, what = parent.get(str(key), (None, None))
-                is_array = node in (Nodetype.ARRAY, Nodetype.SEQUENCE)
-                if is_array:
-                    node, what = what[0]
-                if node not in (Nodetype.BASE, Nodetype.NAME):
-                    raise _UnfitError
-                is_message = node == Nodetype.NAME
-                type_name = what if is_message else what[0]
-                here = here.fields.setdefault(str(key), _Wanted())
-            else:
-                if not is_array or (kind == "name" and not _holds_names(parent)):
-                    raise _UnfitError
-                is_array = False
-                table: dict[Any, _Wanted] = here.elements if kind == "index" else here.named
-                here = table.setdefault(key, _Wanted())
-        if path.function is None:
-            if is_array or is_message:
-                raise _UnfitError
-            here.goals.append((number, 0))
-        elif is_message and not is_array:
-            parts = _parts(definition, type_name, path.function)
-            for part, name in enumerate(parts):
-                here.fields.setdefault(name, _Wanted()).goals.append((number, part))
-        elif is_array and not is_message and path.function.takes.array:
-            here.every.append(number)
-        else:
-            raise _UnfitError
-    _want_stamp(definition, top)
-    return top
-
-
-def _parts(definition: Definition, type_name: str, function: FieldFunction) -> tuple[str, ...]:
-    """Fields of a message that a function takes."""
-    fields = _fields(definition, type_name)
-    if any(hasattr(definition.store.types[type_name], c) for c in "xyzw"):
-        raise _UnfitError  # a constant of that name
-    parts = function.takes.parts(fields)
-    if not parts or any(fields[c][0] != Nodetype.BASE or fields[c][1][0] == "string" for c in parts):
-        raise _UnfitError
-    return parts
-
-
-def _want_stamp(definition: Definition, top: _Wanted) -> None:
-    node, header = _fields(definition, definition.type_name).get("header", (None, ""))
-    if node != Nodetype.NAME:
-        return
-    fields = _fields(definition, header)
-    if "stamp" not in fields:
-        if hasattr(definition.store.types[header], "stamp"):
-            raise _UnfitError
-        return
-    node, stamp = fields["stamp"]
-    if node != Nodetype.NAME:
-        raise _UnfitError
-    parts = _fields(definition, stamp)
-    here = top.fields.setdefault("header", _Wanted()).fields.setdefault("stamp", _Wanted())
-    for part, name in enumerate(("sec", "nanosec")):
-        node, what = parts.get(name, (None, None))
-        if node != Nodetype.BASE or CODES.get(what[0], "f8") not in ("i1", "u1", "i2", "u2", "i4", "u4"):
-            raise _UnfitError
-        here.fields.setdefault(name, _Wanted()).goals.append((_STAMP, part))
-
-
-def _holds_names(fields: Mapping[str, tuple[Any, Any]]) -> bool:
-    node, what = fields.get("name", (None, None))
-    if node not in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        return False
-    (inner, inner_what), _ = what
-    return bool(inner == Nodetype.BASE and inner_what[0] == "string")
-
-
-def _fields(definition: Definition, type_name: str) -> dict[str, tuple[Any, Any]]:
-    return {normalize_fieldname(name): description for name, description in definition.store.fielddefs[type_name][1]}
-
-
 # --- where it stands in one message -------------------------------------------------------------------------
-
-
-class _Number(NamedTuple):
-    """A wanted number: its place from the segment's anchor, and for which path and part it is."""
-
-    at: int
-    kind: str
-    goal: tuple[int, int]
 
 
 @dataclass
@@ -199,180 +93,81 @@ class _Segment:
     begin: int
     size: int = 0
     fixed: list[tuple[int, bytes]] = field(default_factory=list)
-    numbers: list[_Number] = field(default_factory=list)
+    numbers: list[Number] = field(default_factory=list)  # their places count from the anchor
     tail: int = 0
 
 
-class _Walk:
-    """Walks one message by its definition and notes what a layout needs.
+class _Shape:
+    """What a layout needs of a message that was walked.
 
-    shape tells messages apart whose wanted fields stand in other places, or under other names; lengths are those of
+    key tells messages apart whose wanted fields stand in other places, or under other names; lengths are those of
     strings and unwanted sequences in their order, of which those in `free` are left open; odd are the strings
     that are not ASCII.
     """
 
-    def __init__(self, definition: Definition, little: bool, free: frozenset[int]) -> None:
-        self.definition, self.free = definition, free
-        self.order = "<" if little else ">"
-        self.shape: list[object] = [little]
+    def __init__(self, walk: Walk, data: bytes, free: frozenset[int] = frozenset()) -> None:
+        self.walk, self.data, self.free = walk, data, free
+        key = [data[:2]]
         self.lengths: list[int] = []
         self.odd: set[int] = set()
-        self.whole: dict[int, int] = {}  # path that takes a whole array -> its length
-        self.parts = 0
+        self.reserved = walk.reserved
         self.modulus = 8  # the anchor is a multiple of it
-        self.segment = _Segment(8, 0)
-        self.segments = [self.segment]
-        self._fix(-_ENCAPSULATION, b"\xff\xff")
-        self.fields_of: dict[str, dict[str, tuple[Any, Any]]] = {}
+        self.segments = [_Segment(8, 0)]
+        self._fix(-ENCAPSULATION, b"\xff\xff")
+        for role, at, start, end, size in walk.pieces:
+            if role is Role.NUMBERS:
+                self._go_to(start, size)
+                self._end_at(end)
+                continue
+            place = self._go_to(at, 4)
+            self._end_at(at + 4)
+            number = len(self.lengths)
+            if role in (Role.TEXT, Role.SEQUENCE):
+                self.lengths.append((end - start) // size)
+                if number in free:
+                    self.segments[-1].tail = _TEXT if role is Role.TEXT else size
+                    self.reserved -= RESERVED * (size == 8 and start == end)
+                    self._next(end, 1 if role is Role.TEXT else min(size, 4))
+                    continue
+            self._fix(place, b"\xff" * 4)
+            content = data[start:end]
+            if role is Role.COUNT:
+                key.append(data[at : at + 4])
+            elif role is Role.NAME:
+                key.append(content)
+                self._fix(place + 4, b"\xff" * len(content))
+            elif role is Role.TEXT:
+                if not content.isascii():
+                    self.odd.add(number)
+                letters = b"\x80" if content.isascii() else b"\xff"
+                self._fix(place + 4, letters * (len(content) - 1) + b"\xff")
+            elif start < end:
+                self._go_to(start, size)
+            self._end_at(end)
+        self.key = tuple(key)
+        begins = [segment.begin for segment in self.segments]
+        for one in walk.numbers:
+            segment = self.segments[bisect(begins, one.at - ENCAPSULATION) - 1]
+            code = one.code if SIZES[one.code] == 1 else walk.order + one.code
+            segment.numbers.append(Number(one.at - ENCAPSULATION - segment.begin, code, one.goal))
 
-    def message(self, type_name: str, value: Any, wanted: _Wanted | None) -> None:
-        """Walk a message, or one inside."""
-        fields = self.fields_of.get(type_name)
-        if fields is None:
-            fields = self.fields_of[type_name] = _fields(self.definition, type_name)
-        named = wanted is not None and any(entry.named for entry in wanted.fields.values())
-        if named:
-            self.shape.append(tuple(value.name))
-        for name, (node, what) in fields.items():
-            self.parts += 1
-            if self.parts > _MOST_PARTS:
-                raise _UnfitError
-            here = wanted.fields.get(name) if wanted else None
-            content = getattr(value, name)
-            if node == Nodetype.BASE:
-                if what[0] == "string":
-                    self._string(content, exact=False)
-                else:
-                    self._numbers(what[0], 1, {0: here} if here else {})
-            elif node == Nodetype.NAME:
-                self.message(what, content, here)
-            else:
-                self._array(node, what, content, here, value, exact=named and name == "name")
+    def _go_to(self, at: int, align: int) -> int:
+        """Place in the segment; in a new one where it is not known from the anchor."""
+        if self.modulus % align:
+            if not self.segments[-1].size:
+                self.segments.pop()  # nothing stands in it
+            self._next(at, align)
+        return at - ENCAPSULATION - self.segments[-1].begin
 
-    def _array(self, node: Any, what: Any, content: Any, here: _Wanted | None, parent: Any, exact: bool) -> None:
-        (inner, inner_what), length = what
-        count = len(content)
-        plain = inner == Nodetype.BASE and inner_what[0] != "string"
-        elements = _elements(here, parent, count) if here else {}
-        if node == Nodetype.ARRAY:
-            if not length:
-                raise _UnfitError
-        elif plain and here is None:
-            self._unwanted(np.dtype(CODES[inner_what[0]]).itemsize, count)
-            return
-        else:
-            self._align(4)
-            self._fix(self.segment.size, b"\xff" * 4)
-            self.segment.size += 4
-            self.shape.append(count)
-        if plain:
-            if here is not None:
-                for path in here.every:
-                    self.whole[path] = count
-                    for i in range(count):
-                        elements.setdefault(i, _Wanted()).goals.append((path, i))
-            if count:
-                self._numbers(inner_what[0], count, elements)
-            return
-        for i, item in enumerate(content):
-            if inner == Nodetype.NAME:
-                self.message(inner_what, item, elements.get(i))
-            else:
-                self._string(item, exact)
-
-    def _align(self, size: int) -> None:
-        if self.modulus % size == 0:
-            self.segment.size += -self.segment.size % size
-            return
-        begin = self.segment.begin + self.segment.size
-        if not self.segment.size:
-            self.segments.pop()  # nothing stands in it
-        self._next(begin + -begin % size, size)
-
-    def _next(self, begin: int, align: int) -> None:
-        self.segment = _Segment(align, begin)
-        self.segments.append(self.segment)
+    def _next(self, at: int, align: int) -> None:
+        self.segments.append(_Segment(align, at - ENCAPSULATION))
         self.modulus = align
 
-    def _fix(self, at: int, mask: bytes) -> None:
-        self.segment.fixed.append((at, mask))
+    def _end_at(self, end: int) -> None:
+        self.segments[-1].size = end - ENCAPSULATION - self.segments[-1].begin
 
-    def _numbers(self, kind: str, count: int, elements: Mapping[int, _Wanted]) -> None:
-        code = CODES[kind]
-        size = np.dtype(code).itemsize
-        self._align(size)
-        for i, wanted in elements.items():
-            for goal in wanted.goals:
-                place = self.segment.size + i * size
-                self.segment.numbers.append(_Number(place, code if size == 1 else self.order + code, goal))
-        self.segment.size += count * size
-
-    def _string(self, text: str, exact: bool) -> None:
-        data = text.encode()
-        number = len(self.lengths)
-        self.lengths.append(len(data))
-        self._align(4)
-        self.parts += 1
-        if self.parts > _MOST_PARTS:
-            raise _UnfitError
-        if number in self.free and not exact:
-            self._leave_open(_TEXT, len(data) + 1, 1)
-            return
-        self._fix(self.segment.size, b"\xff" * 4)
-        if not text.isascii() and not exact:
-            self.odd.add(number)
-        letters = b"\xff" if exact or not text.isascii() else b"\x80"
-        self._fix(self.segment.size + 4, letters * len(data) + b"\xff")
-        self.segment.size += 5 + len(data)
-
-    def _unwanted(self, size: int, count: int) -> None:
-        """A sequence of numbers that no path looks into."""
-        number = len(self.lengths)
-        self.lengths.append(count)
-        self._align(4)
-        if number in self.free:
-            at = self.segment.begin + self.segment.size + 4
-            self._leave_open(size, (-at % size) + count * size if count else 0, min(size, 4))
-            return
-        self._fix(self.segment.size, b"\xff" * 4)
-        self.segment.size += 4
-        if count:
-            self._align(size)
-            self.segment.size += count * size
-
-    def _leave_open(self, tail: int, length: int, align: int) -> None:
-        self.segment.size += 4
-        self.segment.tail = tail
-        self._next(self.segment.begin + self.segment.size + length, align)
-
-
-def _elements(here: _Wanted, parent: Any, count: int) -> dict[int, _Wanted]:
-    """Wanted elements of an array by position, those by name among them; what is not there is left out."""
-    places: dict[int, list[_Wanted]] = {i: [wanted] for i, wanted in here.elements.items() if i < count}
-    for name, wanted in here.named.items():
-        found = [i for i, other in enumerate(parent.name) if other == name]
-        if len(found) > 1:
-            raise RepeatedNamesError
-        if found and found[0] < count:
-            places.setdefault(found[0], []).append(wanted)
-    return {i: _merged(several) for i, several in places.items()}
-
-
-def _merged(several: Sequence[_Wanted]) -> _Wanted:
-    """What all of these want of one value."""
-    result = _Wanted()
-    for wanted in several:
-        result.goals += wanted.goals
-        result.every += wanted.every
-        _merge_into(result.fields, wanted.fields)
-        _merge_into(result.elements, wanted.elements)
-        _merge_into(result.named, wanted.named)
-    return result
-
-
-def _merge_into(table: dict[_Key, _Wanted], other: Mapping[_Key, _Wanted]) -> None:
-    for key, entry in other.items():
-        table[key] = _merged([table[key], entry]) if key in table else entry
+    def _fix(self, place: int, mask: bytes) -> None:
+        self.segments[-1].fixed.append((place, mask))
 
 
 # --- the same for many messages -----------------------------------------------------------------------------
@@ -431,28 +226,28 @@ class _Span(NamedTuple):
     words: int
     compared: list[tuple[slice, NDArray[np.uint64], NDArray[np.uint64] | None]]
     moves: list[_Move]
-    parts: list[_Number]
+    parts: list[Number]
 
 
 class _Layout:
     """Where the wanted fields stand in messages of one shape, made from one of them."""
 
-    def __init__(self, walk: _Walk, data: bytes, paths: Sequence[FieldPath]) -> None:
-        self.free, self.lengths, self.odd = walk.free, walk.lengths, walk.odd
-        self.order = walk.order
+    def __init__(self, shape: _Shape, paths: Sequence[FieldPath]) -> None:
+        self.free, self.lengths, self.odd = shape.free, shape.lengths, shape.odd
+        self.order, self.reserved = shape.walk.order, shape.reserved
         self.hits = 0
-        parts = dict(walk.whole)
-        for number in itertools.chain.from_iterable(segment.numbers for segment in walk.segments):
+        parts = dict(shape.walk.whole)
+        for number in shape.walk.numbers:
             path, part = number.goal
             parts[path] = max(parts.get(path, 0), part + 1)
-        self.stamped = _STAMP in parts
+        self.stamped = STAMP in parts
         self.absent = [i for i in range(len(paths)) if i not in parts]
         self.computed = [(i, p.function, parts[i]) for i, p in enumerate(paths) if p.function and i in parts]
         plain = {i for i, path in enumerate(paths) if not path.function}
-        around = bytes(8 - _ENCAPSULATION) + data + bytes(16)  # byte 8 is the first behind the encapsulation
-        self.segments = [(segment, _spans(segment, around, plain)) for segment in walk.segments]
+        around = bytes(8 - ENCAPSULATION) + shape.data + bytes(16)  # byte 8 is the first behind the encapsulation
+        self.segments = [(segment, _spans(segment, around, plain)) for segment in shape.segments]
         if sum(len(what) for _, spans in self.segments for span in spans for _, what, _ in span.compared) > _MOST_WORDS:
-            raise _UnfitError
+            raise UnfitError
 
     def read(self, messages: Messages, values: Values, stamps: Integers, rows: Integers | None = None) -> Mask:
         """Fill in rows of values and stamps (all where rows is None); returns which messages have this layout.
@@ -460,6 +255,7 @@ class _Layout:
         What is filled in for the others means nothing.
         """
         some = _Some(messages, rows)
+        some.least = some.least - self.reserved
         for segment, spans in self.segments:
             if segment.align > 1:
                 some.anchor = some.anchor + (some.base - some.anchor) % segment.align
@@ -476,7 +272,9 @@ class _Layout:
                 else:
                     begin = some.anchor + (some.base - some.anchor) % segment.tail
                     some.anchor = np.where(length > 0, begin + length * segment.tail, some.anchor)
-        some.keep((some.anchor <= some.end) & (some.anchor + 3 >= some.end))  # as the decoder has it
+                    if segment.tail == 8:
+                        some.least = some.least - RESERVED * (length == 0)
+        some.keep((some.anchor <= some.end) & (some.anchor >= some.least))
         where = slice(None) if some.rows is None else some.rows
         for path in self.absent:
             values[where, path] = math.nan
@@ -484,7 +282,7 @@ class _Layout:
             values[where, path] = _compute(function, [some.parts[path, part] for part in range(count)], len(some.end))
         stamps[where] = NO_STAMP
         if self.stamped:
-            time = some.parts[_STAMP, 0].astype(np.int64) * 1_000_000_000 + some.parts[_STAMP, 1]
+            time = some.parts[STAMP, 0].astype(np.int64) * 1_000_000_000 + some.parts[STAMP, 1]
             stamps[where] = np.where(time == 0, NO_STAMP, time)
         fit = np.zeros(len(messages.begin), dtype=bool)
         fit[some.position] = True
@@ -507,7 +305,7 @@ class _Layout:
         for move in span.moves:
             values[where, move.column : move.column + move.number] = _taken(content, move.at, move.kind, move.number)
         for number in span.parts:
-            some.parts[number.goal] = _taken(content, number.at, number.kind, 1)[:, 0]
+            some.parts[number.goal] = _taken(content, number.at, number.code, 1)[:, 0]
 
     def _pass_text(self, some: _Some, length: Integers) -> None:
         """Go behind a string of this length, its closing zero counted, where it is one."""
@@ -537,7 +335,8 @@ class _Some:
 
     def __init__(self, messages: Messages, rows: Integers | None) -> None:
         self.data, self.end = messages.data, messages.end
-        self.base = messages.begin + _ENCAPSULATION
+        self.least = messages.end - PADDING  # where a message has to end
+        self.base = messages.begin + ENCAPSULATION
         self.anchor = self.base
         self.rows = rows
         self.position = np.arange(len(self.end))
@@ -551,6 +350,7 @@ class _Some:
             self.rows = self.position
         self.rows, self.position = self.rows[fit], self.position[fit]
         self.base, self.anchor, self.end = self.base[fit], self.anchor[fit], self.end[fit]
+        self.least = self.least[fit]
         self.parts = {goal: part[fit] for goal, part in self.parts.items()}
         return tuple(array[fit] for array in along)
 
@@ -599,7 +399,7 @@ def _compute(function: FieldFunction, parts: Sequence[NDArray[Any]], count: int)
 def _spans(segment: _Segment, around: bytes, plain: set[int]) -> list[_Span]:
     """Parts of a segment that are copied; around is the message behind eight bytes."""
     places = [(at, at + len(mask)) for at, mask in segment.fixed]
-    places += [(n.at, n.at + np.dtype(n.kind).itemsize) for n in segment.numbers]
+    places += [(n.at, n.at + np.dtype(n.code).itemsize) for n in segment.numbers]
     stretches: list[list[int]] = []
     for begin, end in sorted(places):
         begin, end = begin // 8 * 8, -(-end // 8) * 8
@@ -637,20 +437,20 @@ def _runs(used: Mask) -> list[slice]:
     return runs
 
 
-def _moves(numbers: Sequence[_Number]) -> list[_Move]:
+def _moves(numbers: Sequence[Number]) -> list[_Move]:
     moves: list[_Move] = []
     for number in sorted(numbers, key=lambda n: (n.goal, n.at)):
-        column, size = number.goal[0], np.dtype(number.kind).itemsize
+        column, size = number.goal[0], np.dtype(number.code).itemsize
         last = moves[-1] if moves else None
         if (
             last
-            and number.kind == last.kind
+            and number.code == last.kind
             and number.at == last.at + last.number * size
             and column == last.column + last.number
         ):
             moves[-1] = last._replace(number=last.number + 1)
         else:
-            moves.append(_Move(number.at, number.kind, 1, column))
+            moves.append(_Move(number.at, number.code, 1, column))
     return moves
 
 
@@ -671,12 +471,15 @@ class FieldReader:
     def __init__(self, definition: Definition, paths: Sequence[FieldPath]) -> None:
         self.definition, self.paths = definition, paths
         self.layouts: dict[tuple[object, ...], _Layout] = {}
-        self.wanted: _Wanted | None = None
+        self.wanted: Wanted | None = None
         self.alone = 0  # messages that were decoded one by one
         self.patience = _PATIENCE
+        self.fields = functools.cache(definition.fields)
+        if any(name in _MEANT for constants, _ in definition.types.values() for name, *_ in constants):
+            return  # the decoder takes these constants for fields
         try:
-            self.wanted = _wanted(definition, paths)
-        except _UnfitError:
+            self.wanted = wanted(definition.type_name, paths, self.fields)
+        except (UnfitError, SignalError):
             pass
 
     def read(self, messages: Messages, values: Values, stamps: Integers) -> list[Failure]:
@@ -744,44 +547,42 @@ class FieldReader:
 
     def _learn(self, data: bytes) -> _Layout | None:
         """Layout that a message has and that is not known yet, or is known too narrowly."""
-        if self.wanted is None or self.patience <= 0 or data[:1] != b"\0":
+        if self.wanted is None or self.patience <= 0 or data[:2] not in ENCAPSULATIONS:
             return None
         self.patience -= 1
         try:
-            value = self.definition.decode_strictly(data)
-            walk = self._walk(data, value, frozenset())
-            shape = tuple(walk.shape)
-            known = self.layouts.get(shape)
+            self.definition.decode_strictly(data)
+            walk = Walk(data, self.fields)
+            walk.message(self.definition.type_name, self.wanted)
+            if walk.repeated:
+                raise RepeatedNamesError
+            shape = _Shape(walk, data)
+            known = self.layouts.get(shape.key)
             if known is not None:
-                free = self._free(known, walk)
+                free = self._free(known, shape)
                 if free == known.free:
                     return None
-                walk = self._walk(data, value, free)
+                shape = _Shape(walk, data, free)
             elif len(self.layouts) >= _MOST_LAYOUTS:
                 return None
-            layout = _Layout(walk, data, self.paths)
+            layout = _Layout(shape, self.paths)
         except BagError:
             return None
-        except _UnfitError:
+        except UnfitError:
             self.patience -= _PATIENCE // 10
             return None
         if not self._holds(layout, data):
             self.wanted, self.layouts = None, {}
             return None
-        self.layouts[shape] = layout
+        self.layouts[shape.key] = layout
         self.patience = _PATIENCE
         return layout
 
-    def _walk(self, data: bytes, value: Any, free: frozenset[int]) -> _Walk:
-        walk = _Walk(self.definition, data[1] == 1, free)
-        walk.message(self.definition.type_name, value, self.wanted)
-        return walk
-
-    def _free(self, known: _Layout, walk: _Walk) -> frozenset[int]:
+    def _free(self, known: _Layout, shape: _Shape) -> frozenset[int]:
         """What has to be left open so that a layout holds for a second message."""
-        pairs = zip(known.lengths, walk.lengths, strict=True)
+        pairs = zip(known.lengths, shape.lengths, strict=True)
         free = known.free | {i for i, (one, other) in enumerate(pairs) if one != other}
-        return frozenset(free if free != known.free else free | known.odd | walk.odd)
+        return frozenset(free if free != known.free else free | known.odd | shape.odd)
 
     def _holds(self, layout: _Layout, data: bytes) -> bool:
         """Whether a layout gives for its own message what decoding gives."""

@@ -21,6 +21,7 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.recordings.cdr_layout import CODES, ENCAPSULATIONS, PADDING, UnfitError, Walk
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_types import FieldType
 
@@ -35,12 +36,7 @@ _LEAST_INFLATED = 1 << 20
 _NOTHING = "structure_needs_at_least_one_member"  # what the middleware puts into a message without fields: one byte
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _LINE = re.compile(rb"^[ \t\r]*[^#\s]", re.MULTILINE)
-_CDR = b"\0\0", b"\0\1", b"\0\3"  # plain, and what the middleware reads as such; only the first is big-endian
 _MOST_UNROLLED = 1024  # rosbags writes a line of code per element of a fixed array of strings or messages
-CODES = {
-    "bool": "?", "byte": "i1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
-    "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
-}  # fmt: skip
 _KINDS: Mapping[str, Any] = dict.fromkeys(CODES, "number") | {"bool": "bool", "string": "string", "byte": "other"}
 # rclpy hands out a byte as bytes, so it is no number live either
 
@@ -72,7 +68,8 @@ class Definition:
     def decode(self, data: bytes) -> Any:
         """Decode one CDR message.
 
-        Text that is no UTF-8, has no closing zero, or has not even the length of one, is read as the middleware does.
+        Text that is no UTF-8, has no closing zero or one before its end, or has not even the length of one, is read as
+        the middleware does.
 
         Parameters
         ----------
@@ -90,12 +87,16 @@ class Definition:
             It does not fit the definition.
         """
         try:
-            return self.decode_strictly(data)
+            message = self.decode_strictly(data)
+            if not self._has_zeros(self.type_name, message):
+                return message
+            return _OddText(self, _plain(data)).message(self.type_name)
         except BagError:
             try:
+                data = _plain(data)
                 odd = _OddText(self, data)
                 message = odd.message(self.type_name)
-                if self._may_end(message, odd.left):
+                if self._may_end(data, odd.left):
                     return message
             except Exception:  # not that alone
                 pass
@@ -125,30 +126,49 @@ class Definition:
             read = layout.deserialize_cdr_le if data[1] else layout.deserialize_cdr_be
             message, end = read(data[4:], 0, layout.cls, self.store)
             left = len(data) - 4 - end
-            fits = self._may_end(message, left)
+            fits = self._may_end(data, left)
         except Exception as error:  # the generated decoders raise whatever the bytes lead them to
             raise BagError(_one_line(error)) from None
         if not fits:
             raise BagError(f"it is {left} bytes longer than its definition" if left > 0 else "it is cut")
         return message
 
-    def _may_end(self, message: Any, left: int) -> bool:
-        """Whether this many bytes may be left behind a message: no more than `rclpy.serialization` leaves there.
+    def _may_end(self, data: bytes, left: int) -> bool:
+        """Whether these bytes may be left behind a message."""
+        if 0 <= left <= PADDING:
+            return True
+        walk = Walk(data, self.fields)
+        try:
+            walk.message(self.type_name)
+        except UnfitError:
+            return False
+        return left > 0 and not walk.excess
 
-        It reserves 4 for each empty sequence of 8-byte numbers, and so does every bag written through rosbag2_py.
-        """
-        return 0 <= left <= 3 or 3 < left <= 3 + 4 * self._empty_sequences(self.type_name, message)
+    @functools.cached_property
+    def _texts(self) -> Mapping[str, list[tuple[str, FieldType]]]:
+        """Type -> its fields that are text, or messages with text in them."""
+        found: dict[str, list[tuple[str, FieldType]]] = {}
 
-    def _empty_sequences(self, type_name: str, message: Any) -> int:
-        count = 0
-        for name, field in self.fields(type_name).items():
+        def look_into(type_name: str) -> bool:
+            if type_name not in found:
+                found[type_name] = [
+                    (name, field)
+                    for name, field in self.fields(type_name).items()
+                    if field.kind == "string" or (field.kind == "message" and look_into(field.type_name))
+                ]
+            return bool(found[type_name])
+
+        look_into(self.type_name)
+        return found
+
+    def _has_zeros(self, type_name: str, message: Any) -> bool:
+        """Whether a text goes on behind a zero, where the middleware ends it."""
+        for name, field in self._texts[type_name]:
             value = getattr(message, name)
-            if field.kind == "message":
-                inner = value if field.array is not None else [value]
-                count += sum(self._empty_sequences(field.type_name, each) for each in inner)
-            elif field.array == 0 and field.type_name in ("float64", "int64", "uint64"):
-                count += not len(value)
-        return count
+            for one in [value] if field.array is None else value:
+                if ("\0" in one) if field.kind == "string" else self._has_zeros(field.type_name, one):
+                    return True
+        return False
 
     @functools.cached_property
     def has_header(self) -> bool:
@@ -219,7 +239,7 @@ class Definition:
         return {
             normalize_fieldname(name): _field_type(description)
             for name, description in self.types[type_name][1]
-            if name != _NOTHING
+            if name != _NOTHING or len(self.types[type_name][1]) > 1
         }
 
 
@@ -227,7 +247,6 @@ class _OddText:
     """Reads a message number by number, and lets text in it be odd."""
 
     def __init__(self, definition: Definition, data: bytes) -> None:
-        data = _plain(data)
         self._definition, self._data, self._at = definition, data[4:], 0
         self._order: Literal["<", ">"] = "<" if data[1] else ">"
 
@@ -276,7 +295,7 @@ def _plain(data: bytes, wanted: int = _LARGEST_MESSAGE) -> bytes:
     if data[:4] == _ZSTD:  # no CDR begins like this
         most = min(wanted, max(_LEAST_INFLATED, _LARGEST_RATIO * len(data)))
         data = zstandard.ZstdDecompressor().stream_reader(data).read(most)
-    if data[:2] not in _CDR:  # the decoder takes whatever it is for plain
+    if data[:2] not in ENCAPSULATIONS:  # the decoder takes whatever it is for plain
         raise TypesysError(f"it is no plain CDR; it begins with {data[:2].hex() or 'nothing'}")
     return data
 
