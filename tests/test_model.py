@@ -22,7 +22,7 @@ from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
-from uncertain_lti.model.uncertain_lti import FORMAT, UncertainLTI
+from uncertain_lti.model.uncertain_lti import FORMATS, UncertainLTI
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -401,7 +401,7 @@ def base() -> dict[str, Any]:
         for n, t in (("a", "/a"), ("b", "/b"), ("u", "/u"))
     ]
     return {
-        "format": FORMAT,
+        "format": FORMATS[0],
         "states": signals[:2],
         "controls": [signals[2] | {"max_hold": 0.5, "delay": 1}],
         "sampling": {
@@ -481,7 +481,11 @@ def test_a_matrix_that_is_none_is_refused_by_name(name: str, value: Any, tmp_pat
     ("place", "value", "words"),
     [
         ("format", ..., "no field 'format'"),
-        ("format", "uncertain-lti/2", "format is 'uncertain-lti/2', and this version reads 'uncertain-lti/1'"),
+        (
+            "format",
+            "uncertain-lti/3",
+            "format is 'uncertain-lti/3', and this version reads uncertain-lti/1, uncertain-lti/2",
+        ),
         ("format", 1, "format is 1"),
         ("format", [[]], "format is"),
         *[

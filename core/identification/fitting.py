@@ -261,8 +261,11 @@ def fit_fleet(
     else:
         solution = _as_written(engine, criterion)
 
+    n, low, high = fleet.n, sums.low, sums.high
+    domain = Domain(low[:n], high[:n], low[n:], high[n:], fleet.occupancy(low, high))
+
     def build(theta: Array, d: Array) -> UncertainLTI:
-        return _model(fleet.columns, signals, sums, theta, d, dt_median, alarm_rule)
+        return _model(fleet.columns, signals, sums, theta, d, dt_median, domain, alarm_rule)
 
     limits = engine.half_limits
 
@@ -446,6 +449,7 @@ def _model(
     theta: Array,
     d: Array,
     dt_median: float | None,
+    domain: Domain,
     alarm_rule: AlarmRule | None,
 ) -> UncertainLTI:
     n, p = len(signals.states), len(sums.low)
@@ -471,7 +475,7 @@ def _model(
             min_step=signals.min_step,
             max_skew=signals.max_skew,
         ),
-        domain=Domain(sums.low[:n], sums.high[:n], sums.low[n:], sums.high[n:]),
+        domain=domain,
         alarm_rule=alarm_rule,
     )
 

@@ -14,10 +14,13 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.passes import Candidate, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Columns, Partition, Problem
+from uncertain_lti.model.domain import Occupancy, cells_for
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 T = TypeVar("T")
 
+_LOOKED_AT = 200_000
+"""Transitions that the domain is made from, about; of more, every second, third, ... counts."""
 _WORTH_A_THREAD = 100_000
 """Transitions per part from which on a thread of its own pays."""
 
@@ -115,6 +118,26 @@ class Fleet:
         for sums, _ in results[1:]:
             total = total + sums
         return total, [Samples.join([r[1][i] for r in results], self.p) for i in range(self.n)]
+
+    def occupancy(self, low: Array, high: Array) -> Occupancy | None:
+        """Combinations of two signals that the data hold; see `passes.occupied`.
+
+        Parameters
+        ----------
+        low : array (p,)
+            Least z.
+        high : array (p,)
+            Greatest z.
+
+        Returns
+        -------
+        Occupancy or None
+            None if the transitions are too few to say where there were none.
+        """
+        cells, stride = cells_for(self.N), -(-self.N // _LOOKED_AT)
+        if not cells:
+            return None
+        return Occupancy.of(np.logical_or.reduce(self.map(passes.occupied, self._same(low, high, cells, stride))))
 
     def scan(self, candidate: Candidate) -> list[tuple[Samples, float]]:
         """One pass for the samples of least slack; see `passes.scan`.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.problem import Block, Partition
+from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 
@@ -140,6 +141,37 @@ def _product(matrix: Array, columns: Array) -> Array:
     if whole < count:
         np.matmul(matrix, columns[:, whole:], out=total[:, whole:])
     return total
+
+
+def occupied(partition: Partition, least: Array, greatest: Array, cells: int, stride: int) -> NDArray[np.bool_]:
+    """Cells of every pair of signals that some of the transitions start in (`model.domain.Occupancy`).
+
+    Parameters
+    ----------
+    partition : Partition
+        The data.
+    least : array (p,)
+        Least z of all data.
+    greatest : array (p,)
+        Greatest z of all data.
+    cells : int
+        Cells per range.
+    stride : int
+        Every stride-th transition of a block counts.
+
+    Returns
+    -------
+    array (pairs, cells, cells) of bool
+        True if one lies in the cell.
+    """
+    first, second = pairs_of(partition.p)
+    found = np.zeros((len(first), cells, cells), dtype=bool)
+    per_unit = cells_per_unit(least, greatest, cells)
+    for block in partition.blocks():
+        place = cell_of(block.z[:, ::stride].T, least, per_unit, cells - 1).T
+        for pair, (i, j) in enumerate(zip(first, second, strict=True)):
+            found[pair, place[i], place[j]] = True
+    return found
 
 
 def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Samples]]:

@@ -237,6 +237,103 @@ def utilisation_of(difference: cython.double, half: cython.double) -> cython.dou
         return np.where(difference == 0.0, 0.0, difference / half)
 
 
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+def cell_of(z: cython.double, least: cython.double, per_unit: cython.double, last: cython.int) -> cython.int:
+    """Cell of its range that a value lies in.
+
+    Parameters
+    ----------
+    z : double, or array
+        Normalised.
+    least : double, or array
+        Begin of the range.
+    per_unit : double, or array
+        Cells per unit; 0 where the range is empty.
+    last : int
+        Last cell; the first is 0.
+
+    Returns
+    -------
+    int, or array
+        0 to last.
+    """
+    place = (z - least) * per_unit
+    if cython.compiled:
+        return 0 if not place > 0.0 else last if place > last else cython.cast(cython.int, place)
+    return np.clip(place, 0, last).astype(np.intp)
+
+
+def pairs_of(size: int) -> tuple[Any, Any]:
+    """Pairs of signals whose combinations a domain knows; of one signal alone, itself.
+
+    Parameters
+    ----------
+    size : int
+        Number of states and controls.
+
+    Returns
+    -------
+    first, second : int array (pairs,)
+        Their positions in [x; u].
+    """
+    return np.triu_indices(size, 1) if size > 1 else (np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp))
+
+
+def cells_per_unit(least: Any, greatest: Any, cells: int) -> Any:
+    """Cells per normalised unit of each signal; 0 where it does not move.
+
+    Parameters
+    ----------
+    least : array (n + m,)
+        Begin of the range of each signal.
+    greatest : array (n + m,)
+        End of it.
+    cells : int
+        Cells per range.
+
+    Returns
+    -------
+    array (n + m,)
+        What `cell_of` takes.
+    """
+    span = np.subtract(greatest, least)
+    return np.divide(cells, span, out=np.zeros_like(span), where=(span > 0) & np.isfinite(span))
+
+
+def visited(z: Any, least: Any, greatest: Any, occupied: Any) -> Any:
+    """Whether every pair of signals lies in an occupied cell.
+
+    Parameters
+    ----------
+    z : array (..., n + m)
+        Normalised [x; u].
+    least : array (n + m,)
+        Begin of the range of each signal.
+    greatest : array (n + m,)
+        End of it.
+    occupied : array (pairs, cells, cells) of bool
+        Of each pair of `pairs_of`.
+
+    Returns
+    -------
+    array (...) of bool
+        True if every one does.
+
+    Raises
+    ------
+    TypeError
+        This is the compiled module, which takes one sample after another.
+    """
+    if cython.compiled:
+        raise TypeError("compiled code takes one sample after another")
+    cells = occupied.shape[1]
+    place = cell_of(z, least, cells_per_unit(least, greatest, cells), cells - 1)
+    first, second = pairs_of(z.shape[-1])
+    return occupied[np.arange(len(first)), place[..., first], place[..., second]].all(axis=-1)
+
+
 def ordered_sum(weights: Any, values: Any) -> Any:
     """Sum of weights * values over the first axis, from the first element to the last.
 
@@ -388,6 +485,8 @@ class Judge:
         Multiplies the half-widths.
     counted : array of bool (n,)
         States whose violations count.
+    occupied : array (pairs, cells, cells) of bool, optional
+        Combinations of two signals that the fit saw (`domain.Occupancy`).
 
     Raises
     ------
@@ -411,6 +510,10 @@ class Judge:
     _rate: cython.double[::1]
     _spread: cython.double[::1]
     _blank = cython.declare(object)
+    _cells: cython.int
+    _per_unit: cython.double[::1]
+    _occupied: cython.uchar[::1]
+    _place: cython.int[::1]
 
     def __init__(
         self,
@@ -423,6 +526,7 @@ class Judge:
         greatest: Any,
         margin: float,
         counted: Any,
+        occupied: Any = None,
     ) -> None:
         self.n, self.p = theta.shape
         self.size = len(steady)
@@ -431,6 +535,9 @@ class Judge:
             raise ValueError("the terms do not fit one another")
         if not len(scale) == len(least) == len(greatest) == self.size >= self.n:
             raise ValueError("the operating point or the domain does not fit the terms")
+        self._cells = 0 if occupied is None else occupied.shape[1]
+        if occupied is not None and occupied.shape != (len(pairs_of(self.size)[0]), self._cells, self._cells):
+            raise ValueError("the occupied cells do not fit the signals")
         one = np.ones(self.p)  # beyond z the regressors are 1
         if cython.compiled:
             self._theta, self._delta = array("d", theta.T.tobytes()), array("d", delta.T.tobytes())
@@ -440,10 +547,14 @@ class Judge:
             self._phi = _doubles(one)
             self._rate, self._spread = _doubles(np.zeros(self.n)), _doubles(np.zeros(self.n))
             self._blank = array("d", bytes(32 * self.n))
+            self._per_unit = _doubles(cells_per_unit(least, greatest, self._cells))
+            flat = np.zeros(1, bool) if occupied is None else occupied
+            self._occupied = bytearray(np.ascontiguousarray(flat, dtype=np.uint8).tobytes())
+            self._place = array("i", bytes(4 * self.size))
         else:
             self._both = np.ascontiguousarray(np.stack([theta.T, delta.T], axis=1))  # (p, 2, n)
             self._phi = np.stack([one, one])[:, :, None].transpose(1, 0, 2).copy()  # (p, 2, 1): phi and psi
-            self._v, self._least, self._greatest = v, least, greatest
+            self._v, self._least, self._greatest, self._occupied = v, least, greatest, occupied
             # z_k and x_{k+1} side by side, as both are normalised alike
             self._steady = np.concatenate([steady, steady[: self.n]])
             self._scale = np.concatenate([scale, scale[: self.n]])
@@ -487,7 +598,10 @@ class Judge:
         values = centre, half, lower, upper, x_next, inside, self._steady[:n], self._scale[:n]
         every = bool(inside.all())
         violation = not every and not bool((inside | self._uncounted).all())
-        return Judgement(values, every, violation, bool(outside(z, self._least, self._greatest).any()))
+        left = bool(outside(z, self._least, self._greatest).any())
+        if self._cells and not left:
+            left = not visited(z, self._least, self._greatest, self._occupied)
+        return Judgement(values, every, violation, left)
 
     @cython.cfunc
     @cython.boundscheck(False)
@@ -503,6 +617,8 @@ class Judge:
             z = before[i]
             self._phi[i] = z = normalised(z, self._steady[i], self._scale[i])
             left = left or outside(z, self._least[i], self._greatest[i])
+        if self._cells and not left:
+            left = self._unvisited()
         self._ordered_sums()
         blank = array("d", self._blank)
         values: cython.double[::1] = blank
@@ -526,6 +642,27 @@ class Judge:
             values[2 * n + i] = utilisation_of(x_next - centre, half)
             values[3 * n + i] = not inside
         return Judgement(blank, every, violation, left)
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _unvisited(self) -> cython.bint:
+        """`visited`, the other way round, pair after pair."""
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        pair: cython.Py_ssize_t = 0
+        cells: cython.Py_ssize_t = self._cells
+        for i in range(self.size):
+            self._place[i] = cell_of(self._phi[i], self._least[i], self._per_unit[i], self._cells - 1)
+        if self.size == 1:
+            return not self._occupied[self._place[0] * cells + self._place[0]]
+        for i in range(self.size):
+            for j in range(i + 1, self.size):
+                if not self._occupied[(pair * cells + self._place[i]) * cells + self._place[j]]:
+                    return True
+                pair += 1
+        return False
 
     @cython.cfunc
     @cython.boundscheck(False)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import math
+import reprlib
+from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.bounds import outside, pairs_of, visited
 
 
 @dataclass(frozen=True)
@@ -54,9 +61,124 @@ class Sampling:
         return least, np.inf if self.dt_max is None else 2.0 * self.dt_max
 
 
+MOST_CELLS = 24
+"""Cells per range: two values apart by less than about two of them are not told apart."""
+_PER_CELL = 16
+
+
+def cells_for(count: int) -> int:
+    """How many cells each range is divided into; 0 if the samples are too few to say where there were none.
+
+    Parameters
+    ----------
+    count : int
+        Samples.
+
+    Returns
+    -------
+    int
+        0, or 4 to `MOST_CELLS`.
+    """
+    cells = min(MOST_CELLS, math.isqrt(count // _PER_CELL))
+    return cells if cells >= 4 else 0
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """Which combinations of two signals the fit saw: for each pair of them a grid over their ranges.
+
+    A box holds every level between two that were fitted, and every jump from one level to another; a grid does not.
+
+    Parameters
+    ----------
+    cells : int
+        Cells per range.
+    occupied : array (pairs, cells, cells) of bool
+        Pairs as in `bounds.pairs_of`; a cell is true if a fitted sample lies in it or in one next to it.
+    """
+
+    cells: int
+    occupied: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, visited: NDArray[np.bool_]) -> Occupancy:
+        """From the cells that fitted samples lie in.
+
+        Parameters
+        ----------
+        visited : array (pairs, cells, cells) of bool
+            Without their neighbours.
+
+        Returns
+        -------
+        Occupancy
+            With their neighbours.
+        """
+        wide = np.pad(visited, ((0, 0), (1, 1), (1, 1)))
+        cells = visited.shape[1]
+        near = [wide[:, i : i + cells, j : j + cells] for i in range(3) for j in range(3)]
+        return cls(cells, np.logical_or.reduce(near))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it stands in a model file.
+
+        Returns
+        -------
+        dict
+            `cells`, and `occupied` as base64 of bits, pair after pair, row after row.
+        """
+        return {"cells": self.cells, "occupied": b64encode(np.packbits(self.occupied).tobytes()).decode()}
+
+    @classmethod
+    def from_dict(cls, data: Any, size: int) -> Occupancy:
+        """From a model file.
+
+        Parameters
+        ----------
+        data : Any
+            What stands there.
+        size : int
+            Number of states and controls.
+
+        Returns
+        -------
+        Occupancy
+            What `to_dict` wrote.
+
+        Raises
+        ------
+        ModelError
+            It is not that; names the field.
+        """
+        if not isinstance(data, dict) or set(data) != {"cells", "occupied"}:
+            raise ModelError("field 'domain.measure' must be an object of 'cells' and 'occupied'")
+        cells, text = data["cells"], data["occupied"]
+        if isinstance(cells, bool) or not isinstance(cells, int) or not 2 <= cells <= 64:
+            raise ModelError(
+                f"field 'domain.measure.cells' is {reprlib.repr(cells)}; it must be a whole number, 2 to 64"
+            )
+        shape = (len(pairs_of(size)[0]), cells, cells)
+        try:
+            packed = np.frombuffer(b64decode(text, validate=True), dtype=np.uint8)
+        except (TypeError, ValueError):
+            raise ModelError("field 'domain.measure.occupied' is not base64; fit the model again") from None
+        if len(packed) != -(-math.prod(shape) // 8):
+            raise ModelError(
+                f"field 'domain.measure.occupied' holds {len(packed)} bytes, and {plural(size, 'signal')} with {cells} "
+                f"cells take {-(-math.prod(shape) // 8)}; fit the model again"
+            )
+        return cls(cells, np.unpackbits(packed, count=math.prod(shape)).astype(bool).reshape(shape))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Occupancy) and np.array_equal(self.occupied, other.occupied)
+
+    def __hash__(self) -> int:
+        return hash(self.occupied.tobytes())
+
+
 @dataclass(frozen=True)
 class Domain:
-    """Normalised ranges seen in the fit; without end where nothing was fitted.
+    """Normalised ranges seen in the fit, and the combinations in them; without end where nothing was fitted.
 
     Parameters
     ----------
@@ -68,15 +190,28 @@ class Domain:
         Least controls.
     u_max : array (m,)
         Greatest controls.
+    measure : Occupancy, optional
+        Combinations within the box.
     """
 
     x_min: Array
     x_max: Array
     u_min: Array
     u_max: Array
+    measure: Occupancy | None = None
+
+    @property
+    def least(self) -> Array:
+        """Least [x; u] (n + m,)."""
+        return np.concatenate((self.x_min, self.u_min))
+
+    @property
+    def greatest(self) -> Array:
+        """Greatest [x; u] (n + m,)."""
+        return np.concatenate((self.x_max, self.u_max))
 
     def outside(self, x: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
-        """Whether z = [x; u] leaves the box in some element.
+        """Whether z = [x; u] leaves the box in some element, or is a combination that was not fitted.
 
         Parameters
         ----------
@@ -90,7 +225,10 @@ class Domain:
         array (...) of bool
             False where nothing was fitted.
         """
-        x, u = np.asarray(x), np.asarray(u)
-        left_x = ((x < self.x_min) | (x > self.x_max)).any(axis=-1)
-        left_u = ((u < self.u_min) | (u > self.u_max)).any(axis=-1)
-        return np.asarray(left_x | left_u)
+        x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
+        lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+        z = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (x, u)], axis=-1)
+        left = np.asarray(outside(z, self.least, self.greatest).any(axis=-1))
+        if self.measure is not None:
+            left = left | ~visited(z, self.least, self.greatest, self.measure.occupied)
+        return left

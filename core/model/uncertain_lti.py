@@ -21,13 +21,14 @@ from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, numb
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.bounds import centre_and_half, lower_of, upper_of
-from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, regressors, tables
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
-FORMAT = "uncertain-lti/1"
+FORMATS = ("uncertain-lti/1", "uncertain-lti/2")
+"""Formats of model files, oldest first; the oldest that holds a model is written."""
 MAX_FILE_BYTES = 64 * 2**20
 _IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
 _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
@@ -511,7 +512,7 @@ class UncertainLTI:
         ]
         s = self.sampling
         return {
-            "format": FORMAT,
+            "format": FORMATS[self.domain.measure is not None],
             "states": states,
             "controls": controls,
             "sampling": {
@@ -529,7 +530,8 @@ class UncertainLTI:
             "domain": {
                 name: [v if math.isfinite(v) else None for v in getattr(self.domain, name).tolist()]
                 for name in ("x_min", "x_max", "u_min", "u_max")
-            },
+            }
+            | ({} if self.domain.measure is None else {"measure": self.domain.measure.to_dict()}),
             "alarm": {
                 "violations": self.alarm_rule.violations,
                 "window": self.alarm_rule.window,
@@ -636,11 +638,11 @@ class UncertainLTI:
     @classmethod
     def _from_dict(cls, data: Any, source: str) -> UncertainLTI:
         if not isinstance(data, dict) or "format" not in data:
-            raise ModelError(f"no field 'format'; is this a model file written by `uncertain-lti fit` ({FORMAT})?")
-        if data["format"] != FORMAT:
+            raise ModelError(f"no field 'format'; is this a model file written by `uncertain-lti fit` ({FORMATS[0]})?")
+        if data["format"] not in FORMATS:
             raise ModelError(
-                f"format is {reprlib.repr(data['format'])}, and this version reads {FORMAT!r}; fit the model again, "
-                f"or use the version that wrote it"
+                f"format is {reprlib.repr(data['format'])}, and this version reads {', '.join(FORMATS)}; fit the model "
+                f"again, or use the version that wrote it"
             )
         known = {
             "format", "states", "controls", "sampling", *ARRAYS, "domain", "alarm", "fit", "validation",
@@ -688,11 +690,14 @@ class UncertainLTI:
         domain = None
         if "domain" in data:
             sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
-            box = _object(data["domain"], "domain", set(sizes))
+            newer = {"measure"} if data["format"] != FORMATS[0] else set()
+            box = _object(data["domain"], "domain", set(sizes) | newer)
             for name in sizes:
                 if name not in box:
                     raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
-            domain = Domain(**{name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()})
+            limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
+            measure = Occupancy.from_dict(box["measure"], n + m) if box.get("measure") is not None else None
+            domain = Domain(**limits, measure=measure)
         alarm = _object(data.get("alarm", {}), "alarm", {f.name for f in fields(AlarmRule)})
         for key in ("violations", "window"):
             if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):

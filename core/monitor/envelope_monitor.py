@@ -302,10 +302,11 @@ class EnvelopeMonitor:
             *model.tables,
             np.concatenate((point.x_s, point.u_s)),
             np.concatenate((point.X, point.U)),
-            np.concatenate((domain.x_min, domain.u_min)),
-            np.concatenate((domain.x_max, domain.u_max)),
+            domain.least,
+            domain.greatest,
             self.rule.margin,
             self._counted,
+            None if domain.measure is None else domain.measure.occupied,
         )
         self._window = AlarmWindow(self.rule)
         self._shortest, self._longest = model.sampling.step_range

@@ -227,7 +227,6 @@ class Watch:
             for topic in signals.topics
         }
         self._held = {topic: _held(model, signals.on(topic)) for topic in signals.topics}
-        self._unknown = {topic: [math.nan] * len(signals.on(topic)) for topic in signals.topics}
         self.arming = arming if arming is not None else Arming(None, 0)
         self.latched, self.enable_topic, self.enable_type = False, "", ""
         self._follow(rule)
@@ -432,7 +431,7 @@ class Watch:
             stamp_ns, values = self._readers[topic].read(data)
         except UnreadableError as error:
             self._note_unreadable(topic, error)
-            stamp_ns, values = None, self._unknown[topic]
+            return _NOTHING, False  # as in a recording: it is left out, and what was in force stays so
         if stamp_ns is not None and stamp_ns > arrival_ns + _FUTURE_NS:
             self.future[topic] += 1
         sampler = self.sampler

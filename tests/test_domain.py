@@ -1,0 +1,126 @@
+"""The domain: which combinations of signals a fit saw, the same offline and sample by sample, and in the file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti.base.compiled import uncompiled
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model import bounds
+from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for
+
+
+def levels(values: list[float], rng: np.random.Generator, count: int = 1000) -> Transient:
+    """A first-order lag that rests at each level for a while, with a little noise."""
+    u = np.repeat(values, count)
+    x = np.zeros(len(u) + 1)
+    for k in range(len(u)):
+        x[k + 1] = x[k] + 0.5 * (u[k] - x[k])
+    t = np.arange(len(x)) * 10_000_000
+    return Transient(t, x[:, None] + 1e-3 * rng.normal(size=(len(x), 1)), np.append(u, u[-1])[:, None])
+
+
+def outside(model: UncertainLTI, transient: Transient) -> float:
+    verdicts = EnvelopeMonitor(model).check(transient)
+    return float(verdicts.outside_domain[verdicts.judged].mean())
+
+
+def test_levels_between_those_fitted_and_larger_jumps_are_outside() -> None:
+    """Both lie inside the box of what was fitted."""
+    rng = np.random.default_rng(1)
+    model = fit([levels([0.0, 1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0, 0.0, 1.0], rng)], additive="noise")
+    assert model.domain.measure is not None and model.domain.measure.cells == MOST_CELLS
+    assert outside(model, levels([0.0, 1.0, 2.0, 1.0], rng)) < 0.01
+    assert outside(model, levels([0.5, 1.5, 2.5], rng)) > 0.9
+    jump = levels([0.0, 4.0, 0.0, 4.0] * 20, rng, 20)
+    box = Domain(*(getattr(model.domain, name) for name in ("x_min", "x_max", "u_min", "u_max")))
+    steps = jump.transitions()
+    assert box.outside(model.operating_point.normalise_x(steps.x), steps.u).mean() < 0.4
+    far = np.abs(steps.x - steps.u)[:, 0] > 1.3
+    seen = model.domain.outside(model.operating_point.normalise_x(steps.x), steps.u)
+    assert seen[far].all() and far.sum() > 50
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_nothing_that_was_fitted_is_outside(criterion: Any) -> None:
+    rng = np.random.default_rng(2)
+    x, u = rng.normal(size=(3001, 3)), rng.normal(size=(3001, 2))
+    runs = [Transient(np.arange(3001) * 1_000_000, x, u)]
+    model = fit(runs, criterion, additive="noise")
+    assert model.domain.measure is not None
+    assert outside(model, runs[0]) == 0.0
+    assert fit([Transient(np.arange(101) * 1_000_000, x[:101], u[:101])], additive="noise").domain.measure is None
+
+
+@settings(max_examples=60, deadline=None)
+@given(size=st.integers(1, 6), cells=st.integers(2, 15), seed=st.integers(0, 10**6))
+def test_one_sample_and_many_agree_compiled_or_not(size: int, cells: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, size + 1))
+    least, greatest = -rng.uniform(0, 2, size), rng.uniform(0, 2, size)
+    if seed % 3 == 0:
+        greatest[0] = least[0]  # a signal that does not move
+    pairs = len(bounds.pairs_of(size)[0])
+    measure = Occupancy(cells, rng.random((pairs, cells, cells)) < 0.9)
+    domain = Domain(least[:n], greatest[:n], least[n:], greatest[n:], measure)
+    z = rng.uniform(-2.2, 2.2, (50, size))
+    z[:20] = least + (greatest - least) * rng.random((20, size))
+    z[:4] = rng.choice([0.0, 1.0], (4, size)) * (greatest - least) + least  # corners
+    z[4, 0] = 1e300
+    expected = domain.outside(z[:, :n], z[:, n:])
+    terms = np.zeros((n, size + 1)), np.zeros((n, size + 1)), np.zeros(n)
+    for module in (bounds, uncompiled("model.bounds")):
+        judge = module.Judge(
+            *terms, np.zeros(size), np.ones(size), least, greatest, 1.0, np.ones(n, bool), measure.occupied
+        )
+        assert [judge.judge(row.tolist(), row[:n].tolist(), 0.1).outside_domain for row in z] == expected.tolist()
+
+
+def test_cells_follow_the_number_of_samples() -> None:
+    assert [cells_for(count) for count in (0, 100, 255, 256, 2304, 10**9)] == [0, 0, 0, 4, 12, MOST_CELLS]
+
+
+def a_file(folder: Path) -> tuple[UncertainLTI, dict[str, Any]]:
+    rng = np.random.default_rng(3)
+    model = fit([levels([0.0, 1.0, 0.0], rng)], additive="noise")
+    model.save(folder / "m.model.json")
+    return model, json.loads((folder / "m.model.json").read_text())
+
+
+def test_the_oldest_format_that_holds_a_model_is_written(tmp_path: Path) -> None:
+    model, data = a_file(tmp_path)
+    assert data["format"] == "uncertain-lti/2"
+    assert UncertainLTI.load(tmp_path / "m.model.json").domain.measure == model.domain.measure
+    del data["domain"]["measure"]
+    older = UncertainLTI.from_dict({**data, "format": "uncertain-lti/1"})
+    assert older.domain.measure is None and older.to_dict()["format"] == "uncertain-lti/1"
+    assert UncertainLTI.from_dict(data).domain.measure is None, "every new key is optional"
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"cells": 1}, "domain.measure.cells"),
+        ({"cells": True}, "domain.measure.cells"),
+        ({"cells": 10**9}, "domain.measure.cells"),
+        ({"cells": 5}, "domain.measure.occupied"),
+        ({"occupied": "?"}, "domain.measure.occupied"),
+        ({"occupied": 7}, "domain.measure.occupied"),
+        ({"more": 1}, "domain.measure"),
+    ],
+)
+def test_a_measure_that_is_none_is_refused_by_name(tmp_path: Path, change: dict[str, Any], named: str) -> None:
+    _, data = a_file(tmp_path)
+    data["domain"]["measure"] |= change
+    with pytest.raises(ModelError, match=named):
+        UncertainLTI.from_dict(data)
+    with pytest.raises(ModelError, match=r"domain\.measure"):
+        UncertainLTI.from_dict({**data, "format": "uncertain-lti/1"})
