@@ -647,7 +647,8 @@ def flooded() -> Sampler:
     sampler.push("/c", 2, 2, [0.0])
     for stamp in range(3, 3 * BUFFERED_MESSAGES):
         sampler.push("/u", stamp, stamp, [float(stamp)])
-        assert len(sampler.kept("/u")) <= BUFFERED_MESSAGES
+        if stamp % (BUFFERED_MESSAGES // 10) == 0:
+            assert len(sampler.kept("/u")) <= BUFFERED_MESSAGES
     return sampler
 
 

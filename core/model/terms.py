@@ -10,13 +10,16 @@ Programmes, bounds, model file, monitor and reports take the terms from `TERMS`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.limits import LARGEST
 
 
 @dataclass(frozen=True)
@@ -129,3 +132,53 @@ def tables(arrays: dict[str, Array]) -> tuple[Array, Array, Array]:
 
     others = [arrays[term.half] for term in TERMS if not term.times_dt]
     return side_by_side("nominal"), side_by_side("half"), np.sum(others, axis=0) if len(others) > 1 else others[0]
+
+
+def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_width: bool = False) -> Array:
+    """An array of a model, held to its shape.
+
+    Parameters
+    ----------
+    value : array
+        Numbers.
+    name : str
+        What errors call it.
+    shape : tuple of int or None
+        None for any.
+    half_width : bool, default False
+        Whether it must not be negative.
+
+    Returns
+    -------
+    array
+        A copy.
+
+    Raises
+    ------
+    ModelError
+        It is not an array of finite numbers, has another shape, or is negative; names it.
+    """
+    try:
+        if isinstance(value, Sequence) and not _numbers_only(value):
+            raise TypeError
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ModelError(f"field '{name}' is not an array of numbers") from None
+    if shape is not None and array.shape != shape:
+        if array.size == 0 and 0 in shape:
+            return np.zeros(shape)
+        raise ModelError(f"field '{name}' has shape {array.shape}; it must be {shape}")
+    if not np.isfinite(array).all():
+        raise ModelError(f"field '{name}' holds a number that is not finite")
+    if (np.abs(array) > LARGEST).any():
+        raise ModelError(f"field '{name}' holds a number above {LARGEST:g}, which the arithmetic cannot carry")
+    if half_width and (array < 0).any():
+        raise ModelError(f"field '{name}' holds a negative half-width")
+    return array
+
+
+def _numbers_only(value: Any) -> bool:
+    """No texts, truth values or nulls, which numpy would turn into numbers."""
+    if isinstance(value, (list, tuple)):
+        return all(_numbers_only(v) for v in value)
+    return not isinstance(value, (str, bool)) and value is not None

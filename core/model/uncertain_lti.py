@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import reprlib
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,22 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
-from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
-from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.bounds import centre_and_half, lower_of, upper_of
-from uncertain_lti.model.domain import Domain, Occupancy, Sampling
+from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.file import arguments, read, structure, write
 from uncertain_lti.model.operating_point import OperatingPoint
-from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, regressors, tables
+from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked, regressors, tables
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
-FORMATS = ("uncertain-lti/1", "uncertain-lti/2")
-"""Formats of model files, oldest first; the oldest that holds a model is written."""
-MAX_FILE_BYTES = 64 * 2**20
-_IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
-_IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 _BLOCK = 65536  # products per block of the vectorised path: they stay in the cache
 
 
@@ -101,11 +92,11 @@ class UncertainLTI:
         self.c: Array
         self.dc: Array
         self.v: Array
-        self.A = _array(A, "A", None)
+        self.A = checked(A, "A", None)
         n = len(self.A) if self.A.ndim else 0
         if self.A.shape != (n, n) or n == 0:
             raise ModelError(f"A has shape {self.A.shape}; it must be square, one row per state")
-        self.B = _array(B, "B", None)
+        self.B = checked(B, "B", None)
         if self.B.size == 0:
             self.B = np.zeros((n, 0))
         if self.B.ndim != 2 or self.B.shape[0] != n:
@@ -116,7 +107,7 @@ class UncertainLTI:
             shape = SHAPES[name].shape(n, m)
             half_width = name in HALF_WIDTHS
             value = np.zeros(shape) if value is None and name not in REQUIRED else value
-            setattr(self, name, _array(value, name, shape, half_width))
+            setattr(self, name, checked(value, name, shape, half_width))
         for name in ARRAYS:
             getattr(self, name).flags.writeable = False
         if signals is None:
@@ -492,54 +483,14 @@ class UncertainLTI:
     # --- the file ---
 
     def to_dict(self) -> dict[str, Any]:
-        """The structure of the model file, format "uncertain-lti/1".
+        """The structure of the model file, in the oldest format that holds the model.
 
         Returns
         -------
         dict
             Plain data for JSON; null for infinite ranges.
         """
-        states = [
-            {key: getattr(s, key) for key in ("name", "topic", "type", "field", "unit", "steady", "scale")}
-            for s in self.signals.states
-        ]
-        controls = [
-            {
-                key: getattr(s, key)
-                for key in ("name", "topic", "type", "field", "unit", "steady", "scale", "max_hold", "delay")
-            }
-            for s in self.signals.controls
-        ]
-        s = self.sampling
-        return {
-            "format": FORMATS[self.domain.measure is not None],
-            "states": states,
-            "controls": controls,
-            "sampling": {
-                "clock": s.clock,
-                "clock_type": s.clock_type,
-                "time": dict(s.time),
-                "dt_median": s.dt_median,
-                "dt_min": s.dt_min,
-                "dt_max": s.dt_max,
-                "max_gap": s.max_gap,
-                "min_step": s.min_step,
-                "max_skew": s.max_skew,
-            },
-            **{name: getattr(self, name).tolist() for name in ARRAYS},
-            "domain": {
-                name: [v if math.isfinite(v) else None for v in getattr(self.domain, name).tolist()]
-                for name in ("x_min", "x_max", "u_min", "u_max")
-            }
-            | ({} if self.domain.measure is None else {"measure": self.domain.measure.to_dict()}),
-            "alarm": {
-                "violations": self.alarm_rule.violations,
-                "window": self.alarm_rule.window,
-                "margin": self.alarm_rule.margin,
-            },
-            "fit": _plain({_IN_FILES.get(key, key): value for key, value in self.fit_summary.items()}),
-            "validation": _plain(self.validation),
-        }
+        return structure(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model file; an existing file is replaced as a whole or not at all.
@@ -554,17 +505,7 @@ class UncertainLTI:
         ModelError
             The file cannot be written.
         """
-        try:
-            text = _layout(self.to_dict()).encode()
-        except (TypeError, ValueError, RecursionError) as error:
-            raise ModelError(
-                f"{path}: the model holds what JSON cannot ({error}); mend its fit or validation"
-            ) from None
-        try:
-            with whole_file(path) as stream:
-                stream.write(text)
-        except OSError as error:
-            raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+        write(path, self.to_dict())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> UncertainLTI:
@@ -586,25 +527,7 @@ class UncertainLTI:
             The file is missing, is not JSON, has an unknown format, wrong shapes, numbers that are not finite,
             negative half-widths or scales that are not positive; names file and field.
         """
-        if (kind := kind_of(path)) and kind != "a model file":
-            cure = {
-                "a folder": "name the file in it",
-                "a signals file": "write a model with `uncertain-lti fit`",
-            }.get(kind, "are the arguments swapped?")
-            raise ModelError(f"{path}: this is {kind}, and a model file is wanted here; {cure}")
-        try:
-            if os.path.getsize(path) > MAX_FILE_BYTES:
-                raise ModelError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, so not a model file; check the path")
-            with open(path, encoding="utf-8") as stream:
-                data = json.load(stream, object_pairs_hook=_distinct)
-        except FileNotFoundError:
-            raise ModelError(f"{path}: there is no such model file; write one with `uncertain-lti fit`") from None
-        except OSError as error:
-            raise ModelError(f"{path}: cannot be read: {error.strerror}; check the path") from None
-        except (ValueError, RecursionError) as error:
-            detail = (str(error).splitlines() or [type(error).__name__])[0][:120]
-            raise ModelError(f"{path}: is not JSON ({detail}); write one with `uncertain-lti fit`") from None
-        return cls.from_dict(data, source=os.fspath(path))
+        return cls.from_dict(read(path), source=os.fspath(path))
 
     @classmethod
     def from_dict(cls, data: Any, source: str = "model") -> UncertainLTI:
@@ -628,92 +551,12 @@ class UncertainLTI:
             It is not of that form; names source and field.
         """
         try:
-            return cls._from_dict(data, source)
+            return cls(**arguments(data, source))
         except RecursionError:
             raise ModelError(f"{source}: is nested too deeply; is this a model file?") from None
         except (ModelError, SignalError) as error:
             text = str(error).removeprefix(source).removeprefix(": ")
             raise ModelError(f"{source}: {' '.join(text.split())}") from None  # names may hold line breaks
-
-    @classmethod
-    def _from_dict(cls, data: Any, source: str) -> UncertainLTI:
-        if not isinstance(data, dict) or "format" not in data:
-            raise ModelError(f"no field 'format'; is this a model file written by `uncertain-lti fit` ({FORMATS[0]})?")
-        if data["format"] not in FORMATS:
-            raise ModelError(
-                f"format is {reprlib.repr(data['format'])}, and this version reads {', '.join(FORMATS)}; fit the model "
-                f"again, or use the version that wrote it"
-            )
-        known = {
-            "format", "states", "controls", "sampling", *ARRAYS, "domain", "alarm", "fit", "validation",
-        }  # fmt: skip
-        for name in ("states", "controls", "sampling", *REQUIRED):
-            if name not in data:
-                raise ModelError(f"field '{name}' is missing; fit the model again")
-        for name in data:
-            if name not in known:
-                raise ModelError(f"unknown field {reprlib.repr(name)}; known are {', '.join(sorted(known))}")
-        said = _object(data["sampling"], "sampling", {f.name for f in fields(Sampling)})
-        sampling = Sampling(
-            clock=_text(said.get("clock", ""), "sampling.clock"),
-            clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
-            time={
-                _text(k, "sampling.time"): _text(v, f"sampling.time[{k}]")
-                for k, v in _object(said.get("time", {}), "sampling.time").items()
-            },
-            min_step=_positive(said.get("min_step", 0.0), "sampling.min_step", zero=True) or 0.0,
-            **{
-                key: _positive(said.get(key), f"sampling.{key}")
-                for key in ("dt_median", "dt_min", "dt_max", "max_gap", "max_skew")
-            },
-        )
-        for topic, kind in sampling.time.items():
-            if kind not in ("header", "log"):
-                raise ModelError(f"sampling.time[{topic}] is {reprlib.repr(kind)}; it must be header or log")
-        signals = replace(
-            SignalMap.from_dict(
-                {"states": data["states"], "controls": data["controls"]}, source=source, need_topics=False
-            ),
-            clock=sampling.clock or None,
-            max_gap=sampling.max_gap,
-            min_step=sampling.min_step,
-            max_skew=sampling.max_skew,
-            time={t: "log" if k == "log" else "header" for t, k in sampling.time.items()},
-        )
-        for signal in signals.signals:
-            for key in ("steady", "scale"):
-                if getattr(signal, key) == "auto":
-                    raise ModelError(f"{key} of '{signal.name}' is auto; a model file holds numbers")
-        n, m = len(signals.states), len(signals.controls)
-        _array(data["A"], "A", (n, n))  # against the names, before A says how many rows the others have
-        _array(data["B"], "B", (n, m))
-        domain = None
-        if "domain" in data:
-            sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
-            newer = {"measure"} if data["format"] != FORMATS[0] else set()
-            box = _object(data["domain"], "domain", set(sizes) | newer)
-            for name in sizes:
-                if name not in box:
-                    raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
-            limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
-            measure = Occupancy.from_dict(box["measure"], n + m) if box.get("measure") is not None else None
-            domain = Domain(**limits, measure=measure)
-        alarm = _object(data.get("alarm", {}), "alarm", {f.name for f in fields(AlarmRule)})
-        for key in ("violations", "window"):
-            if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
-                raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
-        if "margin" in alarm:
-            alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
-        arrays: dict[str, Any] = {name: data.get(name) for name in ARRAYS}
-        return cls(
-            **arrays,
-            signals=signals,
-            sampling=sampling,
-            domain=domain,
-            alarm_rule=AlarmRule(**alarm),
-            fit_summary={_IN_PYTHON.get(k, k): v for k, v in _object(data.get("fit", {}), "fit").items()},
-            validation=_object(data.get("validation", {}), "validation"),
-        )
 
 
 def _sampling(signals: SignalMap) -> Sampling:
@@ -727,115 +570,3 @@ def _sampling(signals: SignalMap) -> Sampling:
         min_step=signals.min_step,
         max_skew=signals.max_skew,
     )
-
-
-# --- reading and writing plain data -------------------------------------------------------------------------
-
-
-def _array(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_width: bool = False) -> Array:
-    try:
-        if isinstance(value, Sequence) and not _numbers_only(value):
-            raise TypeError
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise ModelError(f"field '{name}' is not an array of numbers") from None
-    if shape is not None and array.shape != shape:
-        if array.size == 0 and 0 in shape:
-            return np.zeros(shape)
-        raise ModelError(f"field '{name}' has shape {array.shape}; it must be {shape}")
-    if not np.isfinite(array).all():
-        raise ModelError(f"field '{name}' holds a number that is not finite")
-    if (np.abs(array) > LARGEST).any():
-        raise ModelError(f"field '{name}' holds a number above {LARGEST:g}, which the arithmetic cannot carry")
-    if half_width and (array < 0).any():
-        raise ModelError(f"field '{name}' holds a negative half-width")
-    return array
-
-
-def _numbers_only(value: Any) -> bool:
-    """No texts, truth values or nulls, which numpy would turn into numbers."""
-    if isinstance(value, (list, tuple)):
-        return all(_numbers_only(v) for v in value)
-    return not isinstance(value, (str, bool)) and value is not None
-
-
-def _object(value: Any, name: str, known: set[str] | None = None) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ModelError(f"field '{name}' is not an object")
-    for key in value:
-        if known is not None and key not in known:
-            raise ModelError(f"unknown field '{name}.{key}'; known are {', '.join(sorted(known))}")
-    return dict(value)
-
-
-def _text(value: Any, name: str) -> str:
-    if not isinstance(value, str):
-        raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a text")
-    return value
-
-
-def _positive(value: Any, name: str, zero: bool = False, null: bool = True, most: float = LONGEST_S) -> float | None:
-    """A number that is positive, or not negative where zero is allowed; None for null where that is."""
-    if value is None and null:
-        return None
-    try:
-        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
-    except OverflowError:
-        number = math.nan
-    if not (0.0 < number <= most or (zero and number == 0.0)):
-        limit = "" if math.isnan(number) or number <= most else f", at most {most:g}"
-        raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number{limit}")
-    return number
-
-
-def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of a JSON file; readers would keep the last of two equal keys."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f"the key {next(k for k in keys if keys.count(k) > 1)!r} stands twice in one object")
-    return found
-
-
-def _limits(value: Any, name: str, size: int) -> Array:
-    """A list of numbers; null stands for no limit."""
-    if not isinstance(value, list) or len(value) != size:
-        raise ModelError(f"field '{name}' must be a list of {plural(size, 'number')}")
-    without = -math.inf if name.endswith("min") else math.inf
-    limits = _array([0.0 if v is None else v for v in value], name, (size,))
-    limits[[v is None for v in value]] = without
-    return limits
-
-
-def _plain(value: Any) -> Any:
-    """numpy and not finite numbers to what JSON has."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (np.integer, np.bool_)):
-        return value.item()
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value
-
-
-def _layout(data: Mapping[str, Any]) -> str:
-    """JSON with one line per matrix row, signal and entry, so that a diff can be read."""
-
-    def flat(value: Any) -> str:
-        return json.dumps(value, allow_nan=False, ensure_ascii=False)
-
-    lines = []
-    for key, value in data.items():
-        if isinstance(value, list) and value and isinstance(value[0], (list, dict)):
-            inner = ",\n    ".join(flat(row) for row in value)
-            lines.append(f"  {flat(key)}: [\n    {inner}\n  ]")
-        elif isinstance(value, dict) and value:
-            inner = ",\n    ".join(f"{flat(k)}: {flat(v)}" for k, v in value.items())
-            lines.append(f"  {flat(key)}: {{\n    {inner}\n  }}")
-        else:
-            lines.append(f"  {flat(key)}: {flat(value)}")
-    return "{\n" + ",\n".join(lines) + "\n}\n"

@@ -1,0 +1,328 @@
+"""The model file: its structure, and how it is read and written."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import reprlib
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.files import kind_of, whole_file
+from uncertain_lti.base.limits import LARGEST, LONGEST_S
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Domain, Occupancy, Sampling
+from uncertain_lti.model.terms import ARRAYS, REQUIRED, checked
+from uncertain_lti.signals.signal_map import SignalMap
+
+FORMATS = ("uncertain-lti/1", "uncertain-lti/2")
+"""Formats of model files, oldest first; the oldest that holds a model is written."""
+MAX_FILE_BYTES = 64 * 2**20
+_IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
+_IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
+
+
+def structure(model: Any) -> dict[str, Any]:
+    """The structure of a model file, in the oldest format that holds the model.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+
+    Returns
+    -------
+    dict
+        Plain data for JSON; null for infinite ranges.
+    """
+    states = [
+        {key: getattr(s, key) for key in ("name", "topic", "type", "field", "unit", "steady", "scale")}
+        for s in model.signals.states
+    ]
+    controls = [
+        {
+            key: getattr(s, key)
+            for key in ("name", "topic", "type", "field", "unit", "steady", "scale", "max_hold", "delay")
+        }
+        for s in model.signals.controls
+    ]
+    s = model.sampling
+    return {
+        "format": FORMATS[model.domain.measure is not None],
+        "states": states,
+        "controls": controls,
+        "sampling": {
+            "clock": s.clock,
+            "clock_type": s.clock_type,
+            "time": dict(s.time),
+            "dt_median": s.dt_median,
+            "dt_min": s.dt_min,
+            "dt_max": s.dt_max,
+            "max_gap": s.max_gap,
+            "min_step": s.min_step,
+            "max_skew": s.max_skew,
+        },
+        **{name: getattr(model, name).tolist() for name in ARRAYS},
+        "domain": {
+            name: [v if math.isfinite(v) else None for v in getattr(model.domain, name).tolist()]
+            for name in ("x_min", "x_max", "u_min", "u_max")
+        }
+        | ({} if model.domain.measure is None else {"measure": model.domain.measure.to_dict()}),
+        "alarm": {
+            "violations": model.alarm_rule.violations,
+            "window": model.alarm_rule.window,
+            "margin": model.alarm_rule.margin,
+        },
+        "fit": _plain({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
+        "validation": _plain(model.validation),
+    }
+
+
+def arguments(data: Any, source: str) -> dict[str, Any]:
+    """What a model is made of, from the structure of its file.
+
+    Parameters
+    ----------
+    data : object
+        As JSON gives it.
+    source : str
+        What errors call it.
+
+    Returns
+    -------
+    dict
+        Arguments of `UncertainLTI`.
+
+    Raises
+    ------
+    ModelError
+        It is not of that form; names the field.
+    """
+    if not isinstance(data, dict) or "format" not in data:
+        raise ModelError(f"no field 'format'; is this a model file written by `uncertain-lti fit` ({FORMATS[0]})?")
+    if data["format"] not in FORMATS:
+        raise ModelError(
+            f"format is {reprlib.repr(data['format'])}, and this version reads {', '.join(FORMATS)}; fit the model "
+            f"again, or use the version that wrote it"
+        )
+    known = {
+        "format", "states", "controls", "sampling", *ARRAYS, "domain", "alarm", "fit", "validation",
+    }  # fmt: skip
+    for name in ("states", "controls", "sampling", *REQUIRED):
+        if name not in data:
+            raise ModelError(f"field '{name}' is missing; fit the model again")
+    for name in data:
+        if name not in known:
+            raise ModelError(f"unknown field {reprlib.repr(name)}; known are {', '.join(sorted(known))}")
+    said = _object(data["sampling"], "sampling", {f.name for f in fields(Sampling)})
+    sampling = Sampling(
+        clock=_text(said.get("clock", ""), "sampling.clock"),
+        clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
+        time={
+            _text(k, "sampling.time"): _text(v, f"sampling.time[{k}]")
+            for k, v in _object(said.get("time", {}), "sampling.time").items()
+        },
+        min_step=_positive(said.get("min_step", 0.0), "sampling.min_step", zero=True) or 0.0,
+        **{
+            key: _positive(said.get(key), f"sampling.{key}")
+            for key in ("dt_median", "dt_min", "dt_max", "max_gap", "max_skew")
+        },
+    )
+    for topic, kind in sampling.time.items():
+        if kind not in ("header", "log"):
+            raise ModelError(f"sampling.time[{topic}] is {reprlib.repr(kind)}; it must be header or log")
+    signals = replace(
+        SignalMap.from_dict({"states": data["states"], "controls": data["controls"]}, source=source, need_topics=False),
+        clock=sampling.clock or None,
+        max_gap=sampling.max_gap,
+        min_step=sampling.min_step,
+        max_skew=sampling.max_skew,
+        time={t: "log" if k == "log" else "header" for t, k in sampling.time.items()},
+    )
+    for signal in signals.signals:
+        for key in ("steady", "scale"):
+            if getattr(signal, key) == "auto":
+                raise ModelError(f"{key} of '{signal.name}' is auto; a model file holds numbers")
+    n, m = len(signals.states), len(signals.controls)
+    checked(data["A"], "A", (n, n))  # against the names, before A says how many rows the others have
+    checked(data["B"], "B", (n, m))
+    domain = None
+    if "domain" in data:
+        sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
+        newer = {"measure"} if data["format"] != FORMATS[0] else set()
+        box = _object(data["domain"], "domain", set(sizes) | newer)
+        for name in sizes:
+            if name not in box:
+                raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
+        limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
+        measure = Occupancy.from_dict(box["measure"], n + m) if box.get("measure") is not None else None
+        domain = Domain(**limits, measure=measure)
+    alarm = _object(data.get("alarm", {}), "alarm", {f.name for f in fields(AlarmRule)})
+    for key in ("violations", "window"):
+        if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
+            raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
+    if "margin" in alarm:
+        alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
+    arrays: dict[str, Any] = {name: data.get(name) for name in ARRAYS}
+    return {
+        **arrays,
+        "signals": signals,
+        "sampling": sampling,
+        "domain": domain,
+        "alarm_rule": AlarmRule(**alarm),
+        "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in _object(data.get("fit", {}), "fit").items()},
+        "validation": _object(data.get("validation", {}), "validation"),
+    }
+
+
+def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
+    """Write a model file; an existing file is replaced as a whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    data : mapping
+        From `structure`.
+
+    Raises
+    ------
+    ModelError
+        It holds what JSON cannot, or the file cannot be written.
+    """
+    try:
+        text = _layout(data).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ModelError(f"{path}: the model holds what JSON cannot ({error}); mend its fit or validation") from None
+    try:
+        with whole_file(path) as stream:
+            stream.write(text)
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+
+
+def read(path: str | os.PathLike[str]) -> Any:
+    """Read the structure of a model file.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Returns
+    -------
+    Any
+        What JSON holds there, for `arguments`.
+
+    Raises
+    ------
+    ModelError
+        The file is missing, too large, or is not JSON.
+    """
+    if (kind := kind_of(path)) and kind != "a model file":
+        cure = {
+            "a folder": "name the file in it",
+            "a signals file": "write a model with `uncertain-lti fit`",
+        }.get(kind, "are the arguments swapped?")
+        raise ModelError(f"{path}: this is {kind}, and a model file is wanted here; {cure}")
+    try:
+        if os.path.getsize(path) > MAX_FILE_BYTES:
+            raise ModelError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, so not a model file; check the path")
+        with open(path, encoding="utf-8") as stream:
+            return json.load(stream, object_pairs_hook=_distinct)
+    except FileNotFoundError:
+        raise ModelError(f"{path}: there is no such model file; write one with `uncertain-lti fit`") from None
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror}; check the path") from None
+    except (ValueError, RecursionError) as error:
+        detail = (str(error).splitlines() or [type(error).__name__])[0][:120]
+        raise ModelError(f"{path}: is not JSON ({detail}); write one with `uncertain-lti fit`") from None
+
+
+def _object(value: Any, name: str, known: set[str] | None = None) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ModelError(f"field '{name}' is not an object")
+    for key in value:
+        if known is not None and key not in known:
+            raise ModelError(f"unknown field '{name}.{key}'; known are {', '.join(sorted(known))}")
+    return dict(value)
+
+
+def _text(value: Any, name: str) -> str:
+    if not isinstance(value, str):
+        raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a text")
+    return value
+
+
+def _positive(value: Any, name: str, zero: bool = False, null: bool = True, most: float = LONGEST_S) -> float | None:
+    """A number that is positive, or not negative where zero is allowed; None for null where that is."""
+    if value is None and null:
+        return None
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
+    except OverflowError:
+        number = math.nan
+    if not (0.0 < number <= most or (zero and number == 0.0)):
+        limit = "" if math.isnan(number) or number <= most else f", at most {most:g}"
+        raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number{limit}")
+    return number
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of a JSON file; readers would keep the last of two equal keys."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(k for k in keys if keys.count(k) > 1)!r} stands twice in one object")
+    return found
+
+
+def _limits(value: Any, name: str, size: int) -> Array:
+    """A list of numbers; null stands for no limit."""
+    if not isinstance(value, list) or len(value) != size:
+        raise ModelError(f"field '{name}' must be a list of {plural(size, 'number')}")
+    without = -math.inf if name.endswith("min") else math.inf
+    limits = checked([0.0 if v is None else v for v in value], name, (size,))
+    limits[[v is None for v in value]] = without
+    return limits
+
+
+def _plain(value: Any) -> Any:
+    """numpy and not finite numbers to what JSON has."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (np.integer, np.bool_)):
+        return value.item()
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def _layout(data: Mapping[str, Any]) -> str:
+    """JSON with one line per matrix row, signal and entry, so that a diff can be read."""
+
+    def flat(value: Any) -> str:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False)
+
+    lines = []
+    for key, value in data.items():
+        if isinstance(value, list) and value and isinstance(value[0], (list, dict)):
+            inner = ",\n    ".join(flat(row) for row in value)
+            lines.append(f"  {flat(key)}: [\n    {inner}\n  ]")
+        elif isinstance(value, dict) and value:
+            inner = ",\n    ".join(f"{flat(k)}: {flat(v)}" for k, v in value.items())
+            lines.append(f"  {flat(key)}: {{\n    {inner}\n  }}")
+        else:
+            lines.append(f"  {flat(key)}: {flat(value)}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
