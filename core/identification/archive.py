@@ -152,7 +152,7 @@ def fit_archive(
         with CacheWriter(cache) as writer:
             for number, recording in enumerate(recordings, start=1):
                 counting(f"reading {recording[0]}")(number)
-                problem = load(recording, signals, Columns(False, False, False))
+                problem = load(recording, signals, Columns())
                 counts.append(problem.N)
                 steps.append(problem.dt)
                 if problem.N:
@@ -266,7 +266,7 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
 
 
 def _constant_dt(recording: Recording, signals: SignalMap) -> bool:
-    dt = load(recording, signals, Columns(False, False, False)).dt
+    dt = load(recording, signals, Columns()).dt
     return is_constant(dt)
 
 

@@ -500,7 +500,7 @@ def _gain(problem: Problem, size: Array) -> Array:
         index = np.union1d(nearest, index[:: problem.N // TRIED])
     part = replace(problem.subset(index), weights=np.ones(problem.n))
     widths = []
-    for columns in (problem.columns, Columns(False, False, True)):
+    for columns in (problem.columns, Columns(frozenset({"v"}))):
         some = replace(part, columns=columns)
         solution = WorkingSet(Fleet([some])).quadratic()
         widths.append((part.dt[:, None] * (some.psi() @ np.maximum(solution.d, 0.0))).mean(axis=0))

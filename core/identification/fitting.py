@@ -26,6 +26,7 @@ from uncertain_lti.identification.working_set import GOOD, LEAST, InfeasibleErro
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath
@@ -453,16 +454,15 @@ def _model(
     alarm_rule: AlarmRule | None,
 ) -> UncertainLTI:
     n, p = len(signals.states), len(sums.low)
-    zeros = np.zeros(n)
+    additive = {term.nominal: theta[k] for k, term in enumerate(columns.nominal, start=p)}
+    additive |= {term.half: d[k] for k, term in enumerate(columns.half, start=p)}
     clock_types = [s.type for s in signals.states if s.topic == signals.clock]
     return UncertainLTI(
         theta[:n].T,
         theta[n:p].T,
         d[:n].T,
         d[n:p].T,
-        theta[p] if columns.drift else zeros,
-        d[p] if columns.disturbance else zeros,
-        d[-1] if columns.noise else zeros,
+        **{name: additive.get(name) for term in ADDITIVE for name in term.names},
         signals=signals,
         sampling=Sampling(
             clock=signals.clock or "",

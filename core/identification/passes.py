@@ -199,7 +199,7 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
         The partition has no transition.
     """
     columns, n, p = part.columns, part.n, part.p
-    q = p + columns.disturbance + columns.noise
+    q = p + len(columns.half)
     sums: Moments | None = None
     sampled: list[Block] = []
     index: list[Index] = []
@@ -211,10 +211,8 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
         phi = block.phi(columns) * block.dt
         psi = np.empty((q, len(block)))
         np.abs(phi[:p], out=psi[:p])  # Δt > 0
-        if columns.disturbance:
-            psi[p] = block.dt
-        if columns.noise:
-            psi[-1] = 1.0
+        for row, term in zip(psi[p:], columns.half, strict=True):
+            row[:] = block.dt if term.times_dt else 1.0
         step = block.x_next - block.z[:n]
         weights = block.weights
         gram = np.stack([_gram(psi * weights[:, i], psi) for i in range(n)]) if weights.ndim == 2 else None

@@ -14,6 +14,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.terms import ADDITIVE, Term
 from uncertain_lti.sampling.transient import Transient
 
 Additive = Literal["none", "disturbance", "noise", "both"]
@@ -24,21 +25,40 @@ BLOCK = 16384
 
 @dataclass(frozen=True)
 class Columns:
-    """Which terms are unknown besides A, B, ΔA, ΔB.
+    """Which arrays of the additive terms are unknown besides A, B, ΔA, ΔB.
 
     Parameters
     ----------
-    drift : bool
-        c is unknown.
-    disturbance : bool
-        dc is unknown.
-    noise : bool
-        v is unknown.
+    names : frozenset of str
+        Of "c", "dc" and "v", those that are.
     """
 
-    drift: bool  # c
-    disturbance: bool  # dc
-    noise: bool  # v
+    names: frozenset[str] = frozenset()
+
+    @property
+    def nominal(self) -> tuple[Term, ...]:
+        """Terms whose nominal elements are unknown, in the order of the rows after those of A and B."""
+        return tuple(term for term in ADDITIVE if term.nominal in self.names)
+
+    @property
+    def half(self) -> tuple[Term, ...]:
+        """Terms whose half-widths are unknown, in the order of the rows after those of ΔA and ΔB."""
+        return tuple(term for term in ADDITIVE if term.half in self.names)
+
+    @property
+    def drift(self) -> bool:
+        """Whether c is unknown."""
+        return "c" in self.names
+
+    @property
+    def disturbance(self) -> bool:
+        """Whether dc is unknown."""
+        return "dc" in self.names
+
+    @property
+    def noise(self) -> bool:
+        """Whether v is unknown."""
+        return "v" in self.names
 
     def unknowns(self, p: int) -> int:
         """Number of unknowns per row with p states and controls.
@@ -53,7 +73,7 @@ class Columns:
         int
             Unknowns per row, nominal elements and half-widths.
         """
-        return 2 * p + self.drift + self.disturbance + self.noise
+        return 2 * p + len(self.names)
 
     @classmethod
     def of(cls, additive: Additive, constant_dt: bool) -> Columns:
@@ -81,8 +101,8 @@ class Columns:
         """
         if additive not in ("none", "disturbance", "noise", "both"):
             raise FitError(f"additive is {additive!r}; it must be none, disturbance, noise or both")
-        disturbance = additive in ("disturbance", "both")
-        return cls(disturbance, disturbance and not (additive == "both" and constant_dt), additive in ("noise", "both"))
+        names = {"none": "", "disturbance": "c dc", "noise": "v", "both": "c v" if constant_dt else "c dc v"}
+        return cls(frozenset(names[additive].split()))
 
 
 @dataclass(frozen=True)
@@ -168,7 +188,7 @@ class Block:
         return rate
 
     def phi(self, columns: Columns) -> Array:
-        """Regressors φ of the nominal row: z, and 1 for the drift.
+        """Regressors φ of the nominal row: z, and 1 for each additive term.
 
         Parameters
         ----------
@@ -180,10 +200,10 @@ class Block:
         array (r, K)
             φ / Δt.
         """
-        return np.vstack([self.z, np.ones(len(self))]) if columns.drift else self.z
+        return np.vstack([self.z, np.ones((len(columns.nominal), len(self)))]) if columns.nominal else self.z
 
     def psi(self, columns: Columns) -> Array:
-        """Regressors ψ of the half-width: |z|, 1 for dc, 1/Δt for v.
+        """Regressors ψ of the half-width: |z|, and for each additive term 1 or, if Δt does not multiply it, 1/Δt.
 
         Parameters
         ----------
@@ -196,12 +216,10 @@ class Block:
             ψ / Δt.
         """
         p = len(self.z)
-        psi = np.empty((p + columns.disturbance + columns.noise, len(self)))
+        psi = np.empty((p + len(columns.half), len(self)))
         np.abs(self.z, out=psi[:p])
-        if columns.disturbance:
-            psi[p] = 1.0
-        if columns.noise:
-            np.divide(1.0, self.dt, out=psi[-1])
+        for row, term in zip(psi[p:], columns.half, strict=True):
+            row[:] = 1.0 if term.times_dt else 1.0 / self.dt
         return psi
 
     def root_weights(self) -> Array:

@@ -77,8 +77,10 @@ def repair(
     lifted = np.where(fixed, d, d + np.outer(unit, np.maximum(violation, 0.0)))
     nominal = np.zeros(d.shape)
     nominal[:p] = np.abs(theta[:p])
-    if fleet.columns.disturbance:
-        nominal[p] = np.abs(theta[p])
+    columns = fleet.columns
+    for k, term in enumerate(columns.half, start=p):
+        if term in columns.nominal:
+            nominal[k] = np.abs(theta[p + columns.nominal.index(term)])
     own = np.zeros(d.shape)
     own[np.arange(n), np.arange(n)] = 1.0 / sums.dt_min
     base = np.clip(lifted, low, high)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
-
-NOMINAL, HALF_WIDTH = ("A", "B", "c"), ("dA", "dB", "dc", "v")
+from uncertain_lti.model.terms import ADDITIVE, HALF_WIDTHS, TERMS
 
 
 class Structure:
@@ -47,11 +46,13 @@ class Structure:
         upper: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         self.n, self.m = n, m
-        self._shapes = {"A": (n, n), "B": (n, m), "c": (n,), "dA": (n, n), "dB": (n, m), "dc": (n,), "v": (n,)}
+        nominal = [term for term in TERMS if term.nominal]
+        self._shapes = {term.nominal: term.shape(n, m) for term in nominal}
+        self._shapes |= {term.half: term.shape(n, m) for term in TERMS}
         self.lower: dict[str, Array] = {}
         self.upper: dict[str, Array] = {}
         for name, shape in self._shapes.items():
-            self.lower[name] = np.full(shape, 0.0 if name in HALF_WIDTH else -math.inf)
+            self.lower[name] = np.full(shape, 0.0 if name in HALF_WIDTHS else -math.inf)
             self.upper[name] = np.full(shape, math.inf)
         for given, targets in (
             (lower, (self.lower,)),
@@ -70,7 +71,7 @@ class Structure:
                     f"structure: {name}{list(at)} is to be at least {self.lower[name][at]:g} and at most "
                     f"{self.upper[name][at]:g}; mend one of them"
                 )
-            if name in HALF_WIDTH and (self.lower[name] < 0).any():
+            if name in HALF_WIDTHS and (self.lower[name] < 0).any():
                 at = tuple(np.argwhere(self.lower[name] < 0)[0].tolist())
                 raise FitError(f"structure: {name}{list(at)} is a half-width and cannot be below 0")
 
@@ -131,10 +132,9 @@ class Structure:
                 raise FitError(f"{here}: a rule has the keys state, from, and nominal and/or half_width")
             rows = range(n) if rule["state"] == "*" else [_position(rule["state"], states, f"{here}: state")]
             columns: list[tuple[str, str, int | None]] = []
-            if rule["from"] == "drift":
-                columns = [("c", "dc", None)]
-            elif rule["from"] == "noise":
-                columns = [("", "v", None)]
+            additive = [term for term in ADDITIVE if rule["from"] == term.word]
+            if additive:
+                columns = [(term.nominal, term.half, None) for term in additive]
             elif rule["from"] == "*":
                 columns = [*(("A", "dA", j) for j in range(n)), *(("B", "dB", j) for j in range(m))]
             else:
@@ -146,10 +146,10 @@ class Structure:
                     for key, name in (("nominal", nominal), ("half_width", half)):
                         if key in rule:
                             if not name:
-                                raise FitError(f"{here}: noise has no nominal value; say half_width")
+                                raise FitError(f"{here}: {rule['from']} has no nominal value; say half_width")
                             low, high = _range(rule[key], f"{here}: {key}")
                             structure.lower[name][at] = (
-                                max(low, 0.0) if name in HALF_WIDTH and low == -math.inf else low
+                                max(low, 0.0) if name in HALF_WIDTHS and low == -math.inf else low
                             )
                             structure.upper[name][at] = high
         return cls(n, m, lower=structure.lower, upper=structure.upper)
@@ -204,17 +204,13 @@ class Structure:
         shaped = {side: {k: v for k, v in arrays(side).items() if v.size} for side in ("lower", "upper")}
         return cls(n, m, lower=shaped["lower"], upper=shaped["upper"])
 
-    def stacked(self, drift: bool, disturbance: bool, noise: bool) -> tuple[Array, Array, Array, Array]:
+    def stacked(self, names: Collection[str]) -> tuple[Array, Array, Array, Array]:
         """Bounds in the order of the unknowns.
 
         Parameters
         ----------
-        drift : bool
-            The fit has c.
-        disturbance : bool
-            The fit has dc.
-        noise : bool
-            The fit has v.
+        names : collection of str
+            Arrays of the additive terms that the fit has.
 
         Returns
         -------
@@ -232,15 +228,21 @@ class Structure:
         FitError
             An additive element is fixed to a number other than 0, and the fit does not have that term.
         """
-        for name, there in (("c", drift), ("dc", disturbance), ("v", noise)):
+        additive = [name for which in ("nominal", "half") for term in ADDITIVE if (name := getattr(term, which))]
+        for name in additive:
             forced = (self.lower[name] > 0) | (self.upper[name] < 0)
-            if not there and forced.any():
+            if name not in names and forced.any():
                 raise FitError(f"structure: {name} is not 0, and the fit has no such term; choose another additive")
         sides = []
         for side in (self.lower, self.upper):
-            theta = [side["A"].T, side["B"].T] + ([side["c"][None]] if drift else [])
-            d = [side["dA"].T, side["dB"].T]
-            d += ([side["dc"][None]] if disturbance else []) + ([side["v"][None]] if noise else [])
+            theta, d = (
+                [
+                    np.atleast_2d(side[name].T)
+                    for term in TERMS
+                    if (name := getattr(term, which)) and (term.required or name in names)
+                ]
+                for which in ("nominal", "half")
+            )
             sides.append((np.vstack(theta), np.vstack(d)))
         return sides[0][0], sides[1][0], sides[0][1], sides[1][1]
 

@@ -12,6 +12,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Moments, Samples
+from uncertain_lti.identification.problem import Columns
 from uncertain_lti.identification.solvers import FEASIBLE, Sense, Simplex, dual_bound, solve_qp
 from uncertain_lti.identification.structure import Structure
 
@@ -217,7 +218,7 @@ class Row:
         self.theta, self.d = theta, d
         self._forget()
         self.width_unit = 1.0
-        self.hold(samples, *self._columns)
+        self.hold(samples, self._columns)
         self.width_unit = float(np.sqrt(np.mean(self.width**2))) if len(samples) else 1.0
         self.width = self.width / self.width_unit
         self.limit = None if limit is None else limit * before / self.limit_unit
@@ -233,7 +234,8 @@ class Row:
         return np.asarray(self.width[positions] * self.width_unit / (2.0 * self.samples.root_weight[positions]))
 
     def _phi(self, samples: Samples) -> Array:
-        return np.vstack([samples.z, np.ones(len(samples))]) if self._columns[0] else samples.z
+        extra = len(self._columns.nominal)
+        return np.vstack([samples.z, np.ones((extra, len(samples)))]) if extra else samples.z
 
     def scaled(self) -> tuple[Array, Array]:
         """Return the row's elements as differences from its fixed part, in scaled units.
@@ -285,28 +287,24 @@ class Row:
         theta = change * self.unit_phi * self.scale
         self.theta[self.free_phi] = theta + self.fixed_theta[self.free_phi] if self.refined else theta
 
-    def hold(self, samples: Samples, columns_drift: bool, disturbance: bool, noise: bool) -> None:
+    def hold(self, samples: Samples, columns: Columns) -> None:
         """Hold these samples, and the working set so far.
 
         Parameters
         ----------
         samples : Samples
             Of the last pass.
-        columns_drift : bool
-            The fit has c.
-        disturbance : bool
-            The fit has dc.
-        noise : bool
-            The fit has v.
+        columns : Columns
+            Terms that the fit has.
         """
-        self._columns = (columns_drift, disturbance, noise)
+        self._columns = columns
         p = len(samples.z)
         kept = self.samples[self.pool]
         self.samples = samples = Samples.join([samples, kept], p)
         self.pool = np.searchsorted(samples.index, kept.index)
         ones = np.ones(len(samples))
         phi = self._phi(samples)
-        extra = ([ones] if disturbance else []) + ([1.0 / samples.dt] if noise else [])
+        extra = [ones if term.times_dt else 1.0 / samples.dt for term in columns.half]
         psi = np.vstack([np.abs(samples.z), *extra])
         size = self.size_unit @ psi
         size[size == 0.0] = 1.0
@@ -983,10 +981,8 @@ class WorkingSet:
         self.whole = fleet.N <= 2 * SUBSAMPLE
         stride = 1 if self.whole else fleet.N // SUBSAMPLE
         self.sums, self._first = fleet.moments(stride)
-        columns = fleet.columns
-        self._terms = (columns.drift, columns.disturbance, columns.noise)
         structure = structure or Structure(fleet.n, fleet.p - fleet.n)
-        bounds = structure.stacked(*self._terms)
+        bounds = structure.stacked(fleet.columns.names)
         self.half_limits = bounds[2:]  # least and largest half-widths that the structure allows, (q, n) each
         self.rows = [Row(i, self.sums, bounds) for i in range(fleet.n)]
         self.solvers: set[str] = set()
@@ -1311,19 +1307,23 @@ class WorkingSet:
             per_column[:p] += np.abs(row.theta - theta)[:p] * np.where(
                 row.size_unit[:p] > 0, 1.0 / row.size_unit[:p], 0.0
             )
-        drift, disturbance, noise = self._terms
-        if drift:  # |c| <= size x ..., by the term of the size that is constant in time
-            change = abs(float(row.theta[p] - theta[p]))
-            if disturbance:
-                per_column[p] += change / row.size_unit[p]
-            elif noise:
-                per_column[-1] += change * self.sums.dt_max / row.size_unit[-1]
+        nominal, half = self.fleet.columns.nominal, self.fleet.columns.half
+        still = [k for k, term in enumerate(half, start=p) if not term.times_dt]
+        for j, term in enumerate(
+            nominal, start=p
+        ):  # |c| <= size x ..., by the term of the size that is constant in time
+            change = abs(float(row.theta[j] - theta[j]))
+            if term in half:
+                k = p + half.index(term)
+                per_column[k] += change / row.size_unit[k]
+            elif still:
+                per_column[still[0]] += change * self.sums.dt_max / row.size_unit[still[0]]
         return float(per_column.max(initial=0.0)) / row.scale * (1.0 + 1e-9)
 
     def _hold(self, row: Row, samples: Samples) -> None:
         if len(self.excluded):
             samples = samples[~np.isin(samples.index, self.excluded)]
-        row.hold(samples, *self._terms)
+        row.hold(samples, self.fleet.columns)
 
     def _sizes(self) -> str:
         return "/".join(str(len(row.pool)) for row in self.rows)

@@ -40,6 +40,8 @@ class Term:
         Whether a model must state it; otherwise it is 0 by default.
     meaning : str
         In words.
+    word : str
+        What rules of a signals file and reports call an additive term; empty for the others.
     """
 
     nominal: str
@@ -48,6 +50,7 @@ class Term:
     times_dt: bool
     required: bool
     meaning: str
+    word: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,11 +78,13 @@ class Term:
 TERMS = (
     Term("A", "dA", "x", True, True, "state matrix"),
     Term("B", "dB", "u", True, True, "control matrix"),
-    Term("c", "dc", "1", True, False, "drift"),
-    Term("", "v", "1", False, False, "measurement noise"),
+    Term("c", "dc", "1", True, False, "drift", "drift"),
+    Term("", "v", "1", False, False, "measurement noise", "noise"),
 )
 """Every term, in the order in which the bounds sum their columns."""
 
+ADDITIVE = tuple(term for term in TERMS if not term.required)
+"""The terms that a fit has or not, each on the regressor 1."""
 _RATES = tuple(term for term in TERMS if term.times_dt)
 HALF_WIDTHS = tuple(term.half for term in TERMS)
 """Names of the half-widths."""

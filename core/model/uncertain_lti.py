@@ -19,7 +19,7 @@ from uncertain_lti.model.bounds import centre_and_half, lower_of, upper_of
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
 from uncertain_lti.model.operating_point import OperatingPoint
-from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked, regressors, tables
+from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -152,6 +152,17 @@ class UncertainLTI:
         """Names of the controls."""
         return tuple(s.name for s in self.signals.controls)
 
+    def additive(self) -> list[tuple[Term, Array, Array]]:
+        """Additive terms of the model.
+
+        Returns
+        -------
+        list of (Term, array (n,), array (n,))
+            Each with its nominal elements, 0 where it has none, and its half-widths.
+        """
+        zeros = np.zeros(self.n)
+        return [(t, getattr(self, t.nominal) if t.nominal else zeros, getattr(self, t.half)) for t in ADDITIVE]
+
     def __repr__(self) -> str:
         text = f"UncertainLTI({plural(self.n, 'state')}: {', '.join(self.state_names)}; "
         text += f"{plural(self.m, 'control')}"
@@ -167,7 +178,7 @@ class UncertainLTI:
         names = [*self.state_names, *self.control_names]
         nominal, half = np.hstack([self.A, self.B]), np.hstack([self.dA, self.dB])
         shown = range(min(len(names), MOST))
-        extra = [(n, a, b) for n, a, b in (("c", self.c, self.dc), ("v", np.zeros(self.n), self.v)) if (a + b).any()]
+        extra = [(t.nominal or t.half, a, b) for t, a, b in self.additive() if a.any() or b.any()]
         header = ["A, B [1/s]", *(names[j] for j in shown)]
         header += ["…"] * (len(names) > MOST) + [name for name, _, _ in extra]
         rows = []

@@ -479,14 +479,11 @@ def _with_additive(model: UncertainLTI) -> tuple[Array, Array, list[str]]:
     """Nominal elements and half-widths (n, columns), with what the model has of drift and noise."""
     nominal, half = [model.A, model.B], [model.dA, model.dB]
     columns = [_short(name) for name in (*model.state_names, *model.control_names)]
-    if model.c.any() or model.dc.any():
-        nominal.append(model.c[:, None])
-        half.append(model.dc[:, None])
-        columns.append("c (drift)")
-    if model.v.any():
-        nominal.append(np.zeros((model.n, 1)))
-        half.append(model.v[:, None])
-        columns.append("v (noise)")
+    for term, centre, width in model.additive():
+        if centre.any() or width.any():
+            nominal.append(centre[:, None])
+            half.append(width[:, None])
+            columns.append(f"{term.nominal or term.half} ({term.word})")
     return np.hstack(nominal), np.hstack(half), columns
 
 

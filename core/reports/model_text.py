@@ -44,11 +44,11 @@ def model_text(model: UncertainLTI) -> str:
     lines.append(table(("signal", "topic", "field", "steady", "scale", "unit"), signals))
     names = [*model.state_names, *model.control_names]
     nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
-    extra = [
-        ("c", np.column_stack([model.c, model.dc])),
-        ("v (noise)", np.column_stack([np.zeros(model.n), model.v])),
+    shown = [
+        (term.nominal or f"{term.half} ({term.word})", np.column_stack(pair))
+        for term, *pair in model.additive()
+        if np.any(pair)
     ]
-    shown = [(name, pair) for name, pair in extra if pair.any()]
     rows = [
         [name]
         + [f"{nominal[i, j]:.4g} ± {half[i, j]:.3g}" for j in range(len(names))]

@@ -39,23 +39,24 @@ def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[
         No recording has a usable transition.
     """
     point = model.operating_point
-    total, count = np.zeros(model.n + model.m + 2), 0
+    additive = [(term, half) for term, _, half in model.additive()]
+    total, count = np.zeros(model.n + model.m + len(additive)), 0
     for transient in transients:
         steps = transient.transitions()
         if not len(steps.k):
             continue
         count += len(steps.k)
         z = np.abs(np.hstack([point.normalise_x(steps.x), point.normalise_u(steps.u)]))
-        total += [*(steps.dt @ z), steps.dt.sum(), len(steps.k)]
+        total += [*(steps.dt @ z), *(steps.dt.sum() if term.times_dt else len(steps.k) for term, _ in additive)]
     if not count:
         raise ModelError("no recording has a usable transition, so there is no width to share out")
-    parts = 2.0 * np.hstack([model.dA, model.dB, model.dc[:, None], model.v[:, None]]) * (total / count)
+    parts = 2.0 * np.hstack([model.dA, model.dB, *(half[:, None] for _, half in additive)]) * (total / count)
     columns = [*model.state_names, *model.control_names]
     kept = list(range(model.n + model.m))
-    for place, (values, name) in enumerate(((model.dc, "drift"), (model.v, "noise")), start=len(kept)):
-        if values.any():
+    for place, (term, half) in enumerate(additive, start=len(kept)):
+        if half.any():
             kept.append(place)
-            columns.append(name)
+            columns.append(term.word)
     width = parts.sum(axis=1)
     shares = np.divide(parts, width[:, None], out=np.zeros_like(parts), where=width[:, None] > 0)
     return shares[:, kept], width * point.X, columns

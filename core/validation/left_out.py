@@ -19,6 +19,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient
@@ -825,7 +826,7 @@ def scenario(validation: Validation) -> dict[str, Any]:
 
 def _variables(model: UncertainLTI) -> int:
     nominal = model.n * (model.n + model.m)
-    return 2 * nominal + sum(int(a.any()) * model.n for a in (model.c, model.dc, model.v))
+    return 2 * nominal + sum(int(getattr(model, name).any()) * model.n for term in ADDITIVE for name in term.names)
 
 
 def _discarded(model: UncertainLTI) -> int:
