@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.sampling.angles import nearest_branch
 from uncertain_lti.sampling.instants import LONGEST_NS, to_ns
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap
 
-_TWO_PI = 2.0 * math.pi
 BUFFERED_MESSAGES = 10_000
 """Messages kept per topic that wait for a later sample; at this many, all but the later half and the one that the
 open sample has chosen so far are forgotten."""
@@ -248,7 +248,7 @@ class _Topic:
     def unwrapped(self, values: list[float]) -> list[float]:
         for i in self.unwrap:
             if math.isfinite(values[i]):
-                values[i] += _TWO_PI * round((self.previous[i] - values[i]) / _TWO_PI)
+                values[i] = nearest_branch(values[i], self.previous[i])
                 self.previous[i] = values[i]
         return values
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.sampling.angles import TURN, nearest_branch
 from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES
 from uncertain_lti.sampling.status import Status
@@ -27,7 +28,6 @@ Integers = NDArray[np.int64]
 Values = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_TWO_PI = 2.0 * math.pi
 _FAR = 2**62  # ns, longer than any recording
 
 
@@ -341,8 +341,8 @@ def _unwrap(values: Values, steady: float, opens: Mask) -> Values:
     last = np.concatenate([[steady], result[finite[:-1]]])
     last[1:][segment[1:] != segment[:-1]] = steady
     with np.errstate(over="ignore", invalid="ignore"):
-        turns = np.rint((last - values[finite]) / _TWO_PI)
-    if not turns.any():
+        near = np.abs(last - values[finite]) < 0.49 * TURN
+    if near.all():  # the usual case: no turn to add
         return np.where(np.isfinite(values), result, values)
     previous = steady
     begins = opens.tolist()
@@ -352,7 +352,7 @@ def _unwrap(values: Values, steady: float, opens: Mask) -> Values:
             previous = steady
         if math.isfinite(value):
             try:
-                unwrapped[i] = previous = value + _TWO_PI * round((previous - value) / _TWO_PI)
+                unwrapped[i] = previous = nearest_branch(value, previous)
             except OverflowError:
                 raise _BackwardError from None
     return np.array(unwrapped)
