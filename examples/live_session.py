@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit, read_transients
-from uncertain_lti.monitor.session import Rule, Watch, topic_types
+from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.sampling.reading import read_as_fitted
@@ -17,7 +17,7 @@ from uncertain_lti.sampling.reading import read_as_fitted
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def session_for(model: UncertainLTI, bag: Bag, rule: Rule, now: float) -> Watch:
+def session_for(model: UncertainLTI, bag: Bag, rule: Rule, now: float) -> Session:
     """Make a session whose messages are defined in a recording; the node takes the installed definitions.
 
     Parameters
@@ -33,7 +33,7 @@ def session_for(model: UncertainLTI, bag: Bag, rule: Rule, now: float) -> Watch:
 
     Returns
     -------
-    Watch
+    Session
         Without any message yet.
     """
     definitions = {raw.topic: raw.channel.definition for raw in bag.raw_messages(model.signals.topics)}
@@ -43,7 +43,7 @@ def session_for(model: UncertainLTI, bag: Bag, rule: Rule, now: float) -> Watch:
     def make_reader(type_name, paths):
         return MessageReader(type_name, paths, bag.fields, decoders[type_name])
 
-    return Watch(model, rule, types, bag.fields, make_reader, now)
+    return Session(model, rule, types, bag.fields, make_reader, now)
 
 
 def main() -> None:

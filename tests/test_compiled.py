@@ -117,25 +117,25 @@ class Node(node_module.EnvelopeMonitorNode):
 
     def standing(self) -> dict[str, Any]:
         """Everything that counts for what comes next, and every count."""
-        watch = self.watch
-        assert watch is not None
-        last = watch.last
+        session = self.session
+        assert session is not None
+        last = session.last
         return {
-            "counters": watch.sampler.counters,
-            "received": watch.received,
+            "counters": session.sampler.counters,
+            "received": session.received,
             "received by": {topic: one.received for topic, one in self._inputs.items()},
-            "unreadable": watch.unreadable,
-            "future": watch.future,
-            "judged": (watch.verdicts, watch.violations, watch.alarms, watch.alarm, watch.failures),
-            "window": (list(watch.monitor._window._recent), watch.monitor._window._violations),
-            "latest": repr(watch.sampler.latest()),
-            "enable": (watch.arming.on, watch.arming.value),
+            "unreadable": session.unreadable,
+            "future": session.future,
+            "judged": (session.verdicts, session.violations, session.alarms, session.alarm, session.failures),
+            "window": (list(session.monitor._window._recent), session.monitor._window._violations),
+            "latest": repr(session.sampler.latest()),
+            "enable": (session.arming.on, session.arming.value),
             "last": last and (last.t_ns, last.outside_domain, last.alarm),
             "last numbers": last and [last.packed(name) for name in NUMBERS],
             "remembered": [
                 (e.arrival_ns, e.topic, e.data, e.alarm, [told(v) for v in e.verdicts]) for e in self._recent.entries()
             ],
-            "period": (watch._period.verdicts, watch._period.outside, watch._period.alarm),
+            "period": (session._period.verdicts, session._period.outside, session._period.alarm),
         }
 
 
@@ -158,7 +158,7 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def end(nodes: list[Node]) -> None:
     for node in nodes:
-        node.last_standing, node.verdicts, node.alarms = node.standing(), node.watch.verdicts, node.watch.alarms
+        node.last_standing, node.verdicts, node.alarms = node.standing(), node.session.verdicts, node.session.alarms
         node.finish()
         assert node._state_machine.current_state[1] == "finalized"
         node.destroy_node()
@@ -274,7 +274,7 @@ def played(path: Path, messages: Sequence[Any], pure: bool, silent: tuple[str, .
             if message is None:
                 node._on_tick()
             elif message == "reset":
-                node.watch.reset()
+                node.session.reset()
             elif message[1] in node._inputs:
                 node.arrive(*message)
             if k % 100 == 0:
@@ -394,8 +394,8 @@ def test_an_output_that_fails_is_reported_and_the_node_goes_on(ros: None, tmp_pa
         if k == 70:
             node._outputs["upper"].send = kept
         node.arrive(*message)
-    assert node._failures == node.watch.failures > 0
-    assert node.watch.verdicts > 45
+    assert node._failures == node.session.failures > 0
+    assert node.session.verdicts > 45
     end([node])
 
 
@@ -407,7 +407,7 @@ def at_work(folder: Path) -> tuple[Node, tuple[int, str, bytes]]:
     *messages, last = stream(model, rng, 60, 0.0)
     for message in messages:
         node.arrive(*message)
-    assert node.watch.verdicts > 40
+    assert node.session.verdicts > 40
     return node, last
 
 
@@ -461,7 +461,7 @@ def test_formats_that_come_and_go_are_learnt(ros: None, tmp_path: Path) -> None:
             x = np.frombuffer(data[-40:-16])
             data = vector(at, {f"x{i}": x[i] for i in range(3)}, "f" * (k // 100 % 20))
         node.arrive(at, topic, data)
-    assert node.watch.decoded[STATE] < 150 and node.watch.verdicts > 2900
+    assert node.session.decoded[STATE] < 150 and node.session.verdicts > 2900
     end([node])
 
 
@@ -488,7 +488,7 @@ def test_a_clock_that_fails_is_reported_and_the_sampler_starts_over(ros: None, t
             node._clock.now = lambda: 1 / 0
         node.arrive(*message)
         node._clock = Clock()
-    assert node.watch.failures == node._failures == 1 and node.watch.verdicts > 50
+    assert node.session.failures == node._failures == 1 and node.session.verdicts > 50
     end([node])
 
 

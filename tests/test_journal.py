@@ -21,7 +21,7 @@ from ros_processes import World, open_world
 from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, Plant, by_hand, joint_state, saved, vector
 
 from uncertain_lti.monitor.journal import Journal
-from uncertain_lti.monitor.session import OK, STALE, WARN, Rule, Watch, topic_types
+from uncertain_lti.monitor.session import OK, STALE, WARN, Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
 
@@ -30,7 +30,7 @@ STEP = STEP_NS * 1e-9
 
 
 class Rig:
-    """A watch fed by hand, and what its journal says; time goes on by one step with every sample."""
+    """A session fed by hand, and what its journal says; time goes on by one step with every sample."""
 
     def __init__(self, **rule: Any) -> None:
         model = self.model = by_hand(alarm_rule=AlarmRule(2, 5))
@@ -45,15 +45,15 @@ class Rig:
             return MessageReader(type_name, paths, live_fields, lambda data: deserialize_message(data, kind))
 
         types = topic_types(model, "by hand", live_fields)
-        self.watch = Watch(model, Rule(**rule), types, live_fields, reader, self.now)
+        self.session = Session(model, Rule(**rule), types, live_fields, reader, self.now)
         self.journal = Journal(lambda level, line: self.said.append((level, line)))
-        self.journal.begin(self.watch, self.now)
+        self.journal.begin(self.session, self.now)
 
     def take(self, topic: str, data: bytes) -> None:
-        before = self.watch.alarm
-        verdicts, _ = self.watch.take(topic, time.time_ns(), data, self.now)
-        if self.watch.alarm != before:
-            self.journal.turned(self.watch, verdicts, self.now)
+        before = self.session.alarm
+        verdicts, _ = self.session.take(topic, time.time_ns(), data, self.now)
+        if self.session.alarm != before:
+            self.journal.turned(self.session, verdicts, self.now)
 
     def send(self, samples: int, off: float = 0.0, control: bool = True, state: bool = True) -> None:
         point = self.model.operating_point
@@ -71,7 +71,7 @@ class Rig:
         for _ in range(max(1, round(seconds / 0.1))):
             self.now += min(seconds, 0.1)
             self.t_ns += round(min(seconds, 0.1) * 1e9)
-            self.journal.look(self.watch, self.now, TIMEOUT, self.publishers, self.problems)
+            self.journal.look(self.session, self.now, TIMEOUT, self.publishers, self.problems)
 
     @property
     def lines(self) -> list[str]:
@@ -92,7 +92,7 @@ def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end
     rig.lines.clear()
     rig.send(3, off=2.0)
     (level, line) = rig.said[-1]
-    verdict = rig.watch.last
+    verdict = rig.session.last
     assert level == WARN and verdict is not None
     found = re.findall(r"(\w) = (\S+) is (\S+) above its bounds (\S+) to ([\d.]+)", line)
     assert [name for name, *_ in found] == ["a", "b"] and line.startswith("alarm, at least 2 of 5 verdicts violated: ")
@@ -113,10 +113,10 @@ def test_masked_states_are_not_named_and_a_latched_alarm_says_what_ends_it() -> 
     rig.lines.clear()
     rig.send(30, off=-2.0)
     (line,) = rig.lines[-1:]
-    assert " below its bounds " in line and "b = " not in line and line.endswith("it stands until ~/reset")
+    assert " below its bounds " in line and "b = " not in line and line.endswith("it lasts until ~/reset")
     rig.send(50)
     assert not rig.lines
-    rig.watch.reset()
+    rig.session.reset()
     rig.wait(0.1)
     assert [line[:21] for line in rig.lines] == ["the alarm is over aft"]
 
@@ -135,38 +135,42 @@ def test_a_narrow_miss_is_told_with_the_digits_that_show_it() -> None:
 def test_a_new_rule_keeps_what_is_known_and_a_standing_alarm_where_it_latches() -> None:
     rig = Rig(enable=f"{CONTROL} vector.x > -1e9")
     rig.send(10)
-    watch = rig.watch
-    assert watch.arming.on
-    watch.follow(replace(watch.rule, enable=f"{CONTROL} vector.x < -1e9"))  # the same field: held against what it said
-    assert watch.arming.on is False
-    watch.follow(replace(watch.rule, enable=f"{CONTROL} vector.y > -1e9"))
-    assert watch.arming.on is None
+    session = rig.session
+    assert session.arming.on
+    session.follow(
+        replace(session.rule, enable=f"{CONTROL} vector.x < -1e9")
+    )  # the same field: held against what it said
+    assert session.arming.on is False
+    session.follow(replace(session.rule, enable=f"{CONTROL} vector.y > -1e9"))
+    assert session.arming.on is None
     rig.wait(0.1)
-    watch.follow(replace(watch.rule, enable=""))
+    session.follow(replace(session.rule, enable=""))
     rig.wait(0.1)
     assert rig.lines[-1] == "alarms count from now on: there is no condition any more"
     rig.send(5, off=2.0)
-    assert watch.alarm
-    watch.follow(watch.rule)  # the rule that there is
-    assert watch.alarm and not watch.latched
-    watch.follow(replace(watch.rule, latch=True))
-    assert watch.alarm and watch.latched
-    watch.follow(replace(watch.rule, masked="b", margin=9.0))
-    assert watch.alarm
-    watch.follow(replace(watch.rule, latch=False))
-    assert not watch.alarm
+    assert session.alarm
+    session.follow(session.rule)  # the rule that there is
+    assert session.alarm and not session.latched
+    session.follow(replace(session.rule, latch=True))
+    assert session.alarm and session.latched
+    session.follow(replace(session.rule, masked="b", margin=9.0))
+    assert session.alarm
+    session.follow(replace(session.rule, latch=False))
+    assert not session.alarm
 
 
 def test_a_watch_goes_on_with_the_controls_in_force_and_a_latched_alarm() -> None:
     rig = Rig(latch=True, enable=f"{CONTROL} vector.x > -1e9")
     rig.send(10)
     rig.send(5, off=2.0)
-    old = rig.watch
-    rig.watch = Watch(rig.model, old.rule, old.types, live_fields, old._make_reader, rig.now, old.arming)
-    rig.watch.go_on_from(old)
-    assert rig.watch.alarm and rig.watch.latched and rig.watch.arming.on and rig.watch.heard(CONTROL) is not None
+    old = rig.session
+    rig.session = Session(rig.model, old.rule, old.types, live_fields, old._make_reader, rig.now, old.arming)
+    rig.session.go_on_from(old)
+    assert (
+        rig.session.alarm and rig.session.latched and rig.session.arming.on and rig.session.heard(CONTROL) is not None
+    )
     rig.send(3, control=False)
-    assert rig.watch.verdicts == 2 and rig.watch.sampler.counters["missing"] == 0
+    assert rig.session.verdicts == 2 and rig.session.sampler.counters["missing"] == 0
 
 
 def test_an_enable_condition_without_a_number_is_told_from_one_that_is_silent() -> None:
@@ -174,33 +178,33 @@ def test_an_enable_condition_without_a_number_is_told_from_one_that_is_silent() 
     rig.wait(0.1)
     assert rig.lines[-1] == f"alarms are off: it is not known whether {STATE} effort[3] > 0"
     rig.send(3)
-    assert rig.watch.arming.why_off() == f"alarms are off: {STATE} comes without a number in effort[3]"
+    assert rig.session.arming.why_off() == f"alarms are off: {STATE} comes without a number in effort[3]"
 
 
 def test_an_alarm_that_stands_through_silence_is_told_in_the_reports() -> None:
     rig = Rig()
     rig.send(10)
     rig.send(5, off=2.0)
-    rig.watch.report(rig.now, TIMEOUT)
+    rig.session.report(rig.now, TIMEOUT)
     rig.wait(5.0)
-    monitor, *states = rig.watch.report(rig.now, TIMEOUT)
-    assert monitor.level == STALE and "alarm: it stood at the last verdict" in monitor.message
+    monitor, *states = rig.session.report(rig.now, TIMEOUT)
+    assert monitor.level == STALE and "alarm: it was on at the last verdict" in monitor.message
     assert f"no message on {STATE}" in monitor.message and all(one.level == STALE for one in states)
-    rig.watch.reset()
-    assert "alarm" not in rig.watch.report(rig.now, TIMEOUT)[0].message
+    rig.session.reset()
+    assert "alarm" not in rig.session.report(rig.now, TIMEOUT)[0].message
 
 
 def test_signals_without_a_value_are_named_in_the_reports() -> None:
     rig = Rig()
     rig.send(10)
-    rig.watch.report(rig.now, TIMEOUT)
+    rig.session.report(rig.now, TIMEOUT)
     rig.wait(1.0)
     rig.send(20, control=False)
-    assert "a signal is missing, stale or not finite (p, q)" in rig.watch.report(rig.now, TIMEOUT)[0].message
+    assert "a signal is missing, stale or not finite (p, q)" in rig.session.report(rig.now, TIMEOUT)[0].message
     rig.send(3)
-    rig.watch.report(rig.now, TIMEOUT)
+    rig.session.report(rig.now, TIMEOUT)
     rig.send(3)
-    assert rig.watch.report(rig.now, TIMEOUT)[0].level == OK
+    assert rig.session.report(rig.now, TIMEOUT)[0].level == OK
 
 
 def test_a_flapping_alarm_does_not_flood_the_log_and_its_state_is_told_in_the_end() -> None:
@@ -211,7 +215,7 @@ def test_a_flapping_alarm_does_not_flood_the_log_and_its_state_is_told_in_the_en
     for _ in range(300):
         rig.send(2, off=2.0)
         rig.send(8)
-    turned, minutes = 2 * rig.watch.alarms, (rig.now - began) / 60
+    turned, minutes = 2 * rig.session.alarms, (rig.now - began) / 60
     lines = rig.lines
     assert turned > 500 and len(lines) <= 6 + 6 * minutes + 1
     rig.wait(11.0)

@@ -34,7 +34,7 @@ from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.journal import Journal
 from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED, VIOLATION
-from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Watch, topic_types
+from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session, topic_types
 from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
 from uncertain_lti.recordings.message_reader import MessageReader
@@ -105,13 +105,13 @@ def _failures_noted(transition: Callable[..., TransitionCallbackReturn]) -> Call
 
 
 class EnvelopeMonitorNode(LifecycleNode):
-    """Managed node around `Watch`; the page on the live node describes its topics, services and parameters."""
+    """Managed node around `Session`; the page on the live node describes its topics, services and parameters."""
 
     def __init__(self) -> None:
         super().__init__(NAME)
         declare(self, PARAMETERS)
         self._reals: dict[str, float] = {}
-        self.watch: Watch | None = None
+        self.session: Session | None = None
         self.active = False
         self._reason = ""  # why the last configure failed
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
@@ -119,7 +119,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._told: dict[str, tuple[int, int]] = {}  # topic: lost and late messages that the last report told of
         self._outputs: dict[str, _Publisher] = {}
         self._enable_problem = ""
-        self._candidate: Watch | Rule | None = None  # accepted, not yet in place
+        self._candidate: Session | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
         self._published = self._looked = self._reported = time.monotonic()
         self._failures, self._failed_how, self._failures_told = 0, "", 0
@@ -165,7 +165,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             chosen[name] = known.get(text)
         return Wish(self.get_parameter("qos.depth").value, **chosen)
 
-    def _make_watch(self, path: str, rule: Rule) -> Watch:
+    def _make_session(self, path: str, rule: Rule) -> Session:
         if not path:
             raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")
         file = Path(path).expanduser()  # no shell does that behind :=
@@ -175,8 +175,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         types = topic_types(model, path, _type_fields)
         for names in (model.state_names, model.control_names):
             sendable(names)
-        arming = self.watch.arming if self.watch else None
-        return Watch(model, rule, types, _type_fields, self._make_reader, time.monotonic(), arming)
+        arming = self.session.arming if self.session else None
+        return Session(model, rule, types, _type_fields, self._make_reader, time.monotonic(), arming)
 
     def _make_reader(self, type_name: str, paths: Sequence[FieldPath]) -> MessageReader:
         kind = message_class(type_name)
@@ -196,10 +196,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         try:
             self._hold_folder(given.get("snapshot.on_alarm", False))
             if "model" in changes:
-                self._candidate = self._make_watch(changes["model"], self._rule(changes))
-            elif changes and self.watch is not None:
+                self._candidate = self._make_session(changes["model"], self._rule(changes))
+            elif changes and self.session is not None:
                 self._candidate = self._rule(changes)
-                self.watch.check(self._candidate)
+                self.session.check(self._candidate)
             elif "enable" in changes:
                 Condition.parse(changes["enable"])
         except UncertainLTIError as error:
@@ -218,32 +218,32 @@ class EnvelopeMonitorNode(LifecycleNode):
         if any(p.name == "largest_message" for p in parameters):
             self._largest = round(self._real("largest_message") * _MIB)
         candidate, self._candidate = self._candidate, None
-        if isinstance(candidate, Rule) and self.watch is not None:
-            if candidate == self.watch.rule:
+        if isinstance(candidate, Rule) and self.session is not None:
+            if candidate == self.session.rule:
                 return
-            self.watch.follow(candidate)
-            self._journal.turned(self.watch, (), time.monotonic(), ", as its rule has changed")
-            self.get_logger().info(self.watch.whole_rule_text())
+            self.session.follow(candidate)
+            self._journal.turned(self.session, (), time.monotonic(), ", as its rule has changed")
+            self.get_logger().info(self.session.whole_rule_text())
             if self.active:
                 self._subscribe()
-        elif isinstance(candidate, Watch) and self.watch is not None:
+        elif isinstance(candidate, Session) and self.session is not None:
             self._swap(candidate)
-        elif self.watch is None and self._starts_itself:
+        elif self.session is None and self._starts_itself:
             self.start()
 
-    def _swap(self, watch: Watch) -> None:
+    def _swap(self, session: Session) -> None:
         """Put another model in place, between two messages."""
-        if self.watch is not None and self.active:
-            watch.go_on_from(self.watch)
-        self.watch = watch
+        if self.session is not None and self.active:
+            session.go_on_from(self.session)
+        self.session = session
         self._prepare_outputs()
         if self._recent is not None:
             self._recent.clear()
         if self.active:
             self._subscribe()
         name = Path(str(self.get_parameter("model").value)).name
-        self.get_logger().info(f"model swapped: {name}: {watch.model}; {watch.whole_rule_text()}")
-        self._journal.begin(watch, time.monotonic())
+        self.get_logger().info(f"model swapped: {name}: {session.model}; {session.whole_rule_text()}")
+        self._journal.begin(session, time.monotonic())
 
     # --- lifecycle ---
 
@@ -283,10 +283,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         path = str(self.get_parameter("model").value)
         try:
             self._wish()
-            self.watch = self._make_watch(path, self._rule({}))
+            self.session = self._make_session(path, self._rule({}))
             self._open_album()
         except Exception as error:
-            self.watch = None
+            self.session = None
             self._reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
             then = "; the node starts as soon as its parameters are set right" if self._starts_itself else ""
             self.get_logger().error(f"not configured: {self._reason}{then}")
@@ -300,8 +300,8 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._outputs[output.name] = _Publisher(self, kind, output.name, beat if output is VIOLATION else qos)
         self._violation = self._outputs[VIOLATION.name]
         self._prepare_outputs()
-        self.get_logger().info(f"configured with {Path(path).name}: {self.watch.model}")
-        if self.watch.model.sampling.dt_median is None:
+        self.get_logger().info(f"configured with {Path(path).name}: {self.session.model}")
+        if self.session.model.sampling.dt_median is None:
             self.get_logger().info("the model has no median step, so nothing is predicted")
         return super().on_configure(state)
 
@@ -323,8 +323,8 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._recent = Recent(self._real("snapshot.seconds"), round(self._real("snapshot.memory") * _MIB))
 
     def _prepare_outputs(self) -> None:
-        assert self.watch is not None
-        names = self.watch.model.state_names
+        assert self.session is not None
+        names = self.session.model.state_names
         encode = VerdictMessages(names, sendable).encode
 
         def vectors(*when: str) -> list[_Vector]:
@@ -353,13 +353,13 @@ class EnvelopeMonitorNode(LifecycleNode):
         ModelError
             A parameter of the quality of service is set to a word that is none.
         """
-        assert self.watch is not None
+        assert self.session is not None
         result = super().on_activate(state)
-        self.watch.restart(time.monotonic())
+        self.session.restart(time.monotonic())
         self._simulated = self._clock.ros_time_is_active
         self._subscribe()
-        self._journal.begin(self.watch, time.monotonic())
-        resolved = {topic: self.resolve_topic_name(topic) for topic in self.watch.types}
+        self._journal.begin(self.session, time.monotonic())
+        resolved = {topic: self.resolve_topic_name(topic) for topic in self.session.types}
         topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
         self.get_logger().info(f"active: listening to {', '.join(topics)}")
         self.active = True
@@ -450,7 +450,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         for output in self._outputs.values():
             self.destroy_lifecycle_publisher(output.publisher)
         self._outputs.clear()
-        self.watch = None
+        self.session = None
 
     def finish(self) -> None:
         """Shut down in good order, at the end of the process."""
@@ -483,8 +483,8 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _subscribe(self) -> None:
         """Listen to exactly the topics wanted; what is listened to already goes on undisturbed."""
-        assert self.watch is not None
-        types = self.watch.types
+        assert self.session is not None
+        types = self.session.types
         for topic in list(self._inputs):
             if self._inputs[topic].type_name != types.get(topic):
                 self._inputs.pop(topic).destroy()
@@ -502,40 +502,40 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._inputs.clear()
 
     def _on_message(self, topic: str, data: bytes) -> None:
-        if not self.active or self.watch is None:
+        if not self.active or self.session is None:
             return
         try:
-            self._take(self.watch, topic, data)
+            self._take(self.session, topic, data)
         except Exception as error:
             self._note_failed_message(topic, error)
 
     def _note_failed_message(self, topic: str, error: Exception) -> None:
         self.note_failure(f"on a message of {topic}", error)
-        assert self.watch is not None
-        self.watch.failed()
+        assert self.session is not None
+        self.session.failed()
 
-    def _take(self, watch: Watch, topic: str, data: bytes) -> None:
+    def _take(self, session: Session, topic: str, data: bytes) -> None:
         arrival = self._arrival()
         now = time.monotonic()
-        alarms, alarm = watch.alarms, watch.alarm
-        verdicts, opened = watch.take(topic, arrival, data, now)
-        turned = watch.alarm != alarm
+        alarms, alarm = session.alarms, session.alarm
+        verdicts, opened = session.take(topic, arrival, data, now)
+        turned = session.alarm != alarm
         if turned:
-            self._journal.turned(watch, verdicts, now)
+            self._journal.turned(session, verdicts, now)
         if self._recent is not None:
-            self._recent.add(Entry(now, arrival, topic, data, verdicts, watch.alarm))
-            if watch.alarms > alarms and self._snapshot_due is None and self._is_first_alarm(now):
+            self._recent.add(Entry(now, arrival, topic, data, verdicts, session.alarm))
+            if session.alarms > alarms and self._snapshot_due is None and self._is_first_alarm(now):
                 self._snapshot_due = now + self._real("snapshot.after")
-        if turned and not watch.alarm:
+        if turned and not session.alarm:
             self._alarmed = now
         if verdicts or opened or turned:
-            self._publish(watch, verdicts, opened, now, turned)
+            self._publish(session, verdicts, opened, now, turned)
 
     def _is_first_alarm(self, now: float) -> bool:
         """There was none for as long as a snapshot goes back: one that flaps must not drive out the first file."""
         return now - self._alarmed >= self._real("snapshot.seconds")
 
-    def _publish(self, watch: Watch, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
+    def _publish(self, session: Session, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
         """Publish what is listened to; turned: the alarm did, which is said in any case.
 
         First everything is laid out, then all of it is sent in one go: threads of the middleware that are woken by
@@ -549,13 +549,13 @@ class EnvelopeMonitorNode(LifecycleNode):
                     messages.append((publisher.send, encode(verdict)))
             turned |= judged and self._violation.listeners > 0
         if opened and any(publisher.listeners for publisher, _ in self._predicted):
-            expected = watch.predict()
+            expected = session.predict()
             for publisher, encode in self._predicted:
                 if publisher.listeners and expected is not None:
                     messages.append((publisher.send, encode(expected)))
         if turned:
             self._published = now
-            messages.append((self._violation.send, TRUE if watch.alarm else FALSE))
+            messages.append((self._violation.send, TRUE if session.alarm else FALSE))
         for send, message in messages:
             send(message)
 
@@ -565,9 +565,9 @@ class EnvelopeMonitorNode(LifecycleNode):
         return nanoseconds
 
     def _beat(self) -> None:
-        assert self.watch is not None
+        assert self.session is not None
         self._published = time.monotonic()
-        self._violation.send(TRUE if self.watch.alarm else FALSE)
+        self._violation.send(TRUE if self.session.alarm else FALSE)
 
     # --- heartbeat, graph, diagnostics ---
 
@@ -600,13 +600,13 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._find_enable_type()
 
     def _find_enable_type(self) -> None:
-        watch = self.watch
-        if watch is None or not self.active or not watch.enable_topic or watch.enable_type:
+        session = self.session
+        if session is None or not self.active or not session.enable_topic or session.enable_type:
             return
-        infos = self.get_publishers_info_by_topic(watch.enable_topic)
+        infos = self.get_publishers_info_by_topic(session.enable_topic)
         if infos:
             try:
-                watch.found_enable_type(infos[0].topic_type)
+                session.found_enable_type(infos[0].topic_type)
             except UncertainLTIError as error:
                 self._enable_problem = f"parameter enable: {error}"
                 return
@@ -617,22 +617,22 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = time.monotonic()
         if now - self._reported < self._real("diagnostics_period"):
             return
-        if self.watch is not None and self.active and not self._diagnostics.get_subscription_count():
+        if self.session is not None and self.active and not self._diagnostics.get_subscription_count():
             self._reported = now
-            self.watch.pass_over(now)
+            self.session.pass_over(now)
             self._note_told()
         else:
             self._report()
 
     def _keep_journal(self) -> None:
         now = time.monotonic()
-        if self.watch is None or not self.active or now - self._noted < _NOTE:
+        if self.session is None or not self.active or now - self._noted < _NOTE:
             return
         self._noted = now
         problems = [problem for subscription in self._inputs.values() for problem in subscription.problems]
         problems += self._lasting_problems()
         publishers = {topic: subscription.publishers for topic, subscription in self._inputs.items()}
-        self._journal.look(self.watch, now, self._real("state_timeout"), publishers, problems)
+        self._journal.look(self.session, now, self._real("state_timeout"), publishers, problems)
 
     def _log(self, level: int, line: str) -> None:
         if level == WARN:
@@ -656,13 +656,13 @@ class EnvelopeMonitorNode(LifecycleNode):
                 self.get_logger().error(str(error))
 
     def _scene(self, why: str) -> Scene:
-        assert self.watch is not None and self._recent is not None
-        watch = self.watch
-        rule = watch.monitor.rule
+        assert self.session is not None and self._recent is not None
+        session = self.session
+        rule = session.monitor.rule
         return Scene(
             self._recent.entries(),
-            watch.model.state_names,
-            watch.types,
+            session.model.state_names,
+            session.types,
             {output.name: self.resolve_topic_name(f"~/{output.name}") for output in RECORDED},
             {
                 "node": self.get_fully_qualified_name(),
@@ -699,8 +699,8 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _report(self) -> None:
         now = self._reported = time.monotonic()
-        if self.watch is not None and self.active:
-            reports = self.watch.report(now, self._real("state_timeout"), self._problems())
+        if self.session is not None and self.active:
+            reports = self.session.report(now, self._real("state_timeout"), self._problems())
             extra: dict[str, str] = {}
             for topic, subscription in self._inputs.items():
                 extra |= {
@@ -718,8 +718,8 @@ class EnvelopeMonitorNode(LifecycleNode):
             message = f"{state}: {self._reason}" if self._reason else f"{state}: no verdicts are given"
             level = ERROR if self._reason else STALE
             reports = [Report(level, "monitor", message, {"unexpected errors": str(self._failures)})]
-            if self.watch is not None:
-                reports += [Report(STALE, name, message, {}) for name in self.watch.model.state_names]
+            if self.session is not None:
+                reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
         self._note_told()
         full_name = self.get_fully_qualified_name().lstrip("/")
         hardware = str(self.get_parameter("hardware_id").value) or self.get_name()
@@ -760,25 +760,25 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_reset(self, response: Trigger.Response) -> None:
         """End a latched alarm, and let the alarm look at verdicts from now on only."""
-        if self.watch is None or not self.active:
+        if self.session is None or not self.active:
             raise ModelError("the node is not active, so there is no alarm to reset")
-        response.message = "the alarm is reset" if self.watch.alarm else "there was no alarm; its window starts anew"
-        self.watch.reset()
-        self._journal.turned(self.watch, (), time.monotonic(), ", by ~/reset")
+        response.message = "the alarm is reset" if self.session.alarm else "there was no alarm; its window is empty now"
+        self.session.reset()
+        self._journal.turned(self.session, (), time.monotonic(), ", by ~/reset")
         self._beat()
         response.success = True
 
     def _on_reload(self, response: Trigger.Response) -> None:
         """Read the model file once more."""
-        if self.watch is None:
+        if self.session is None:
             raise ModelError("the node is not configured; configure it, which reads the model file")
         path = str(self.get_parameter("model").value)
-        self._swap(self._make_watch(path, self._rule({})))
-        response.success, response.message = True, f"{Path(path).name}: {self.watch.model}"
+        self._swap(self._make_session(path, self._rule({})))
+        response.success, response.message = True, f"{Path(path).name}: {self.session.model}"
 
     def _on_snapshot(self, response: Trigger.Response) -> None:
         """Write the last seconds to a file."""
-        if self._album is None or self.watch is None:
+        if self._album is None or self.session is None:
             if self.get_parameter("snapshot.folder").value:
                 raise ModelError("the node is not configured, so there is nothing to write")
             raise ModelError("parameter snapshot.folder is empty; start the node with a folder for snapshots")
@@ -787,7 +787,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_status(self, response: Trigger.Response) -> None:
         """Counters as JSON; success says whether verdicts are given."""
-        watch = self.watch
+        session = self.session
         response.success = self.active
         response.message = json.dumps(
             {
@@ -798,15 +798,15 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "use_sim_time": self.get_parameter("use_sim_time").value,
                 "received": {s.topic: s.received for s in self._inputs.values()},
                 "lost": {s.topic: s.lost for s in self._inputs.values()},
-                "verdicts": watch.verdicts if watch else 0,
-                "violations": dict(zip(watch.model.state_names, watch.violations, strict=True)) if watch else {},
-                "alarm": watch.alarm if watch else False,
-                "latched": watch.latched if watch else False,
-                "armed": watch.arming.on if watch else None,
-                "counters": dict(watch.sampler.counters) if watch else {},
-                "unreadable": dict(watch.unreadable) if watch else {},
-                "future": dict(watch.future) if watch else {},
-                "decoded": watch.decoded if watch else {},
+                "verdicts": session.verdicts if session else 0,
+                "violations": dict(zip(session.model.state_names, session.violations, strict=True)) if session else {},
+                "alarm": session.alarm if session else False,
+                "latched": session.latched if session else False,
+                "armed": session.arming.on if session else None,
+                "counters": dict(session.sampler.counters) if session else {},
+                "unreadable": dict(session.unreadable) if session else {},
+                "future": dict(session.future) if session else {},
+                "decoded": session.decoded if session else {},
                 "unexpected_errors": self._failures,
                 "snapshot": self._album.last if self._album else "",
                 "problems": self._problems(),

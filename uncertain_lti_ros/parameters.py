@@ -42,7 +42,7 @@ PARAMETERS = (
         f"after `enable` began to hold. {_ANEW}",
         low=0.0, high=86400.0,
     ),
-    Declared("latch", False, "An alarm stands until ~/reset is called, also one that stands when this is set."),
+    Declared("latch", False, "An alarm lasts until ~/reset is called, also one that is on when this is set."),
     Declared(
         "heartbeat", 1.0,
         "~/violation is published at least this often, s of wall time; also the deadline it offers.",

@@ -9,7 +9,7 @@ from typing import Any
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.monitor.envelope_monitor import Verdict
-from uncertain_lti.monitor.session import OK, WARN, WHY, Watch
+from uncertain_lti.monitor.session import OK, WARN, WHY, Session
 from uncertain_lti.sampling.status import Status
 
 _BURST, _REFILL = 6, 10.0  # lines on one matter at once, and s until there is one more
@@ -58,18 +58,18 @@ class Journal:
         self._ceased, self._judged = 0.0, False
         self._cause = ("", 0.0)  # of no verdicts, and since when it is this one
 
-    def begin(self, watch: Watch, now: float) -> None:
+    def begin(self, session: Session, now: float) -> None:
         """A session starts, with no sample.
 
         Parameters
         ----------
-        watch : Watch
+        session : Session
             The session.
         now : float
             Steady time, s.
         """
-        self._alarm, self._unsaid = watch.alarm, 0
-        self._counters, self._unreadable = Counter(watch.sampler.counters), Counter(watch.unreadable)
+        self._alarm, self._unsaid = session.alarm, 0
+        self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
         self._ceased, self._judged = now, False
         self._cause = ("", now)
         self._matters.clear()
@@ -79,12 +79,12 @@ class Journal:
             self._matters[name] = _Matter(True if name == "arming" else None)
         return self._matters[name]
 
-    def turned(self, watch: Watch, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
+    def turned(self, session: Session, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
         """Log the alarm if it has turned.
 
         Parameters
         ----------
-        watch : Watch
+        session : Session
             The session.
         verdicts : iterable of Verdict
             Those that may have turned it.
@@ -93,14 +93,14 @@ class Journal:
         why : str, default ""
             What else turned it, with the blank in front.
         """
-        if watch.alarm == self._alarm:
+        if session.alarm == self._alarm:
             return
-        self._alarm = watch.alarm
-        if watch.alarm:
-            cause = next((v for v in verdicts if v.alarm and v.violated), watch.last)
-            left = f": {_left(watch, cause)}" if cause is not None and cause.violated else ""
-            level, line = WARN, f"alarm, {watch.rule_text()}{left}"
-            line += "; it stands until ~/reset" if watch.rule.latch else ""
+        self._alarm = session.alarm
+        if session.alarm:
+            cause = next((v for v in verdicts if v.alarm and v.violated), session.last)
+            left = f": {_left(session, cause)}" if cause is not None and cause.violated else ""
+            level, line = WARN, f"alarm, {session.rule_text()}{left}"
+            line += "; it lasts until ~/reset" if session.rule.latch else ""
             self._alarm_since = now
         else:
             level, line = OK, f"the alarm is over after {now - self._alarm_since:.3g} s{why}"
@@ -114,13 +114,13 @@ class Journal:
         return f" (it has turned {plural(unsaid, 'time')} more since the last line)" if unsaid else ""
 
     def look(
-        self, watch: Watch, now: float, timeout: float, publishers: Mapping[str, int], problems: Sequence[str]
+        self, session: Session, now: float, timeout: float, publishers: Mapping[str, int], problems: Sequence[str]
     ) -> None:
         """Log what has changed since the last look.
 
         Parameters
         ----------
-        watch : Watch
+        session : Session
             The session.
         now : float
             Steady time, s.
@@ -131,7 +131,7 @@ class Journal:
         problems : sequence of str
             What keeps messages from coming, in words that stay the same while it lasts.
         """
-        self.turned(watch, (), now)
+        self.turned(session, (), now)
         if self._unsaid and self._matter("alarm").may(now):
             self._say(
                 WARN if self._alarm else OK, f"the alarm is {'on' if self._alarm else 'off'}{self._passed_over()}"
@@ -141,57 +141,57 @@ class Journal:
         if matter.becomes(tuple(problems) or None, now):
             for problem in new[:_SHOWN]:
                 self._say(OK, problem)
-        if self._matter("arming").becomes(watch.arming.on, now):
-            condition = watch.arming.condition or "there is no condition any more"
-            self._say(OK, watch.arming.why_off() or f"alarms count from now on: {condition}")
-        for topic in watch.types:
-            if topic != watch.sampler.clock:
-                self._look_at_topic(watch, topic, now, timeout, publishers.get(topic, 0))
-        self._look_at_verdicts(watch, now, timeout)
+        if self._matter("arming").becomes(session.arming.on, now):
+            condition = session.arming.condition or "there is no condition any more"
+            self._say(OK, session.arming.why_off() or f"alarms count from now on: {condition}")
+        for topic in session.types:
+            if topic != session.sampler.clock:
+                self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0))
+        self._look_at_verdicts(session, now, timeout)
 
-    def _look_at_topic(self, watch: Watch, topic: str, now: float, timeout: float, publishers: int) -> None:
-        heard = watch.heard(topic)
+    def _look_at_topic(self, session: Session, topic: str, now: float, timeout: float, publishers: int) -> None:
+        heard = session.heard(topic)
         if heard is None:
             return  # the line on verdicts says so
-        held = watch.held(topic)
+        held = session.held(topic)
         age = now - heard
         silent = age > max(timeout, held) or (age > timeout and math.isinf(held) and not publishers)
         if self._matter(f"silence {topic}").becomes(silent or None, now):
             held_on = " and no publisher any more; its last values are held" if math.isinf(held) else ""
             self._say(OK, f"no message on {topic} for {age:.1f} s{held_on}" if silent else f"messages on {topic} again")
 
-    def _look_at_verdicts(self, watch: Watch, now: float, timeout: float) -> None:
-        without = watch.without_verdict(now)
+    def _look_at_verdicts(self, session: Session, now: float, timeout: float) -> None:
+        without = session.without_verdict(now)
         matter = self._matter("verdicts")
-        if watch.verdicts and without <= timeout:
+        if session.verdicts and without <= timeout:
             if matter.becomes("", now):
                 again = f"judging again, after {now - without - self._ceased:.1f} s without a verdict"
-                self._say(OK, again if self._judged else self._judging(watch))
+                self._say(OK, again if self._judged else self._judging(session))
                 self._judged = True
-            self._counters, self._unreadable = Counter(watch.sampler.counters), Counter(watch.unreadable)
+            self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
             self._ceased = now - without
         elif without > timeout:
-            why = self._why(watch, now, timeout) or matter.said or "no two samples have come one after the other"
+            why = self._why(session, now, timeout) or matter.said or "no two samples have come one after the other"
             if why != self._cause[0]:
                 self._cause = (why, now)
             # another cause than was told may be that of the moment in which messages come again
             lasting = not matter.said or now - self._cause[1] >= timeout
             if lasting and matter.becomes(why, now):
-                self._say(OK, f"no verdict {f'for {without:.1f} s' if watch.verdicts else 'yet'}: {why}")
+                self._say(OK, f"no verdict {f'for {without:.1f} s' if session.verdicts else 'yet'}: {why}")
 
-    def _judging(self, watch: Watch) -> str:
-        text = f"judging {', '.join(watch.model.state_names)}; alarm when {watch.rule_text()}"
-        return f"{text}; masked: {', '.join(watch.monitor.masked)}" if watch.monitor.masked else text
+    def _judging(self, session: Session) -> str:
+        text = f"judging {', '.join(session.model.state_names)}; alarm when {session.rule_text()}"
+        return f"{text}; masked: {', '.join(session.monitor.masked)}" if session.monitor.masked else text
 
-    def _why(self, watch: Watch, now: float, timeout: float) -> str:
+    def _why(self, session: Session, now: float, timeout: float) -> str:
         """What keeps verdicts from being given, without numbers that change from one look to the next; or nothing."""
-        never = [topic for topic in watch.types if watch.heard(topic) is None]
+        never = [topic for topic in session.types if session.heard(topic) is None]
         found = [f"nothing received on {', '.join(never)}"] if never else []
-        clock = watch.sampler.clock
-        if clock not in never and watch.silent_for(now) > timeout / 2:
+        clock = session.sampler.clock
+        if clock not in never and session.silent_for(now) > timeout / 2:
             return "; ".join([f"no message on {clock}", *found])
-        since = watch.sampler.counters - self._counters
-        if signals := watch.lacking(self._counters):
+        since = session.sampler.counters - self._counters
+        if signals := session.lacking(self._counters):
             found.append(f"{', '.join(signals)} missing, stale or not finite")
         for status, name in ((Status.GAP, "gaps"), (Status.RESET, "resets"), (Status.STEP, Status.STEP.value)):
             if since[name]:
@@ -199,8 +199,8 @@ class Journal:
         dropped = [status.value for status in Status if status.dropped and since[status.value]]
         if dropped:
             found.append(f"messages on {clock} are dropped ({', '.join(dropped)})")
-        unreadable = watch.unreadable - self._unreadable
-        found += [f"{topic}: a message {watch.why_unreadable[topic]}" for topic in sorted(unreadable)]
+        unreadable = session.unreadable - self._unreadable
+        found += [f"{topic}: a message {session.why_unreadable[topic]}" for topic in sorted(unreadable)]
         return "; ".join(found)
 
 
@@ -210,14 +210,14 @@ def _digits(value: float, by: float) -> int:
     return min(max(7, math.ceil(math.log10(ratio)) + 2), 17) if 1.0 < ratio < math.inf else 7
 
 
-def _left(watch: Watch, verdict: Verdict) -> str:
+def _left(session: Session, verdict: Verdict) -> str:
     """The states that left their bounds, and by how much."""
     numbers = zip(
-        watch.model.state_names, *(verdict.numbers(n) for n in ("flags", "state", "lower", "upper")), strict=True
+        session.model.state_names, *(verdict.numbers(n) for n in ("flags", "state", "lower", "upper")), strict=True
     )
     left = []
     for name, flag, value, lower, upper in numbers:
-        if flag == 1.0 and name not in watch.monitor.masked:
+        if flag == 1.0 and name not in session.monitor.masked:
             side, by = ("above", value - upper) if value > upper else ("below", lower - value)
             digits = _digits(value, by)
             left.append(

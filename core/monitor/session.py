@@ -1,4 +1,4 @@
-"""Watch: one model at work, messages in, verdicts and health out; everything of the live node that needs no rclpy."""
+"""Session: one model on live messages; takes messages, returns verdicts and health, and needs no rclpy."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def _held(model: UncertainLTI, signals: Sequence[int]) -> float:
     return max(math.inf if hold is None else hold for hold in holds)
 
 
-class Watch:
+class Session:
     """Samples and judges the messages of one model, and keeps count.
 
     Parameters
@@ -192,12 +192,12 @@ class Watch:
     now : float
         A steady time in s, as everywhere below.
     arming : Arming, optional
-        Of the watch before: where the condition asks for the same field, what is known of that stays.
+        Of the session before: where the condition asks for the same field, what is known of that stays.
 
     Attributes
     ----------
     latched : bool
-        An alarm has been raised that stands until `reset`.
+        An alarm has been raised that lasts until `reset`.
     enable_topic : str
         Topic of the enable condition; empty without one.
 
@@ -233,14 +233,14 @@ class Watch:
         self.restart(now)
 
     def restart(self, now: float) -> None:
-        """Forget every message, verdict and count; what the enable condition last said stands.
+        """Forget every message, verdict and count; keep the last value of the enable condition.
 
         Parameters
         ----------
         now : float
             Steady time, s.
         """
-        self._anew()
+        self._start()
         self.unreadable: Counter[str] = Counter()
         self.why_unreadable: dict[str, str] = {}
         self.future: Counter[str] = Counter()
@@ -252,7 +252,7 @@ class Watch:
         self._began, self._judged = now, -math.inf
         self._period = _Period(now)
 
-    def _anew(self) -> None:
+    def _start(self) -> None:
         self.sampler = Sampler(self.model.signals)
         self.reset()
         self.arming.restart()
@@ -276,9 +276,9 @@ class Watch:
             The condition's field is not in its type.
         """
         if rule != self.rule:
-            stands = self.alarm
+            raised = self.alarm
             self._follow(rule)
-            self.latched = rule.latch and stands
+            self.latched = rule.latch and raised
 
     def _follow(self, rule: Rule) -> None:
         monitor, condition, enable_type, reader = self._prepared(rule)
@@ -287,14 +287,14 @@ class Watch:
         self.arming = Arming(condition, to_ns(rule.grace), self.arming.said_on(condition))
         self.enable_topic = condition.topic if condition else ""
 
-    def go_on_from(self, other: Watch) -> None:
-        """Keep what the watch before knows: what is in force on topics that both read alike, and a latched alarm.
+    def go_on_from(self, other: Session) -> None:
+        """Keep what the session before knows: what is in force on topics that both read alike, and a latched alarm.
 
         States start anew; controls would not come again where they are sent on a change only.
 
         Parameters
         ----------
-        other : Watch
+        other : Session
             The session before.
         """
         mine, theirs = self.model.signals, other.model.signals
@@ -396,7 +396,7 @@ class Watch:
     def failed(self) -> None:
         """Something unexpected happened between messages: what was half done must not be joined to what follows."""
         latched, counters = self.latched, self.sampler.counters
-        self._anew()
+        self._start()
         self.latched, self.sampler.counters = latched, counters
         self.failures += 1
 
@@ -648,7 +648,7 @@ class Watch:
         if without > timeout or not self.verdicts:
             level = ERROR if self.latched else STALE
             if self.monitor.alarm:
-                complaints.insert(0, "alarm: it stood at the last verdict")
+                complaints.insert(0, "alarm: it was on at the last verdict")
             silent = self.silent_for(now)
             if silent > timeout and self.sampler.clock in self._heard:
                 complaints.insert(0, f"no message on {self.sampler.clock} for {silent:.1f} s")
