@@ -550,6 +550,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[5, 50], choices=list(CONTROLS))
     parser.add_argument("--left", type=float, default=0.0, metavar="SHARE", help="of samples out of bounds")
     parser.add_argument("--soak", type=float, metavar="S", help="instead, run the monitor for S seconds at 1 kHz")
+    parser.add_argument("--soak-rate", type=float, default=1000.0, metavar="HZ")
     parser.add_argument("--before", metavar="FOLDER", help="instead, beside the monitor of another checkout")
     parser.add_argument("--part", nargs="+", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -564,7 +565,7 @@ def main() -> None:
         else:
             {"take": take, "delay": bare_delay}[kind](rest[0])
     elif args.soak:
-        found = soak(args.soak, 1000.0, args.sizes[0])
+        found = soak(args.soak, args.soak_rate, args.sizes[0])
         if not (found["exact"] and found["growth"] < 1.0):
             raise SystemExit(1)
     elif args.before:

@@ -384,7 +384,8 @@ def test_paths_that_a_user_gives_are_those_of_the_user(world: World, tmp_path: P
     assert (tmp_path / "snapshots").is_dir() and world.status()["model"] == "~/hand.model.json"
     for wrong in ("hand.model.json", "x" * 5000):
         accepted, reason = world.set(model=wrong)
-        assert not accepted and reason == f"{wrong}: there is no such model file in {Path.cwd()}; give the whole path"
+        assert not accepted and reason.startswith(wrong[:100]) and len(reason) < 6000
+        assert reason.endswith(f"there is no such model file in {Path.cwd()}; give the whole path")
     assert process.running and world.state() == "active"
 
 

@@ -57,6 +57,7 @@ _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring 
 _NOTE = 0.05  # s between two looks for what the log should say
 _OUTPUT_DEPTH = 1000
 _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
+_LAST_WORDS = 1.0  # s that the end waits for readers of /diagnostics to have the last report
 _LOGGED = 5.0  # s between two log entries on unexpected errors
 _MIB = 1 << 20
 
@@ -458,6 +459,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.trigger_shutdown()
         self._reason = ""
         self._report()
+        self._diagnostics.wait_for_all_acked(Duration(seconds=_LAST_WORDS))
 
     # --- what nobody thought of ---
 

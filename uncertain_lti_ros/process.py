@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.exceptions import InvalidHandle, InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -91,6 +91,8 @@ class Life:
                 # As `spin_once`, for as many callbacks as there are: the way back here costs 8 µs for each. And
                 # seldom: in some releases each of these calls costs 32 bytes that never come back.
                 self.executor.spin_until_future_complete(self._end, timeout_sec=_SPELL)
+            except InvalidHandle:
+                pass  # an event came for a subscription that is being replaced; nobody wants it
             except Exception as error:
                 if self.alive:
                     note("in the executor", error)

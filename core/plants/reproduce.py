@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ class Case:
     largest : array (n,)
         The same, eq. (5).
     outside_domain : int
-        Transitions of the check outside the fitted domain.
+        Transitions of the check outside the fitted ranges.
     seconds : float
         Wall-clock time of the fit.
     """
@@ -112,7 +112,8 @@ class Case:
         seconds = time.perf_counter() - began
         monitor = EnvelopeMonitor(model)
         verdicts = monitor.check(check)
-        judged = verdicts.judged
+        judged, steps, point = verdicts.judged, check.transitions(), model.operating_point
+        ranges = replace(model.domain, measure=None)  # pulses, one control at a time, fit few combinations
         width = ((verdicts.upper - verdicts.lower) / model.operating_point.X)[judged]
         squared, largest = model.discrepancy(check)
         return cls(
@@ -126,7 +127,7 @@ class Case:
             width.max(axis=0),
             squared,
             largest,
-            int(verdicts.outside_domain[judged].sum()),
+            int(ranges.outside(point.normalise_x(steps.x), point.normalise_u(steps.u)).sum()),
             seconds,
         )
 
