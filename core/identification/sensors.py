@@ -12,6 +12,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.identification.excitation import quoted, successive, unexplained
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.sampling.codes import codes
+from uncertain_lti.sampling.counters import TOO_OLD
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal
 
@@ -314,7 +315,7 @@ def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Seque
     samples = sum(len(t) for t in transients)
     old: dict[tuple[int, float | None], list[str]] = {}
     for signal in signals[n:]:
-        count = sum(t.counters[f"stale {signal.name}"] for t in transients)
+        count = sum(t.counters.of(TOO_OLD).get(signal.name, 0) for t in transients)
         if samples and count > STALE * samples:
             old.setdefault((count, signal.max_hold), []).append(signal.name)
     for (count, hold), names in old.items():

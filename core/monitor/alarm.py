@@ -3,11 +3,39 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.model.alarm_rule import AlarmRule
+
+
+class AlarmStatistic(Protocol):
+    """What raises the alarm from one verdict after another; `AlarmWindow` is one."""
+
+    @property
+    def alarm(self) -> bool:
+        """The alarm after the last verdict."""
+        ...
+
+    def reset(self) -> None:
+        """Forget every verdict and the alarm."""
+
+    def push(self, violated: bool) -> bool:
+        """Take one verdict.
+
+        Parameters
+        ----------
+        violated : bool
+            Whether it is a violation that counts.
+
+        Returns
+        -------
+        bool
+            The alarm after it.
+        """
+        ...
 
 
 class AlarmWindow:

@@ -29,7 +29,7 @@ from uncertain_lti.model.bounds import (
     utilisation_of,
 )
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import AlarmWindow, raised
+from uncertain_lti.monitor.alarm import AlarmStatistic, AlarmWindow, raised
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
@@ -308,7 +308,7 @@ class EnvelopeMonitor:
             self._counted,
             None if domain.measure is None else domain.measure.occupied,
         )
-        self._window = AlarmWindow(self.rule)
+        self._window: AlarmStatistic = AlarmWindow(self.rule)
         self._shortest, self._longest = model.sampling.step_range
 
     def __repr__(self) -> str:

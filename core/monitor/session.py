@@ -14,6 +14,7 @@ from uncertain_lti.monitor.arming import Arming, Condition
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
+from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
 from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.sampler import Sampler, all_finite
 from uncertain_lti.sampling.status import Status
@@ -508,7 +509,7 @@ class Session:
     @property
     def late(self) -> int:
         """Messages that came after the sample they belonged to was closed."""
-        return sum(count for name, count in self.sampler.counters.items() if name.startswith("late /"))
+        return sum(self.sampler.counters.of(LATE).values())
 
     def heard(self, topic: str) -> float | None:
         """When the last message of a topic came.
@@ -679,9 +680,9 @@ class Session:
         list of str
             Names.
         """
-        since = self.sampler.counters - before
-        names = [signal.name for signal in self.model.signals.signals]
-        return [name for name in names if since[f"missing {name}"] or since[f"stale {name}"]]
+        since = Counters(self.sampler.counters - before)
+        lacking = since.of(MISSING) | since.of(TOO_OLD)
+        return [signal.name for signal in self.model.signals if signal.name in lacking]
 
     def rule_text(self) -> str:
         """The alarm rule in words.

@@ -15,6 +15,7 @@ from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
+from uncertain_lti.sampling.counters import LATE, TOO_OLD
 from uncertain_lti.sampling.reading_processes import processes_for, read_streams
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.sampler import Sampler
@@ -472,4 +473,6 @@ def unused(transient: Transient) -> list[str]:
     parts = [f"{count} {kind}" for kind, count in counts.items()]
     counters = transient.counters
     parts += [f"{counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and counters[s.value]]
-    return parts + [f"{count} {key}" for key, count in sorted(counters.items()) if key.startswith(("late ", "stale "))]
+    return parts + [
+        f"{count} {kind} {name}" for kind in (LATE, TOO_OLD) for name, count in sorted(counters.of(kind).items())
+    ]

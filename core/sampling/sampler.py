@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +19,7 @@ from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling.angles import nearest_branch
+from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
 from uncertain_lti.sampling.instants import LONGEST_NS, to_ns
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
@@ -336,7 +337,7 @@ class Sampler:
         self._clock_is_x = self._clock.where == list(range(n))
         self._unknown, self._no_state = [math.nan] * len(signals), [math.nan] * n
         self._delays = [(n + j, c.delay) for j, c in enumerate(signals.controls) if c.delay]
-        self.counters = Counter()
+        self.counters = Counters()
         self._open = self._before = None
         self._open_status, self._open_dt = Status.FIRST, math.nan
         self._history = {}
@@ -377,7 +378,7 @@ class Sampler:
         if state.steps_back(message, self.max_gap_ns):
             state.start_anew(self._open, message)
         elif state.came_late(message):
-            self.counters[f"late {topic}"] += 1
+            self.counters.add(LATE, topic)
         if state.unwrap:
             state.unwrapped(message.values)
         state.keep(message, self._open)
@@ -475,7 +476,7 @@ class Sampler:
                 if age <= longest:
                     z[i] = value
                 elif final:
-                    self.counters[f"stale {self.signals[i].name}"] += 1
+                    self.counters.add(TOO_OLD, self.signals[i].name)
         for i, delay in self._delays:
             line = self._history.setdefault(i, deque(maxlen=delay + 1))
             line = line if final else line.copy()
@@ -484,7 +485,7 @@ class Sampler:
         if final and not all_finite(z):
             for signal, value in zip(self.signals, z, strict=True):
                 if not math.isfinite(value):
-                    self.counters[f"missing {signal.name}"] += 1
+                    self.counters.add(MISSING, signal.name)
         return z
 
     @cython.cfunc

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.sampling.angles import TURN, nearest_branch
+from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
 from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES
 from uncertain_lti.sampling.status import Status
@@ -50,7 +50,7 @@ class Samples:
     t_ns: Integers
     x: Values
     u: Values
-    counters: Counter[str]
+    counters: Counters
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class _Sampling:
         self.max_gap, self.min_step = to_ns(signals.max_gap), to_ns(signals.min_step)
         skew = self.max_gap if signals.max_skew is None else to_ns(signals.max_skew)
         self.max_age = [skew] * self.n + [_FAR if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls]
-        self.counters: Counter[str] = Counter()
+        self.counters: Counters = Counters()
         self.topics: dict[str, _Messages] = {}
         for position, name in enumerate(signals.topics):
             order = np.flatnonzero(topic == position)
@@ -206,12 +206,16 @@ class _Sampling:
             self._fix(name, others, samples, z)
         self._delay(z, opens)
         for signal, column in zip(signals.signals, z.T, strict=True):
-            self._count(f"missing {signal.name}", ~np.isfinite(column))
+            self._count_of(MISSING, signal.name, ~np.isfinite(column))
         return self._samples(samples.stamp if by_header else samples.arrival, z, own, opens, back)
 
     def _count(self, what: str, which: Mask) -> None:
         if number := int(np.count_nonzero(which)):
             self.counters[what] += number
+
+    def _count_of(self, kind: str, name: str, which: Mask) -> None:
+        if number := int(np.count_nonzero(which)):
+            self.counters.add(kind, name, number)
 
     def _accepted(self, instants: Integers) -> tuple[Integers, Mask, Mask]:
         """Clock messages that make samples; which of these open a segment, and which step back to do so."""
@@ -263,7 +267,7 @@ class _Sampling:
         opened = np.searchsorted(others.order, samples.order[:-1])
         if (opened - chosen >= BUFFERED_MESSAGES // 2)[chosen >= 0].any():
             raise _BackwardError  # the Sampler may have forgotten it before the sample opened
-        self._count(f"late {name}", self._late(others, samples, time, at[:-1], chosen))
+        self._count_of(LATE, name, self._late(others, samples, time, at[:-1], chosen))
 
         values = self._unwrapped(name, others.values, np.zeros(len(others.order), dtype=bool))
         there = chosen >= 0
@@ -271,7 +275,7 @@ class _Sampling:
         age = at[:-1][there] - time[which]
         for column, position in enumerate(self.signals.on(name)):
             fresh = age <= self.max_age[position]
-            self._count(f"stale {self.signals[position].name}", ~fresh)
+            self._count_of(TOO_OLD, self.signals[position].name, ~fresh)
             z[there, position] = np.where(fresh, values[which, column], math.nan)
 
     def _late(self, others: _Messages, samples: _Messages, time: Integers, at: Integers, chosen: Integers) -> Mask:

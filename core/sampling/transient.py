@@ -18,6 +18,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LONGEST_S
+from uncertain_lti.sampling.counters import Counters
 from uncertain_lti.sampling.instants import median_step_ns, to_ns
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import SignalMap
@@ -108,7 +109,7 @@ class Transient:
     x: Array
     u: Array
     segment: NDArray[np.int32]
-    counters: Counter[str]
+    counters: Counters
 
     def __init__(
         self,
@@ -135,7 +136,7 @@ class Transient:
             raise TransientError(f"{name}: x has no column; give at least one state")
         self.state_names = _names(state_names, signals.states if signals else None, "x", self.x, name)
         self.control_names = _names(control_names, signals.controls if signals else None, "u", self.u, name)
-        self.counters = Counter(counters or {})
+        self.counters = Counters(counters or {})
         self.sources = tuple(os.fspath(s) for s in sources)
         self.notes = tuple(notes)
         if max_gap is not None and not (0 < max_gap <= LONGEST_S or max_gap == math.inf):

@@ -1,0 +1,45 @@
+"""Counters of a sampler: what became of messages and samples, by kind and by the topic or signal concerned."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+LATE, TOO_OLD, MISSING = "late", "stale", "missing"
+"""Kinds that are counted per topic (late) or per signal."""
+
+
+class Counters(Counter[str]):
+    """Counts by flat name, as diagnostics and `--json` show them: `samples`, `gaps`, `late /topic`, `stale signal`.
+
+    `of` gives the counts of one kind by topic or signal, so that nobody takes the names apart.
+    """
+
+    def add(self, kind: str, name: str, count: int = 1) -> None:
+        """Count something of a topic or signal.
+
+        Parameters
+        ----------
+        kind : {"late", "stale", "missing"}
+            What happened.
+        name : str
+            Topic or signal.
+        count : int, default 1
+            How often.
+        """
+        self[f"{kind} {name}"] += count
+
+    def of(self, kind: str) -> dict[str, int]:
+        """Counts of one kind.
+
+        Parameters
+        ----------
+        kind : {"late", "stale", "missing"}
+            What happened.
+
+        Returns
+        -------
+        dict
+            By topic or signal, those that were counted.
+        """
+        start = f"{kind} "
+        return {key[len(start) :]: count for key, count in self.items() if key.startswith(start) and count}
