@@ -10,7 +10,7 @@ from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import formulation, passes, solvers, working_set
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import assemble
+from uncertain_lti.identification.problem import Columns, Problem, assemble
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import SUBSAMPLE
 from uncertain_lti.plants.leibov import leibov2006
@@ -419,11 +419,11 @@ def test_moments_are_plain_sums():
 
 @pytest.mark.parametrize("weights", ["ones", "per sample"])
 @pytest.mark.parametrize("limited", [False, True])
-@pytest.mark.parametrize("most", [40, 10**6])
-def test_scan_brings_every_sample_below_the_reach_that_it_reports(weights, limited, most):
+@pytest.mark.parametrize("most, jitter, rows", [(40, 0.3, range(5)), (10**6, 0.3, range(5)), (10**6, 0.0, (3, 1))])
+def test_scan_brings_every_sample_below_the_reach_that_it_reports(weights, limited, most, jitter, rows):
     """Against the slack written out, with pieces and products that do not divide the number of samples."""
     rng = np.random.default_rng(5)
-    transient = drawn(leibov2006(), 40_001, 3, noise=1e-3, jitter=0.3)
+    transient = drawn(leibov2006(), 40_001, 3, noise=1e-3, jitter=jitter)
     W = None if weights == "ones" else rng.uniform(0.5, 2, (40_001, 5))
     problem = assemble([transient], OperatingPoint.identity(5, 4), W, "both")
     sums, sampled = passes.moments(problem, 0, 7)
@@ -439,8 +439,10 @@ def test_scan_brings_every_sample_below_the_reach_that_it_reports(weights, limit
     room = (limit / (2 * root * problem.dt[:, None]) - half) / size if limited else np.full(inside.shape, np.inf)
     reach = np.quantile(inside, 0.02, axis=0)
     room_reach = np.maximum(np.quantile(room, 0.01, axis=0), 0.0) if limited else reach
-    found = passes.scan(problem, passes.Candidate(theta, d, unit, sums.rate_scale, limit, reach, room_reach, most))
-    for i, (samples, held) in enumerate(found):
+    rows = np.array(rows)
+    chosen = theta[:, rows], d[:, rows], unit, sums.rate_scale[rows], limit if limit is None else limit[rows]
+    found = passes.scan(problem, passes.Candidate(*chosen, reach[rows], room_reach[rows], most, rows))
+    for i, (samples, held) in zip(rows, found, strict=True):
         edge = 1e-9 * np.abs(reach[i])
         below = (inside[:, i] < held - edge) | (room[:, i] < min(held, room_reach[i]) - edge)
         assert np.isin(np.flatnonzero(below), samples.index).all()
@@ -450,6 +452,49 @@ def test_scan_brings_every_sample_below_the_reach_that_it_reports(weights, limit
             assert (np.minimum(inside, room)[samples.index, i] < max(reach[i], room_reach[i]) + edge).all()
         np.testing.assert_allclose(samples.rate, problem.rate()[samples.index, i])
         np.testing.assert_allclose(samples.root_weight, root[samples.index, i])
+
+
+def judged_sample(seed):
+    """A model and transitions of it inside, on and one ulp beyond its bounds, in sizes from 1e-6 to 1e6."""
+    rng = np.random.default_rng(seed)
+    n, m, N = rng.integers(1, 6), rng.integers(0, 5), int(rng.integers(300, 6000))
+    A = rng.normal(size=(n, n + m)) * 10.0 ** rng.integers(-3, 3)
+    D = np.abs(rng.normal(size=(n, n + m))) * rng.choice([0, 1e-17, 1e-3, 1.0], size=(n, 1))
+    c, dc, v = rng.normal(size=(3, n)) * rng.choice([0, 1], size=(3, 1))
+    model = UncertainLTI(A[:, :n], A[:, n:], D[:, :n], D[:, n:], c=c, dc=np.abs(dc), v=np.abs(v))
+    z = rng.normal(size=(n + m, N)) * rng.choice([1e-6, 1.0, 1e6], size=(n + m, 1))
+    dt = np.full(N, 0.01) if seed % 2 else rng.uniform(0.005, 0.02, N)
+    centre, half = np.empty((2, n, N))
+    model.columns_centre_and_half(z, dt, centre, half)
+    x_next = centre + half * rng.uniform(-1, 1, centre.shape)
+    edge = rng.integers(0, N, 20)
+    x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
+    beyond = edge[:10]
+    x_next[:, beyond] = np.nextafter(x_next[:, beyond], rng.choice([-np.inf, np.inf]))
+    nothing = np.zeros(N, dtype=np.intp)
+    return model, Problem(z, x_next, dt, nothing, nothing, rng.uniform(0.5, 2, n), Columns())
+
+
+def test_judging_what_is_in_doubt_is_judging_everything():
+    """The faster arithmetic decides nothing that the verdict's own could decide otherwise: the same counts and bits."""
+    decided = outside = 0
+    for seed in range(200):
+        model, problem = judged_sample(seed)
+        block = problem.block(slice(0, problem.N))
+        every = passes._judged(block, model)
+        for known in (np.zeros(problem.n), every.largest, np.nextafter(every.largest, 0.0)):
+            fast = passes._judged_in_doubt(block, model, known)
+            if fast is not None:
+                decided += 1
+                outside += int(fast.outside.sum())
+                assert np.array_equal(fast.outside, every.outside)
+                assert np.array_equal(np.maximum(fast.largest, known), every.largest)
+                assert np.array_equal(fast.weighted, fast.largest * np.sqrt(problem.weights))
+        total = passes.judge(problem, model)
+        assert np.array_equal(total.outside, every.outside)
+        assert total.largest.tobytes() == every.largest.tobytes()
+        assert total.weighted.tobytes() == every.weighted.tobytes()
+    assert decided > 300 and outside > 1000
 
 
 def test_products_are_those_of_whole_matrices():

@@ -220,7 +220,7 @@ def describe(
         )
     columns = problem.columns
     if not columns.noise and not columns.disturbance:
-        messages += _near_rest(problem, sums, mean_width, states)
+        messages += _near_rest(problem, part, sums, mean_width, states)
     messages += _wide(problem, mean_width, states, known, few, bool(slow) and SLOW in slow[0], follow)
     if columns.drift and columns.noise and not columns.disturbance:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
@@ -455,9 +455,8 @@ def remedies(messages: Sequence[str], additive: str, state: str) -> str:
     return ", or ".join(found)
 
 
-def _near_rest(problem: Problem, sums: Moments, mean_width: Array, states: Sequence[str]) -> list[str]:
-    """Widths that come from samples near rest, and what the additive term would gain."""
-    part = _stretches(problem)
+def _near_rest(problem: Problem, part: Problem, sums: Moments, mean_width: Array, states: Sequence[str]) -> list[str]:
+    """Widths that come from samples near rest, and what the additive term would gain; part: `_stretches`."""
     floor = 1e-9 * np.abs(part.z_columns[: part.n]).max(axis=1)  # below it both are rounding
     box = _least_squares_box(part, sums)
     if part is not problem and (mean_width > 0.7 * box).any():  # the band of all samples is no narrower: a screen

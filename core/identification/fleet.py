@@ -150,11 +150,11 @@ class Fleet:
         Returns
         -------
         list of (Samples, float)
-            Per row the samples, and the reach below which none is missing.
+            Per row of the candidate the samples, and the reach below which none is missing.
         """
         results = self.map(passes.scan, [(candidate, offset) for offset in self.offsets])
         rows = []
-        for i in range(self.n):
+        for i in range(len(candidate.rows)):
             rows.append((Samples.join([r[i][0] for r in results], self.p), min(r[i][1] for r in results)))
         return rows
 

@@ -98,6 +98,12 @@ class Moments:
 _PIECE = 2**18
 """Numbers of z and x_next in a piece: they stay in the cache, and numpy is long enough at each operation on them for
 other threads not to wait for the interpreter."""
+_FEW = 256
+"""Transitions of a piece that are worth judging one by one."""
+_FEW_ALL = 20_000
+"""Transitions up to which a scan spends its time elsewhere."""
+_EPS, _TINY = float(np.finfo(np.float64).eps), 1e-290
+"""Relative rounding of one operation, twice; and more than underflow can add up to."""
 _SINGLE_THREADED = 2**18
 """Multiplications up to which OpenBLAS keeps a product on one thread; waking the others costs more, for narrow ones."""
 
@@ -353,6 +359,8 @@ class Candidate:
         And those that have less slack than this from being wider than the limit.
     most : int
         Samples per row at most.
+    rows : array of int
+        Rows of the model that are looked at; the arrays above have one element or column for each.
     """
 
     theta: Array
@@ -363,6 +371,7 @@ class Candidate:
     reach: Array
     room: Array
     most: int
+    rows: Index
 
 
 def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[Samples, float]]:
@@ -384,11 +393,12 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     Returns
     -------
     list of (Samples, float)
-        Per row the samples, and the reach that held to the end.
+        Per row of the candidate the samples, and the reach that held to the end.
     """
-    columns = part.columns
+    columns, p = part.columns, part.p
     theta, d = np.ascontiguousarray(candidate.theta.T), np.ascontiguousarray(candidate.d.T)
     n = len(theta)
+    rows = slice(part.n) if n == part.n else candidate.rows  # a slice is no copy
     found: list[list[Samples]] = [[] for _ in range(n)]
     slacks: list[list[Array]] = [[] for _ in range(n)]
     kept = [0] * n
@@ -405,21 +415,30 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     inner, outer = shifted()
     for block in _pieces(part):
         psi = block.psi(columns)
-        residual = _product(theta, block.phi(columns))
-        residual -= block.rate()
+        # a constant step goes into the elements, unless the transitions are too few for it to save time
+        step = float(block.dt[0]) if part.N > _FEW_ALL and (block.dt == block.dt[0]).all() else None
+        residual = _product(theta[:, :p] * (step or 1.0), block.z)
+        if columns.drift:
+            residual += theta[:, p:] * (step or 1.0)
+        rate = block.x_next[rows] - block.z[rows]
+        if not step:
+            rate /= block.dt
+        residual -= rate
         np.abs(residual, out=residual)
-        below = residual > _product(inner, psi)
+        below = residual > _product(inner * (step or 1.0), psi)
         if candidate.limit is not None:
-            width = _product(outer, psi)
-            width *= block.dt
-            below |= width > candidate.limit[:, None] / (2.0 * block.root_weights())
+            width = _product(outer * (step or 1.0), psi)
+            if not step:
+                width *= block.dt
+            root = block.root_weights()
+            below |= width > candidate.limit[:, None] / (2.0 * (root if len(root) == 1 else root[rows]))
         changed = False
         for i, row in enumerate(below):
             chosen = np.flatnonzero(row)
             if not len(chosen):
                 continue
-            found[i].append(_take(block, i, chosen, offset))
-            slacks[i].append(_slack(candidate, i, psi[:, chosen], residual[i, chosen], found[i][-1]))
+            found[i].append(_take(block, int(candidate.rows[i]), chosen, offset))
+            slacks[i].append(_slack(candidate, i, psi[:, chosen], residual[i, chosen] / (step or 1.0), found[i][-1]))
             kept[i] += len(chosen)
             if kept[i] > 2 * candidate.most:
                 found[i], slacks[i], reach[i] = _least(found[i], slacks[i], candidate.most, part.p, reach[i])
@@ -502,18 +521,105 @@ def judge(part: Partition, model: UncertainLTI) -> Judged:
     zeros = np.zeros(part.n)
     total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
     for block in _pieces(part):
-        centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
-        model.columns_centre_and_half(block.z, block.dt, centre, half)
-        largest = 2.0 * half.max(axis=1)
-        if block.weights.ndim == 1:
-            weighted = largest * np.sqrt(block.weights)
-        else:
-            weighted = 2.0 * (half * block.root_weights()).max(axis=1)
-        inside = centre - half <= block.x_next
-        centre += half
-        inside &= block.x_next <= centre
-        total = total + Judged(len(block) - np.count_nonzero(inside, axis=1), largest, weighted)
+        found = _judged_in_doubt(block, model, total.largest) if block.weights.ndim == 1 else None
+        total = total + (found or _judged(block, model))
     return total
+
+
+def _judged(block: Block, model: UncertainLTI) -> Judged:
+    """`judge` of one piece, every transition by the verdict's arithmetic."""
+    inside, half = _inside_and_half(model, block.z, block.x_next, block.dt)
+    largest = 2.0 * half.max(axis=1)
+    if block.weights.ndim == 1:
+        weighted = largest * np.sqrt(block.weights)
+    else:
+        weighted = 2.0 * (half * block.root_weights()).max(axis=1)
+    return Judged(len(block) - np.count_nonzero(inside, axis=1), largest, weighted)
+
+
+def _inside_and_half(model: UncertainLTI, z: Array, x_next: Array, dt: Array) -> tuple[NDArray[np.bool_], Array]:
+    """The verdict on each row of each transition, and its half-width, both (n, K)."""
+    centre, half = np.empty(x_next.shape), np.empty(x_next.shape)
+    model.columns_centre_and_half(z, dt, centre, half)
+    inside: NDArray[np.bool_] = centre - half <= x_next
+    centre += half
+    inside &= x_next <= centre
+    return inside, half
+
+
+def _judged_in_doubt(block: Block, model: UncertainLTI, known: Array) -> Judged | None:
+    """`_judged` to the bit, from the transitions alone that the rounding of a faster arithmetic leaves in doubt.
+
+    A transition that is inside, or narrower than the widest, by more than any order of the sums can differ is so by the
+    verdict's arithmetic too; the others are judged by it. The bound is that of a sum of k products, k ε Σ |a b| (Higham
+    2002, section 3.1), with room to spare.
+
+    Parameters
+    ----------
+    block : Block
+        The transitions, with weights that are constant in time.
+    model : UncertainLTI
+        The model.
+    known : array (n,)
+        Widths that were found already; transitions that are narrower need not be judged.
+
+    Returns
+    -------
+    Judged or None
+        None where the doubt is not worth the trouble; widths are 0 where none is larger than what was known.
+    """
+    nominal, spread, v = model.tables
+    n, p = block.n, len(block.z)
+    drift, steady = nominal[:, p:].sum(axis=1), spread[:, p:].sum(axis=1)  # beyond z the regressors are 1
+    longest = float(block.dt.max())
+    psi = np.abs(block.z)
+    most = psi.max(axis=1)
+    constant = float(block.dt.min()) == longest
+    widest, floor = longest * (spread[:, :p] @ most), v
+    if constant:
+        floor = longest * steady + v
+    else:
+        widest = widest + longest * steady
+    size = longest * (np.abs(nominal[:, :p]) @ most + np.abs(nominal[:, p:]).sum(axis=1)) + most[:n] + widest + floor
+    relative = 8.0 * (p + 8) * _EPS
+    error = relative * size + _TINY
+    if not np.isfinite(error).all():
+        return None
+    if constant:  # the step goes into the elements
+        distance = _product(nominal[:, :p] * longest + np.eye(n, p), block.z)
+        half = _product(spread[:, :p] * longest, psi)
+        if drift.any():
+            distance += (drift * longest)[:, None]
+    else:
+        distance, half = _product(nominal[:, :p], block.z), _product(spread[:, :p], psi)
+        distance += drift[:, None]
+        distance *= block.dt
+        distance += block.z[:n]
+        half += steady[:, None]
+        half *= block.dt
+    distance -= block.x_next
+    np.abs(distance, out=distance)
+    distance += (error - floor)[:, None]
+    doubtful: NDArray[np.bool_] = np.any(distance > half, axis=0)
+    # rounding keeps the order, so the widest is where the half-width without the floor, added last, is the largest
+    doubt = 2.0 * (relative * widest + _TINY)
+    for i, least in enumerate(half.max(axis=1) - doubt):
+        if 2.0 * (least + 2.0 * doubt[i] + floor[i]) * (1.0 + relative) < known[i]:
+            continue
+        if widest[i] == 0.0:
+            doubtful[0] = True
+        else:
+            doubtful |= half[i] >= least
+    chosen = np.flatnonzero(doubtful)
+    if len(chosen) > _FEW:
+        return None
+    outside, largest = np.zeros(n, dtype=np.intp), np.zeros(n)
+    if len(chosen):
+        padded = np.resize(chosen, _FEW)  # a fixed number, as `ordered_sum` tries each shape first
+        inside, widths = _inside_and_half(model, block.z[:, padded], block.x_next[:, padded], block.dt[padded])
+        outside = len(chosen) - np.count_nonzero(inside[:, : len(chosen)], axis=1)
+        largest = 2.0 * widths.max(axis=1)
+    return Judged(outside, largest, largest * np.sqrt(block.weights))
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:

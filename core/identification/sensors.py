@@ -85,14 +85,18 @@ def flipped(problem: Problem, signals: Sequence[Signal], place: Callable[[Sequen
     n = problem.n
     states = signals[:n]
     scale, steady = np.array([float(s.scale) for s in states]), np.array([float(s.steady) for s in states])
-    before, after = problem.z[:, :n] * scale + steady, problem.x_next * scale + steady
+
+    def recorded(those: list[int]) -> tuple[Array, Array]:
+        before, after = problem.z[:, those], problem.x_next[:, those]
+        return before * scale[those] + steady[those], after * scale[those] + steady[those]
+
     messages = []
     groups: dict[tuple[str, str], list[int]] = {}
     for i, signal in enumerate(states):
         if match := _QUATERNION.fullmatch(signal.field) or (not signal.topic and _QUATERNION.fullmatch(signal.name)):
             groups.setdefault((signal.topic, match[1]), []).append(i)
     for (topic, attitude), those in groups.items():
-        one, other = before[:, those], after[:, those]
+        one, other = recorded(those)
         if max(np.abs(one).max(), np.abs(other).max()) > 1.01:
             continue  # no unit quaternion
         sum_, difference = np.square(one + other).sum(axis=1), np.square(one - other).sum(axis=1)
@@ -105,11 +109,17 @@ def flipped(problem: Problem, signals: Sequence[Signal], place: Callable[[Sequen
                 + (f", such as 'unwrap(yaw({attitude.rstrip('.')}))' of {topic}," if topic else "")
                 + " instead of components"
             )
+    longest = np.zeros(n)
+    for block in problem.blocks():
+        longest = np.maximum(longest, np.abs(block.x_next - block.z[:n]).max(axis=1) * scale)
     for i, signal in enumerate(states):
+        if longest[i] < 0.8 * 2 * np.pi:  # no step is near a turn
+            continue
+        before, after = (columns[:, 0] for columns in recorded([i]))
         for turn in (2 * np.pi, 360.0):
-            step = np.abs(after[:, i] - before[:, i])
+            step = np.abs(after - before)
             wraps = np.flatnonzero(np.abs(step - turn) < 0.1 * turn)
-            inside = np.abs(before[:, i]).max() < 0.51 * turn or (before[:, i].min() >= 0 and before[:, i].max() < turn)
+            inside = np.abs(before).max() < 0.51 * turn or (before.min() >= 0 and before.max() < turn)
             rest = np.delete(step, wraps)
             if 0 < len(wraps) < 0.05 * problem.N and inside and len(rest) and rest.max() < 0.3 * turn:
                 messages.append(

@@ -16,6 +16,8 @@ from uncertain_lti.identification.problem import Columns
 from uncertain_lti.identification.solvers import FEASIBLE, Sense, Simplex, dual_bound, solve_qp
 from uncertain_lti.identification.structure import Structure
 
+_FURTHER = 1.5
+"""After the first pass, samples are held whose slack is up to this many times as large: few are left there."""
 SUBSAMPLE = 10_000
 """Transitions of the first solve; up to twice as many are held as a whole."""
 TOLERANCE = 1e-11
@@ -1211,7 +1213,7 @@ class WorkingSet:
         for row in self.rows:
             row.theta, row.d, row.limit = theta[:, row.i], d[:, row.i], None
         everything = np.full(self.fleet.n, np.inf)
-        found = self.fleet.scan(self._candidate(everything, everything, most=1))
+        found = self.fleet.scan(self._candidate(everything, everything, 1, self.rows))
         for row, (samples, _) in zip(self.rows, found, strict=True):
             self._hold(row, samples)
         return self._solution().violation
@@ -1251,6 +1253,7 @@ class WorkingSet:
             return
         most = 2 * SUBSAMPLE + self.fleet.N // 500
         share = 0.3 * most / self.fleet.N
+        rows, scanned = self.rows, False
         for _ in range(MAX_ROUNDS):
             wanted = np.array([row.reach(share) for row in self.rows]).T
             # the samples held after a pass are those of least slack, so the next reach would shrink: keep the first
@@ -1258,12 +1261,15 @@ class WorkingSet:
             if self._reach is not None and np.array_equal(scales, self._reach_scales):
                 wanted = np.maximum(wanted, self._reach)
             self._reach, self._reach_scales = wanted, scales
-            found = self.fleet.scan(self._candidate(wanted[0], wanted[1], most))
+            if scanned:  # few are left near the bounds, and what is held further off need not be looked for again
+                wanted = _FURTHER * wanted
+            found = self.fleet.scan(self._candidate(wanted[0], wanted[1], most, rows))
+            scanned = True
             self.passes += 1
-            before = [(row.theta.copy(), row.d.copy(), row.limit, row.scale) for row in self.rows]
+            before = [(row.theta.copy(), row.d.copy(), row.limit, row.scale) for row in rows]
             todo = []
             left = 0
-            for row, (samples, _) in zip(self.rows, found, strict=True):
+            for row, (samples, _) in zip(rows, found, strict=True):
                 self._hold(row, samples)
                 left += int((row.slack() < -row.tolerance).sum())
                 if row.widen_pool():
@@ -1271,28 +1277,34 @@ class WorkingSet:
             self.progress(f"pass {self.passes}: {plural(left, 'sample')} outside, working set {self._sizes()}")
             if not todo:
                 return
-            settle(self.rows if self.sums.coupled is not None else todo)
-            moved = [self._moved(row, *old) for row, old in zip(self.rows, before, strict=True)]
-            if all(change == 0.0 or change < held for change, (_, held) in zip(moved, found, strict=True)):
+            settle(rows if self.sums.coupled is not None else todo)
+            moved = [self._moved(row, *old) for row, old in zip(rows, before, strict=True)]
+            again = [
+                row
+                for row, change, (_, held) in zip(rows, moved, found, strict=True)
+                if not (change == 0.0 or change < held)
+            ]
+            if not again:
                 return
+            rows = self.rows if self.sums.coupled is not None else again
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} passes; scale the signals to order one")
 
-    def _candidate(self, reach: Array, room: Array, most: int) -> Candidate:
-        limits = [row.limit for row in self.rows]
+    def _candidate(self, reach: Array, room: Array, most: int, rows: list[Row]) -> Candidate:
+        limits = [row.limit for row in rows]
         limit = None
         if all(value is not None for value in limits):
-            limit = np.array(
-                [float(value or 0.0) * row.limit_unit for value, row in zip(limits, self.rows, strict=True)]
-            )
+            limit = np.array([float(value or 0.0) * row.limit_unit for value, row in zip(limits, rows, strict=True)])
+        which = np.array([row.i for row in rows], dtype=np.intp)
         return Candidate(
-            np.column_stack([row.theta for row in self.rows]),
-            np.column_stack([row.d for row in self.rows]),
-            self.rows[0].size_unit,
-            np.array([row.scale for row in self.rows]),
+            np.column_stack([row.theta for row in rows]),
+            np.column_stack([row.d for row in rows]),
+            rows[0].size_unit,
+            np.array([row.scale for row in rows]),
             limit,
-            reach,
-            room,
+            reach[which],
+            room[which],
             most,
+            which,
         )
 
     def _moved(self, row: Row, theta: Array, d: Array, limit: float | None, scale: float) -> float:
