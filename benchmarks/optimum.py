@@ -154,7 +154,7 @@ class Row:
 def rows(problem: Problem, structure: Structure | None) -> list[Row]:
     """The rows of (8) and (9)."""
     n, p, columns = problem.n, problem.p, problem.columns
-    bounds = (structure or Structure(n, p - n)).stacked(columns.drift, columns.disturbance, columns.noise)
+    bounds = (structure or Structure(n, p - n)).stacked(columns.names)
     dt = problem.dt[:, None]
     phi, psi = problem.phi() * dt, problem.psi() * dt
     made = []

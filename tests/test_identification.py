@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import formulation, passes, solvers, working_set
+from uncertain_lti.identification import formulation, passes, row, solvers
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Columns, Problem, assemble
 from uncertain_lti.identification.structure import Structure
@@ -743,7 +743,7 @@ def test_a_weight_beside_the_largest_width_that_is_too_large_is_seen(monkeypatch
     """The simplex method tells that δ is not the least, and takes over: the same optimum, ties broken alike."""
     transient = drawn(leibov2006(), N, 4, noise=1e-3)
     expected = fit(transient, "lp", additive="noise")
-    monkeypatch.setattr(working_set, "REGULARISATION", 100.0)
+    monkeypatch.setattr(row, "REGULARISATION", 100.0)
     model = fit(transient, "lp", additive="noise")
     np.testing.assert_allclose(model.fit_summary["objective"], expected.fit_summary["objective"], rtol=1e-8)
     np.testing.assert_allclose(model.fit_summary["mean_width"], expected.fit_summary["mean_width"], rtol=1e-3)

@@ -18,8 +18,8 @@ from uncertain_lti.identification.diagnosis import too_few
 from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, is_constant
+from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.identification.working_set import InfeasibleError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI

@@ -12,8 +12,9 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.row import Row
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.identification.working_set import Row, WorkingSet
+from uncertain_lti.identification.working_set import WorkingSet
 
 _ACTIVE = 1e-7
 """Slack, in scaled units, below which a sample carries the envelope."""

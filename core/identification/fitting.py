@@ -21,8 +21,9 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Judged, Moments
 from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, median_step
 from uncertain_lti.identification.repair import repair
+from uncertain_lti.identification.row import LEAST, InfeasibleError
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.identification.working_set import GOOD, LEAST, InfeasibleError, Solution, WorkingSet
+from uncertain_lti.identification.working_set import GOOD, Solution, WorkingSet
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.operating_point import OperatingPoint

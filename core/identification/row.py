@@ -1,0 +1,901 @@
+"""One row of the model: its unknowns, the samples held for it, and its small programmes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification.passes import Moments, Samples
+from uncertain_lti.identification.problem import Columns
+from uncertain_lti.identification.solvers import FEASIBLE, Sense, Simplex, dual_bound, solve_qp
+
+TOLERANCE = 1e-11
+"""Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
+TIE_BREAK = 1e-8
+"""Weight of the squared distance of the centre beside the squared half-widths.
+
+|rate - centre| <= half-width for every sample, so the sum of squared distances is at most that of squared half-widths,
+and the optimum of the sum is within TIE_BREAK (relative) of the optimum of (10) alone, with the centre that the stated
+tie-break asks for.
+"""
+ROUGH = 1e-4
+"""Violation, in scaled units, up to which a first answer is worth judging: how good it is, is measured at the end."""
+LEAST = 1e-9
+"""Widths below this share of the steps themselves are rounding, and so is their distance from the optimum."""
+COLLINEAR = 1e-11
+"""Relative singular value of the columns below which a direction has no effect that arithmetic could tell."""
+_EPS = float(np.finfo(np.float64).eps)
+WIDTH_SLACK = 1e-9
+"""Relative room above δ of (11) in which its ties are broken; a solver needs some."""
+BOUNDED_TIE_BREAK = 1e-5
+"""The same as TIE_BREAK among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
+REGULARISATION = 1e-4
+"""Weight of the squared widths beside δ in (11), for a solver of strictly convex programmes.
+
+With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
+of the squared widths. Whether it was is seen from the optimum of δ alone, at the end.
+"""
+_ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
+JOIN = 48  # samples that join a working set per round, at least; more where there are many unknowns
+
+
+class InfeasibleError(FitError):
+    """A row cannot contain a transition, whatever its elements within the structure.
+
+    Parameters
+    ----------
+    row : int
+        The row of the model.
+    index : int
+        Position of the transition.
+    distance : float
+        How far it stays outside at best, normalised.
+    together : int, default 0
+        How many other transitions it contradicts, if it could be contained without them.
+    """
+
+    def __init__(self, row: int, index: int, distance: float, together: int = 0) -> None:
+        super().__init__(f"row {row} cannot contain transition {index}")
+        self.row, self.index, self.distance, self.together = row, index, distance, together
+
+
+class Row:
+    """One row of the model in scaled unknowns ξ = [θ d], with the samples held for it and the working set among them.
+
+    Elements that the structure fixes, and columns that are 0 in every sample, are no unknowns.
+
+    Parameters
+    ----------
+    i : int
+        Which row of the model.
+    sums : Moments
+        Of all data.
+    bounds : four arrays
+        Of `Structure.stacked`.
+    """
+
+    def __init__(self, i: int, sums: Moments, bounds: tuple[Array, Array, Array, Array]) -> None:
+        self.i = i
+        self.sums = sums
+        self._bounds = bounds
+        self.refined = False
+        self.width: Array = np.empty(0)
+        self.kept: float | None = None  # violation, in units of the size, of an answer of before that was good
+        self.width_unit = 1.0  # of δ and `width`, beside scale: of order one in refined coordinates
+        self.tolerance = TOLERANCE
+        self._coordinates(float(sums.rate_scale[i]))
+        self.samples = Samples.join([], len(sums.low))
+        self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
+        self.limit: float | None = None  # δ of (11) in units of scale x width_unit
+        self.exact = False  # (11) by the simplex method
+        self._forget()
+
+    def _forget(self) -> None:
+        """What solvers start from."""
+        self.attempt = _ATTEMPTS[0]
+        self._active: dict[str, Sense] = {}  # what was active in the last programme of a kind
+        self._simplex: Simplex | None = None
+        self._known: Index = np.empty(0, dtype=np.intp)
+
+    def _coordinates(self, scale: float) -> None:
+        """Scaled unknowns: columns of unit size, elements in units of `scale` per step."""
+        i, sums, bounds = self.i, self.sums, self._bounds
+        self.scale = scale
+        theta_low, theta_high, d_low, d_high = (b[:, i] for b in bounds)
+        dead_phi, dead_psi = sums.phi_scale == 0, sums.psi_scale == 0
+        fixed_phi, fixed_psi = theta_low == theta_high, d_low == d_high
+        self.theta = np.where(fixed_phi, theta_low, np.clip(0.0, theta_low, theta_high))
+        self.d = np.where(fixed_psi, d_low, np.where(dead_psi, d_low, 0.0))
+        self.free_phi = np.flatnonzero(~dead_phi & ~fixed_phi)
+        self.free_psi = np.flatnonzero(~dead_psi & ~fixed_psi)
+        with np.errstate(divide="ignore"):
+            unit_phi, unit_psi = 1.0 / sums.phi_scale, 1.0 / sums.psi_scale
+        self.unit_phi, self.unit_psi = unit_phi[self.free_phi], unit_psi[self.free_psi]
+        self.size_unit = np.where(dead_psi, 0.0, unit_psi)
+        self.r, self.q = len(self.free_phi), len(self.free_psi)
+        self.fixed_theta, self.fixed_d = self.theta.copy(), self.d.copy()
+        self.fixed_theta[self.free_phi] = 0.0
+        self.fixed_d[self.free_psi] = 0.0
+        to_phi, to_psi = self.scale * self.unit_phi, self.scale * self.unit_psi
+        self.lower = np.concatenate([theta_low[self.free_phi] / to_phi, d_low[self.free_psi] / to_psi])
+        self.upper = np.concatenate([theta_high[self.free_phi] / to_phi, d_high[self.free_psi] / to_psi])
+        inside = np.ix_(self.free_phi, self.free_phi)
+        self.centre = sums.centre[inside] * np.outer(self.unit_phi, self.unit_phi) / sums.count
+        target = sums.target[:, i] - sums.centre @ self.fixed_theta
+        self.target = target[self.free_phi] * self.unit_phi / (sums.count * self.scale)
+        plain = self._gram(sums.plain_gram, sums.count)
+        self.plain, self.plain_linear, _ = plain
+        self.gram, self.linear, self.known = plain if sums.gram is None else self._gram(sums.gram[i], sums.count)
+        self.basis: Array | None = None  # scaled θ = basis η, in refined coordinates
+        self.asked: Array = np.empty((0, self.r))  # asked η >= asked_limits: what the structure says of θ there
+        self.asked_limits: Array = np.empty(0)
+
+    def refine(self) -> None:
+        """Go over to coordinates in which the envelope has order one, however narrow and collinear the data.
+
+        The elements are sought as differences from the least squares over the samples held, in units of the residual
+        instead of the step, along directions of equal effect instead of columns. A solver's tolerance is then one on
+        the envelope. It costs a decomposition, so rows are refined only where it matters.
+        """
+        samples, pool, limit = self.samples, self.pool, self.limit
+        theta, d, before = self.theta, self.d, self.limit_unit
+        phi = self._phi(samples)
+        step = samples.rate * samples.dt
+        fixed = np.where(np.isin(np.arange(len(self.theta)), self.free_phi), 0.0, self.theta)
+        columns = (phi[self.free_phi] * samples.dt).T * self.unit_phi
+        left, values, right = np.linalg.svd(columns, full_matrices=False)
+        keep = values > COLLINEAR * values.max(initial=0.0)
+        inverse = right[keep].T / values[keep]
+        base, residual = np.zeros(self.r), step - fixed @ phi * samples.dt
+        for _ in range(2):  # the first leaves the rounding of large numbers
+            change = inverse @ (left[:, keep].T @ residual)
+            base, residual = base + change, residual - columns @ change
+        low, high = (b[:, self.i][self.free_phi] for b in self._bounds[:2])
+        base = np.clip(base * self.unit_phi, low, high)
+        fixed[self.free_phi] = base
+        residual = step - fixed @ phi * samples.dt
+        largest = float(np.abs(samples.z[self.i]).max(initial=0.0)) + float(np.abs(step).max(initial=0.0))
+        rounding = _EPS * largest
+        scale = max(float(np.sqrt(np.mean(residual**2))) if len(step) else 0.0, 4.0 * rounding, 1e-14 * self.rms_step)
+        self._coordinates(scale)
+        self.refined = True
+        self.tolerance = max(TOLERANCE, 0.25 * rounding / scale)
+        self.fixed_theta[self.free_phi] = base
+        self.lower[: self.r] -= base / (self.unit_phi * scale)
+        self.upper[: self.r] -= base / (self.unit_phi * scale)
+        target = self.sums.target[:, self.i] - self.sums.centre @ self.fixed_theta
+        self.target = target[self.free_phi] * self.unit_phi / (self.sums.count * scale)
+        if self.r:
+            root = np.sqrt(len(step))
+            self.basis = inverse * root
+            if values[keep].min(initial=np.inf) > 1e-5 * values.max(initial=0.0):
+                self.centre = self.basis.T @ self.centre @ self.basis
+                self.target = self.basis.T @ self.target
+            else:  # sums of squares do not hold so small a difference, the samples do
+                self.centre = np.eye(self.basis.shape[1])
+                self.target = left[:, keep].T @ residual / (root * scale)
+            low, high = self.lower[: self.r], self.upper[: self.r]
+            there = np.concatenate([np.flatnonzero(np.isfinite(low)), np.flatnonzero(np.isfinite(high))])
+            signs = np.repeat([1.0, -1.0], [int(np.isfinite(low).sum()), int(np.isfinite(high).sum())])
+            asked = signs[:, None] * self.basis[there]
+            size = np.maximum(np.abs(asked).max(axis=1, initial=0.0), 1e-300)
+            limits = np.concatenate([low[np.isfinite(low)], -high[np.isfinite(high)]])
+            self.asked, self.asked_limits = asked / size[:, None], limits / size
+            self.r = self.basis.shape[1]
+            self.lower = np.concatenate([np.full(self.r, -np.inf), self.lower[-self.q :] if self.q else np.empty(0)])
+            self.upper = np.concatenate([np.full(self.r, np.inf), self.upper[-self.q :] if self.q else np.empty(0)])
+        self.theta, self.d = theta, d
+        self._forget()
+        self.width_unit = 1.0
+        self.hold(samples, self._columns)
+        self.width_unit = float(np.sqrt(np.mean(self.width**2))) if len(samples) else 1.0
+        self.width = self.width / self.width_unit
+        self.limit = None if limit is None else limit * before / self.limit_unit
+        self.pool = pool
+
+    @property
+    def limit_unit(self) -> float:
+        """Of `limit`, in normalised units."""
+        return self.scale * self.width_unit
+
+    def _sizes(self, positions: Index | int) -> Array:
+        """Size of held samples: the unit of their slack, with `scale`."""
+        return np.asarray(self.width[positions] * self.width_unit / (2.0 * self.samples.root_weight[positions]))
+
+    def _phi(self, samples: Samples) -> Array:
+        extra = len(self._columns.nominal)
+        return np.vstack([samples.z, np.ones((extra, len(samples)))]) if extra else samples.z
+
+    def scaled(self) -> tuple[Array, Array]:
+        """Return the row's elements as differences from its fixed part, in scaled units.
+
+        Returns
+        -------
+        array (r,), array (q,)
+            Of the nominal elements, without the basis, and of the half-widths.
+        """
+        theta, d = self.theta[self.free_phi], self.d[self.free_psi]
+        if self.refined:
+            theta = theta - self.fixed_theta[self.free_phi]
+        return theta / (self.unit_phi * self.scale), d / (self.unit_psi * self.scale)
+
+    def _gram(self, gram: Array, count: int) -> tuple[Array, Array, float]:
+        """Squared widths as ½ dᵀ G d + gᵀ d + k in scaled units; G has order one."""
+        unit = self.unit_psi
+        inside = gram[np.ix_(self.free_psi, self.free_psi)] * np.outer(unit, unit) / count
+        linear = (gram @ self.fixed_d)[self.free_psi] * unit / (count * self.scale)
+        largest = float(np.diagonal(inside).max(initial=0.0)) or 1.0
+        known = 0.5 * float(self.fixed_d @ gram @ self.fixed_d) / (count * self.scale**2)
+        self.largest = largest
+        return inside / largest, linear / largest, known / largest
+
+    @property
+    def unknown(self) -> bool:
+        """Something is left to solve for."""
+        return self.r + self.q > 0
+
+    def start(self) -> None:
+        """Start from least squares, with no half-width."""
+        answer = np.linalg.lstsq(self.centre + 1e-12 * np.eye(self.r), self.target, rcond=None)[0].astype(np.float64)
+        self.store(np.concatenate([np.clip(answer, self.lower[: self.r], self.upper[: self.r]), np.zeros(self.q)]))
+
+    def store(self, answer: Array) -> None:
+        """Take scaled unknowns as the row's elements.
+
+        Parameters
+        ----------
+        answer : array (r + q,)
+            Scaled unknowns ξ.
+        """
+        self._store_theta(answer[: self.r])
+        d = np.maximum(answer[self.r :], np.maximum(self.lower[self.r :], 0.0))
+        self.d[self.free_psi] = d * self.unit_psi * self.scale
+
+    def _store_theta(self, answer: Array) -> None:
+        change = answer if self.basis is None else self.basis @ answer
+        theta = change * self.unit_phi * self.scale
+        self.theta[self.free_phi] = theta + self.fixed_theta[self.free_phi] if self.refined else theta
+
+    def hold(self, samples: Samples, columns: Columns) -> None:
+        """Hold these samples, and the working set so far.
+
+        Parameters
+        ----------
+        samples : Samples
+            Of the last pass.
+        columns : Columns
+            Terms that the fit has.
+        """
+        self._columns = columns
+        p = len(samples.z)
+        kept = self.samples[self.pool]
+        self.samples = samples = Samples.join([samples, kept], p)
+        self.pool = np.searchsorted(samples.index, kept.index)
+        ones = np.ones(len(samples))
+        phi = self._phi(samples)
+        extra = [ones if term.times_dt else 1.0 / samples.dt for term in columns.half]
+        psi = np.vstack([np.abs(samples.z), *extra])
+        size = self.size_unit @ psi
+        size[size == 0.0] = 1.0
+        # rows of the programme: each sample divided by its own size, so that one near rest weighs as any other
+        self.plain_phi = ((phi[self.free_phi] * self.unit_phi[:, None]) / size).T
+        self.phi = self.plain_phi if self.basis is None else self.plain_phi @ self.basis
+        self.psi = ((psi[self.free_psi] * self.unit_psi[:, None]) / size).T
+        self.y = (samples.rate - self.fixed_theta @ phi) / (size * self.scale)
+        self.half = (self.fixed_d @ psi) / (size * self.scale)
+        self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
+        if self.refined:
+            self.width = self.width / self.width_unit
+
+    def slacks(self) -> tuple[Array, Array | None]:
+        """Slack of every held sample.
+
+        Returns
+        -------
+        array (K,)
+            From leaving the bounds.
+        array (K,) or None
+            From being wider than (11) allows; None without a limit.
+        """
+        theta, d = self.scaled()
+        half = self.psi @ d + self.half
+        inside = half - np.abs(self.y - self.plain_phi @ theta)
+        return inside, None if self.limit is None else self.limit / self.width - half
+
+    def slack(self) -> Array:
+        """Slack of every held sample, the lesser of both; see `passes.scan`.
+
+        Returns
+        -------
+        array (K,)
+            Negative where the sample is violated.
+        """
+        inside, room = self.slacks()
+        return inside if room is None else np.minimum(inside, room)
+
+    def reach(self, share: float) -> tuple[float, float]:
+        """Slack below which so large a share of all samples is expected: from leaving the bounds, from being too wide.
+
+        Where the widths of many samples are the largest one, which is so where noise alone makes them, only those
+        that are too wide matter.
+
+        Parameters
+        ----------
+        share : float
+            Of all samples.
+
+        Returns
+        -------
+        float
+            Slack from leaving the bounds.
+        float
+            Slack from being too wide.
+        """
+        inside, room = self.slacks()
+        least = 10 * self.tolerance
+        wanted = max(float(np.quantile(inside, share)), least)
+        width = 0.0 if room is None else float(np.quantile(room, share))
+        return wanted, min(width, wanted) if width > 1e-6 else 0.0
+
+    def widen_pool(self, most: int | None = None) -> bool:
+        """Let the most violated held samples join the working set.
+
+        Parameters
+        ----------
+        most : int, optional
+            Samples at most; default twice the unknowns, or a fixed number if that is more.
+
+        Returns
+        -------
+        bool
+            False where there is none to join.
+        """
+        slack = self.slack()
+        slack[self.pool] = np.inf
+        outside = np.flatnonzero(slack < -self.tolerance)
+        most = most or max(JOIN, 2 * (self.r + self.q))
+        if len(outside) > most:
+            outside = outside[np.argpartition(slack[outside], most)[:most]]
+        self.pool = np.concatenate([self.pool, outside])
+        return len(outside) > 0
+
+    def containment(self, pool: Index) -> tuple[Array, Array]:
+        """Containment (8)(9) of some samples as G ξ >= h.
+
+        Parameters
+        ----------
+        pool : array of int
+            Positions among the held samples.
+
+        Returns
+        -------
+        array (2 K, r + q)
+            G.
+        array (2 K,)
+            h.
+        """
+        phi, psi = self.phi[pool], self.psi[pool]
+        y, half = self.y[pool], self.half[pool]
+        return np.vstack([np.hstack([phi, psi]), np.hstack([-phi, psi])]), np.concatenate([y - half, -y - half])
+
+    def hessian(self, gram: Array, linear: Array, tie_break: float, ridge: float = 1e-10) -> tuple[Array, Array]:
+        """Objective of squared widths, plus the tie-break on the centre.
+
+        Parameters
+        ----------
+        gram : array (q, q)
+            Quadratic term of the half-widths.
+        linear : array (q,)
+            Their linear term.
+        tie_break : float
+            Weight of the centre, relative to the least diagonal element of `gram`.
+        ridge : float, default 1e-10
+            Added to the centre's diagonal, for what moves together in every sample.
+
+        Returns
+        -------
+        array (r + q, r + q)
+            H.
+        array (r + q,)
+            f.
+        """
+        H = np.zeros((self.r + self.q, self.r + self.q))
+        diagonal = np.diagonal(gram)
+        weight = tie_break * float(diagonal.min(initial=1.0))
+        H[: self.r, : self.r] = weight * (self.centre + ridge * np.eye(self.r))
+        H[self.r :, self.r :] = gram + 1e-13 * np.diag(diagonal)
+        return H, np.concatenate([-weight * self.target, linear])
+
+    # --- programmes of this row on its working set ---
+
+    def _solve(
+        self,
+        kind: str,
+        objective: Callable[[float, float], tuple[Array, Array]],
+        G: Array,
+        h: Array,
+        lower: Array,
+        upper: Array,
+        any_solver: bool = False,
+    ) -> tuple[Array, str]:
+        """Solve a programme whose rows are some for each sample of the pool, from what was active last time.
+
+        objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
+        """
+        feasible = FEASIBLE if self.refined else ROUGH
+        fixed, per_sample = len(lower), len(h) // max(len(self.pool), 1)
+        start = None
+        if kind in self._active and per_sample:
+            known = self._active[kind][fixed:].reshape(per_sample, -1)
+            known = known[:, : len(self.pool)]  # the pool grows, but for discards
+            start = np.zeros(fixed + len(h), dtype=np.int32)
+            start[:fixed] = self._active[kind][:fixed]
+            start[fixed:].reshape(per_sample, -1)[:, : known.shape[1]] = known
+        for attempt in _ATTEMPTS:
+            try:
+                answer = solve_qp(*objective(*attempt), *self._asked(G, h), lower, upper, start, False, feasible)
+                break
+            except FitError:
+                continue
+        else:
+            if not any_solver:
+                raise FitError("DAQP could not solve the quadratic programme")
+            answer = solve_qp(*objective(*attempt), *self._asked(G, h), lower, upper, feasible=feasible)
+        self.attempt = attempt
+        if answer.active is not None and not len(self.asked):
+            self._active[kind] = answer.active
+        return answer.xi, answer.solver
+
+    def _asked(self, G: Array, h: Array) -> tuple[Array, Array]:
+        """Rows G ξ >= h, and what the structure asks of θ if that is no bound of an unknown."""
+        if not len(self.asked):
+            return G, h
+        rows = np.hstack([self.asked, np.zeros((len(self.asked), G.shape[1] - self.r))])
+        return np.vstack([G, rows]), np.concatenate([h, self.asked_limits])
+
+    def solve_quadratic(self) -> str:
+        """Solve (10) on the working set.
+
+        Returns
+        -------
+        str
+            Who found it.
+
+        Raises
+        ------
+        FitError
+            No solver found an answer.
+        """
+        answer, solver = self._solve(
+            "quadratic",
+            lambda factor, ridge: self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge),
+            *self.containment(self.pool),
+            self.lower,
+            self.upper,
+            any_solver=True,
+        )
+        self.store(answer)
+        return solver
+
+    def solve_regularised(self) -> str:
+        """Solve (11) with a little of the squared widths on the working set.
+
+        Returns
+        -------
+        str
+            Who found it.
+
+        Raises
+        ------
+        FitError
+            No solver found an answer.
+        """
+        size = self.r + self.q
+
+        def objective(factor: float, ridge: float) -> tuple[Array, Array]:
+            H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
+            whole = REGULARISATION * np.eye(size + 1)
+            whole[:size, :size] = REGULARISATION * H
+            return whole, np.append(REGULARISATION * f, 1.0)
+
+        answer, solver = self._solve(
+            "regularised",
+            objective,
+            *self._rows(self.pool),
+            np.append(self.lower, 0.0),
+            np.append(self.upper, np.inf),
+        )
+        self.store(answer[:-1])
+        self.limit = max(float(answer[-1]), 0.0)
+        self._active["bounded"] = np.delete(self._active["regularised"], size)  # all but δ
+        return solver
+
+    def solve_linear(self) -> str:
+        """Solve (11) on the working set, by the simplex method.
+
+        Returns
+        -------
+        str
+            Who found it.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
+        if self._simplex is None:
+            self._simplex = self._minimax()
+        index = self.samples.index[self.pool]
+        fresh = self.pool[~np.isin(index, self._known)]
+        if len(fresh):
+            self._simplex.add(*self._rows(fresh))
+            self._known = index
+        answer = self._simplex.solve()
+        self.store(answer[:-1])
+        self.limit = max(float(answer[-1]), 0.0)
+        return "HiGHS simplex"
+
+    def least_width(self) -> float:
+        """A lower bound of δ, in units of scale: the optimum of (11) on the samples that decide it, then on more.
+
+        Returns
+        -------
+        float
+            In units of scale.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
+        assert self.limit is not None
+        inside, room = self.slacks()
+        assert room is not None
+        few = 2 * (self.r + self.q)
+        inside, room = inside[self.pool], room[self.pool]
+        least = np.argpartition(room, few)[:few] if len(room) > few else np.arange(len(room))
+        decisive = np.union1d(np.flatnonzero(inside < 1e-7), least)
+        bound = 0.0
+        for pool in (self.pool[decisive], self.pool):
+            simplex = self._minimax()
+            simplex.add(*self._rows(pool))
+            bound = max(bound, float(simplex.solve()[-1]))
+            if self.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+                break
+        return bound
+
+    def _minimax(self) -> Simplex:
+        """Minimise δ, the last unknown."""
+        cost = np.append(np.zeros(self.r + self.q), 1.0)
+        simplex = Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
+        simplex.add(*self._asked(np.empty((0, len(cost))), np.empty(0)))
+        return simplex
+
+    def duality_gap(self) -> float:
+        """How far the squared widths of this row are above the optimum at most, relative to it, by the dual objective.
+
+        The programme that is solved has the tie-break and the ridge beside the squared widths; both are bounded. inf
+        where the columns are so collinear that the ridge is not.
+
+        Returns
+        -------
+        float
+            Relative.
+        """
+        theta, d = self.scaled()
+        factor, ridge = self.attempt
+        if self.basis is not None:
+            theta = np.linalg.lstsq(self.basis, theta, rcond=None)[0].astype(np.float64)
+        H, f = self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge)
+        xi = np.concatenate([theta, d])
+        bound = dual_bound(H, f, *self._asked(*self.containment(self.pool)), self.lower, self.upper, xi)
+        value = max(self.value(d), self.least_value())
+        weight = factor * TIE_BREAK * float(np.diagonal(self.gram).min(initial=1.0))
+        spread = max(float(d @ self.plain @ d), 0.0)
+        smallest = float(np.linalg.eigvalsh(self.centre)[0]) if self.r else 1.0
+        largest = (self.rms_step / self.scale + np.sqrt(spread) + float(np.abs(self.half).max(initial=0.0))) ** 2
+        lifted = 0.5 * weight * ridge * 4.0 * largest / smallest if smallest > 1e-13 else np.inf
+        ties = factor * TIE_BREAK * (1.0 if self.sums.gram is None else float(len(d)))
+        return float(max(0.5 * xi @ H @ xi + f @ xi - bound, 0.0) + lifted) / value + ties
+
+    def among(self, coupled: Array, widths: list[Array]) -> None:
+        """Take the row's part of (10) with full weights, given the other rows, as its own.
+
+        Parameters
+        ----------
+        coupled : array (n q, n q)
+            Of `Moments`.
+        widths : list of array (q,)
+            Half-widths of all rows.
+        """
+        q = len(self.d)
+        mine = slice(self.i * q, (self.i + 1) * q)
+        unit = self.unit_psi * self.scale
+        fixed = np.concatenate(widths)
+        fixed[mine] = self.fixed_d
+        gram = coupled[mine, mine][np.ix_(self.free_psi, self.free_psi)] * np.outer(unit, unit)
+        self.largest = float(np.diagonal(gram).max(initial=0.0)) or 1.0
+        self.gram = gram / self.largest
+        self.linear = (coupled[mine] @ fixed)[self.free_psi] * unit / self.largest
+
+    def solve_among(self) -> str:
+        """(10) with full weights, of this row given the others.
+
+        If another row is wider by many orders of magnitude, what it weighs here is as many times steeper than the
+        row's own part. Either this row follows it, and is solved in its units, or the row is as narrow as can be.
+
+        Returns
+        -------
+        str
+            The solver.
+
+        Raises
+        ------
+        FitError
+            No solver found an answer.
+        """
+        try:
+            return self.solve_quadratic()
+        except FitError:
+            steep = float(np.abs(self.linear).max(initial=0.0))
+            if steep <= 1.0:
+                raise
+        G, h = self._asked(*self.containment(self.pool))
+        if -self.linear.min() >= self.linear.max():
+            H, f = self.hessian(self.gram, self.linear, TIE_BREAK)
+            answer = solve_qp(H, f / steep, G, h / steep, self.lower / steep, self.upper / steep)
+            self.store(answer.xi * steep)
+            return answer.solver
+        simplex = Simplex(np.concatenate([np.zeros(self.r), self.linear / steep]), self.lower, self.upper)
+        simplex.add(G, h)
+        self.store(simplex.solve())
+        return "HiGHS simplex"
+
+    def value(self, d: Array) -> float:
+        """Return half the mean of the squared half-widths of all samples, in scaled units.
+
+        Parameters
+        ----------
+        d : array (q,)
+            Scaled half-widths.
+
+        Returns
+        -------
+        float
+            The row's part of (10) but for a factor.
+        """
+        return max(float(0.5 * d @ self.gram @ d + self.linear @ d) + self.known, 0.0)
+
+    def least_value(self) -> float:
+        """Return the `value` of an envelope so narrow that it is rounding.
+
+        Returns
+        -------
+        float
+            In the same units.
+        """
+        return 0.125 * (LEAST * self.rms_step / self.scale) ** 2
+
+    def collinear(self) -> bool:
+        """Tell whether columns are so alike that the simplex method's tolerance is none on the envelope.
+
+        Returns
+        -------
+        bool
+            Never in refined coordinates.
+        """
+        return self.r > 0 and not self.refined and float(np.linalg.eigvalsh(self.centre)[0]) < 1e-8
+
+    @property
+    def rms_step(self) -> float:
+        """Root mean square of x_next - x."""
+        return float(self.sums.rate_scale[self.i])
+
+    def outside(self) -> float:
+        """Return the largest violation of the samples held.
+
+        Returns
+        -------
+        float
+            In scaled units; 0 if none is violated.
+        """
+        return max(0.0, -float(self.slack().min(initial=0.0)))
+
+    def answer(self) -> tuple[Array, Array, float]:
+        """Return what the row is now.
+
+        Returns
+        -------
+        array (r,), array (q,), float
+            Nominal elements, half-widths, and their largest violation in units of the size of a sample.
+        """
+        return self.theta.copy(), self.d.copy(), self.outside() * self.scale
+
+    def keep(self, answer: tuple[Array, Array, float]) -> None:
+        """Return to an answer of before.
+
+        Parameters
+        ----------
+        answer : (array, array, float)
+            What `answer` returned.
+        """
+        self.theta, self.d, self.kept = answer
+
+    def least_linear(self, cost: Array) -> float:
+        """Minimise costᵀ d over scaled half-widths that contain the working set.
+
+        Parameters
+        ----------
+        cost : array (q,)
+            Of the free half-widths.
+
+        Returns
+        -------
+        float
+            The minimum.
+
+        Raises
+        ------
+        FitError
+            The simplex method found none.
+        """
+        simplex = Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, self.upper)
+        simplex.add(*self._asked(*self.containment(self.pool)))
+        return float(cost @ simplex.solve()[self.r :])
+
+    def linear_gap(self) -> float:
+        """As `duality_gap`, by the simplex method.
+
+        (10) is convex, so its optimum is no less than what its linearisation here says of any elements that contain
+        the working set. It needs neither multipliers nor a Hessian that can be inverted.
+
+        Returns
+        -------
+        float
+            Relative; inf if the simplex method found no bound.
+        """
+        _, d = self.scaled()
+        slope = self.gram @ d + self.linear
+        largest = float(np.abs(slope).max(initial=0.0))
+        if largest == 0.0:
+            return 0.0
+        try:
+            least = self.least_linear(slope / largest) * largest
+        except FitError:
+            return np.inf
+        return max(float(slope @ d) - least, 0.0) / max(self.value(d), self.least_value())
+
+    def lifted_loss(self) -> float:
+        """Estimate what lifting the half-widths over the violation that is left adds to the optimum.
+
+        Returns
+        -------
+        float
+            Relative.
+        """
+        _, d = self.scaled()
+        outside = self.outside()
+        if outside <= 0.0:
+            return 0.0
+        if self.limit is None:
+            slope = float((self.gram @ d + self.linear).sum())
+            return outside * slope / max(self.value(d), self.least_value())
+        least = LEAST * self.rms_step / self.limit_unit * float(self.samples.root_weight.max(initial=0.0))
+        return outside * float(self.width.max(initial=0.0)) / max(self.limit, least, 1e-300)
+
+    def _rows(self, pool: Index) -> tuple[Array, Array]:
+        """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
+        G, h = self.containment(pool)
+        width = self.width[pool]
+        unit = np.minimum(1.0, 1.0 / width)[:, None]  # δ - width x (ψ d + half) >= 0, scaled to order one
+        rows = np.hstack([np.zeros((len(pool), self.r)), -width[:, None] * self.psi[pool], np.ones((len(pool), 1))])
+        return (
+            np.vstack([np.hstack([G, np.zeros((len(G), 1))]), rows * unit]),
+            np.concatenate([h, width * self.half[pool] * unit[:, 0]]),
+        )
+
+    def solve_bounded(self) -> str:
+        """Least squared widths, then the centre, among the optima of (11).
+
+        Returns
+        -------
+        str
+            Who found it.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
+        assert self.limit is not None
+        G, h = self.containment(self.pool)
+        width, limit = self.width[self.pool], self.limit
+        if limit > 0:
+            width, limit = width / limit, 1.0
+        G = np.vstack([G, np.hstack([np.zeros((len(width), self.r)), -width[:, None] * self.psi[self.pool]])])
+        h = np.concatenate([h, width * self.half[self.pool] - limit])
+        try:
+            answer, solver = self._solve(
+                "bounded",
+                lambda factor, ridge: self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge),
+                G,
+                h,
+                self.lower,
+                self.upper,
+                any_solver=self.exact,
+            )
+            self.store(answer)
+            return solver
+        except FitError:  # rounding has closed the room of WIDTH_SLACK: as near to the ties as it goes
+            before = self.limit
+            try:
+                solver = self.solve_linear() if self.exact else self.solve_regularised()
+            except FitError:
+                self.exact = True
+                solver = self.solve_linear()
+            self.limit = max(before, self.limit * (1.0 + WIDTH_SLACK))
+            return solver
+
+    def polish(self) -> None:
+        """Solve for the centre again, with the half-widths as they are: the tie-break on its own.
+
+        Beside the squared widths it weighs so little that their rounding shows in the elements.
+        """
+        if self.r == 0:
+            return
+        phi, psi = self.phi[self.pool], self.psi[self.pool]
+        half = psi @ (self.d[self.free_psi] / (self.unit_psi * self.scale)) + self.half[self.pool]
+        y = self.y[self.pool]
+        try:
+            answer = solve_qp(
+                self.centre + self.attempt[1] * np.eye(self.r),
+                -self.target,
+                *self._asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half])),
+                self.lower[: self.r],
+                self.upper[: self.r],
+                any_solver=False,
+                feasible=FEASIBLE if self.refined else ROUGH,
+            )
+        except FitError:  # the half-widths leave no room at all
+            return
+        self._store_theta(answer.xi)
+
+    def contradiction(self) -> tuple[int, float, int] | None:
+        """A sample that no elements within the structure can contain, alone or with others.
+
+        Returns
+        -------
+        (int, float, int) or None
+            Index of the sample, its distance from the bounds at best, normalised, and how many others it contradicts:
+            0 if it could not be contained alone either. None where there is none.
+
+        Raises
+        ------
+        FitError
+            There is no optimum.
+        """
+
+        def least(pool: Index) -> tuple[Array, Array, Array]:
+            simplex = self._minimax()
+            G, h = self.containment(pool)
+            simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
+            answer = simplex.solve()
+            prices = np.abs(simplex.duals()[len(self.asked) :]).reshape(2, -1).sum(axis=0)
+            return answer, (h - G @ answer[:-1]).reshape(2, -1).max(axis=0), prices
+
+        answer, short, prices = least(self.pool)
+        if answer[-1] <= 1e-9:
+            return None
+        against = np.flatnonzero(prices > 1e-9 * prices.max(initial=0.0))  # they prove that there is no answer
+        worst = int(against[np.argmax(short[against])]) if len(against) else int(np.argmax(short))
+        distance, together = float(answer[-1]), len(against) - 1
+        for position in against[np.argsort(-short[against])]:
+            alone = float(least(self.pool[[position]])[0][-1])
+            if alone > 1e-9:
+                worst, distance, together = int(position), alone, 0
+                break
+        sample = int(self.pool[worst])
+        return int(self.samples.index[sample]), distance * float(self._sizes(sample)) * self.scale, max(together, 0)
