@@ -317,9 +317,11 @@ def status(domain: int) -> dict[str, Any]:
 class Run:
     """One subject, one rate, one size: the processes, and what was measured of them."""
 
-    def __init__(self, n: int, rate: float, seconds: float, left: float = 0.0, before: str = "") -> None:
+    def __init__(
+        self, n: int, rate: float, seconds: float, left: float = 0.0, before: str = "", domain: int = 0
+    ) -> None:
         self.n, self.rate, self.seconds, self.left, self.before = n, rate, seconds, left, before
-        self.domain = random.randint(1, 100)
+        self.domain = domain or random.randint(1, 100)
         self.env = os.environ | {
             "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         }  # fmt: skip
@@ -489,9 +491,9 @@ def compare_versions(before: str, rates: list[float], sizes: list[int], seconds:
     print(table(["n", "Hz", "", "before, µs/sample", "now", "ratio", "turns"], rows))
 
 
-def soak(seconds: float, rate: float, n: int) -> dict[str, Any]:
+def soak(seconds: float, rate: float, n: int, domain: int) -> dict[str, Any]:
     """Growth of memory after warm-up, MiB, and whether every counter accounts for every sample; prints both."""
-    run = Run(n, rate, seconds)
+    run = Run(n, rate, seconds, domain=domain)
     try:
         with tempfile.TemporaryDirectory() as folder:
             subject = run.monitor(folder)
@@ -550,6 +552,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[5, 50], choices=list(CONTROLS))
     parser.add_argument("--left", type=float, default=0.0, metavar="SHARE", help="of samples out of bounds")
     parser.add_argument("--soak", type=float, metavar="S", help="instead, run the monitor for S seconds at 1 kHz")
+    parser.add_argument("--domain", type=int, default=0, metavar="N", help="ROS domain of --soak; 0: any")
     parser.add_argument("--soak-rate", type=float, default=1000.0, metavar="HZ")
     parser.add_argument("--before", metavar="FOLDER", help="instead, beside the monitor of another checkout")
     parser.add_argument("--part", nargs="+", help=argparse.SUPPRESS)
@@ -565,7 +568,7 @@ def main() -> None:
         else:
             {"take": take, "delay": bare_delay}[kind](rest[0])
     elif args.soak:
-        found = soak(args.soak, args.soak_rate, args.sizes[0])
+        found = soak(args.soak, args.soak_rate, args.sizes[0], args.domain)
         if not (found["exact"] and found["growth"] < 1.0):
             raise SystemExit(1)
     elif args.before:

@@ -19,7 +19,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 T = TypeVar("T")
 
-_LOOKED_AT = 200_000
+_LOOKED_AT = 50_000
 """Transitions that the domain is made from, about; of more, every second, third, ... counts."""
 _WORTH_A_THREAD = 100_000
 """Transitions per part from which on a thread of its own pays."""
