@@ -74,6 +74,7 @@ extras = {
     # colcon test looks for pytest here; setuptools lets the tests read this file; cyclonedds hears the node from
     # another vendor's DDS.
     "test": [
+        "Cython>=3",
         "cyclonedds; platform_machine == 'x86_64'",
         "hypothesis",
         "packaging",

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import re
+import runpy
 import subprocess
 import sys
 import textwrap
@@ -18,6 +19,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 import uncertain_lti
+from uncertain_lti.base import compiled
 
 ROOT = Path(__file__).resolve().parent.parent
 LIVE = [
@@ -220,3 +222,34 @@ def test_pinned_versions_run_on_the_python_of_debian_12_and_ubuntu_24_04():
             for python in ("3.11.2", "3.12.3"):
                 assert SpecifierSet(wanted).contains(python), f"{name} {version} wants Python {wanted}"
     assert looked > 20
+
+
+def extensions(monkeypatch: pytest.MonkeyPatch) -> list:
+    """What setup.py asks to be compiled."""
+    given: dict = {}
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("setuptools.setup", lambda **arguments: given.update(arguments))
+    runpy.run_path(str(ROOT / "setup.py"), run_name="__main__")
+    return given["ext_modules"]
+
+
+def test_an_installation_goes_on_without_cython_or_a_compiler_that_works(monkeypatch, capsys):
+    """Then Python runs the same files; an extension that cannot be built is left out as well."""
+    build = pytest.importorskip("Cython.Build", reason="Cython is not installed")
+    found = extensions(monkeypatch)
+    assert sorted(extension.name for extension in found) == sorted(
+        "uncertain_lti." + name.replace(".", "._") for name in compiled.MODULES
+    )
+    assert all(extension.optional for extension in found), "cythonize drops it"
+    assert all("-ffp-contract=off" in extension.extra_compile_args for extension in found)
+
+    def fails(*_: object, **__: object) -> None:
+        raise RuntimeError("CompileError")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(build, "cythonize", fails)
+        assert extensions(patch) == []
+        assert "not compiled" in capsys.readouterr().err
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "Cython", None)
+        assert extensions(patch) == []
