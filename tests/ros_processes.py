@@ -278,11 +278,21 @@ class Diagnostics:
                     return status
         return None
 
+    @property
+    def count(self) -> int:
+        """Messages so far: what is caused after this, and is over again soon, may come before it is asked for."""
+        return len(self.topic.messages)
+
     def reaches(
-        self, level: int, name: str = "envelope_monitor: monitor", saying: str = "", patience: float = 10
+        self,
+        level: int,
+        name: str = "envelope_monitor: monitor",
+        saying: str = "",
+        patience: float = 60,
+        since: int | None = None,
     ) -> Any:
-        """A status of this level and message that comes from now on."""
-        before = len(self.topic.messages)
+        """A status of this level and message that comes from now on, or since so many messages had come (`count`)."""
+        before = self.count if since is None else since
 
         def found() -> Any:
             for array in self.topic.messages[before:]:

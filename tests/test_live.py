@@ -408,14 +408,15 @@ def test_a_sample_outside_the_fitted_domain_is_marked_and_still_judged(world: Wo
 def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp_path: Path) -> None:
     domain = Domain(np.full(2, -1.0), np.full(2, 1.0), np.full(2, -0.5), np.full(2, 0.5))
     model = by_hand(domain=domain, alarm_rule=AlarmRule(3, 5))
-    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=0.6, hardware_id="rig 1")
+    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=3.0, hardware_id="rig 1")
     diagnostics = world.diagnostics()
     status = diagnostics.reaches(STALE, saying="nothing ever received on")
     assert STATE in status.message and CONTROL in status.message and status.hardware_id == "rig 1"
     plant = Plant(world, model).subscribed()
 
+    count = diagnostics.count
     plant.send(30)
-    status = diagnostics.reaches(OK)
+    status = diagnostics.reaches(OK, since=count)
     state = diagnostics.latest("envelope_monitor: b")
     assert state.level == bytes([OK])
     values = Diagnostics.values(state)
@@ -425,17 +426,20 @@ def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp
     assert float(values[f"age {CONTROL}"]) < 5 and values[f"publishers {STATE}"] == "1"
 
     plant.u = np.full(2, 0.7)
+    count = diagnostics.count
     plant.send(20)
-    diagnostics.reaches(WARN, saying="outside the fitted domain")
+    diagnostics.reaches(WARN, saying="outside the fitted domain", since=count)
     plant.u = np.full(2, 0.2)
+    count = diagnostics.count
     plant.send(20, off=2.0)
-    diagnostics.reaches(ERROR, saying="alarm: at least 3 of 5")
+    diagnostics.reaches(ERROR, saying="alarm: at least 3 of 5", since=count)
     assert diagnostics.latest("envelope_monitor: a").level == bytes([ERROR])
     plant.t_ns += 10 * STEP_NS
     plant.send(5)
     plant.t_ns -= STEP_NS
+    count = diagnostics.count
     plant.send(1)
-    diagnostics.reaches(STALE, saying=f"no message on {STATE} for")
+    diagnostics.reaches(STALE, saying=f"no message on {STATE} for", since=count)
     assert diagnostics.latest("envelope_monitor: a").level == bytes([STALE])
     values = Diagnostics.values(diagnostics.latest("envelope_monitor: monitor"))
     assert (values["gaps"], values["dropped"], values["alarms"]) == ("1", "1", "1")
