@@ -6,11 +6,13 @@ import argparse
 import io
 import os
 import re
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from uncertain_lti import __version__
 from uncertain_lti.base.english import printable
@@ -65,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):  # a name that the terminal has no letters for ends nothing
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    sys.unraisablehook = _keep_interrupt
     try:
         try:
             return _run(command, given)
@@ -79,6 +82,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(
             command, f"the output cannot be written ({error.strerror or error}); make room, or send it elsewhere"
         )
+
+
+def _keep_interrupt(unraisable: Any) -> None:
+    """A Ctrl-C that comes in a callback, where Python passes over it, comes again a moment later."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _run(command: str, given: Sequence[str]) -> int:
