@@ -18,7 +18,8 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.validation.calibration import calibrate, detection
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
-from uncertain_lti.validation.left_out import Part, _rest, cut, judge, leave_out_with_fit, validate, validate_model
+from uncertain_lti.validation.left_out import _rest, cut, leave_out_with_fit, validate, validate_model
+from uncertain_lti.validation.part import Part, judge
 
 # --- intervals ---
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
@@ -21,7 +21,6 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.intervals import (
@@ -31,6 +30,7 @@ from uncertain_lti.validation.intervals import (
     scenario_interval,
     share_interval,
 )
+from uncertain_lti.validation.part import Part, by_unit, judge, rising, unit_numbers
 
 BLOCKS = 10
 """Parts that a single recording is cut into, unless told otherwise."""
@@ -42,175 +42,6 @@ LIMIT = 1e9
 """Elements of all left-out problems together up to which a fit leaves out as well: some minutes."""
 REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
 """Alarm rules whose false alarms are counted beside the model's own."""
-
-
-@dataclass(frozen=True, repr=False)
-class Part:
-    """A recording, or a block of one, judged by the model that was fitted without it.
-
-    Parameters
-    ----------
-    name : str
-        What was left out.
-    dt : array (K,)
-        Step of each judged transition, s.
-    utilisation : array (K, n)
-        (x_next - centre) / half of every judged transition.
-    narrowness : array (K, n)
-        Mean half-width over half-width.
-    starts : tuple of int
-        Positions at which the alarm starts anew: 0, and after every step back in time.
-    violations : array (n,) of int
-        Violated verdicts of each state at margin 1.
-    violated : int
-        Verdicts violated on any state at margin 1.
-    outside_domain : int
-        Verdicts from outside the domain fitted without this part.
-    unseen : int
-        Violated verdicts from inside that domain.
-    mean_width : array (n,)
-        Of the left-out model's bounds on this part, recorded units.
-    max_width : array (n,)
-        The largest such width.
-    relative_width : array (n,)
-        The mean over that of the full model on the same samples.
-    group : str
-        What was left out together with it; "" if it was left out alone.
-    """
-
-    name: str
-    dt: Array
-    utilisation: Array
-    narrowness: Array
-    starts: tuple[int, ...]
-    violations: NDArray[np.intp]
-    violated: int
-    outside_domain: int
-    unseen: int
-    mean_width: Array
-    max_width: Array
-    relative_width: Array
-    group: str = ""
-
-    def __repr__(self) -> str:
-        return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
-
-    @property
-    def judged(self) -> int:
-        """Number of verdicts."""
-        return len(self.dt)
-
-    @property
-    def hours(self) -> float:
-        """Time under verdict, h."""
-        return float(self.dt.sum()) / 3600.0
-
-    @property
-    def severity(self) -> Array:
-        """(K,): the largest |utilisation| of the states; a verdict is violated where it exceeds the margin."""
-        return np.asarray(np.abs(self.utilisation).max(axis=1))
-
-    def level(self, violations: int, window: int, severity: Array | None = None) -> Array:
-        """The margin below which the alarm is raised: the m-th largest severity of the last n verdicts.
-
-        Parameters
-        ----------
-        violations : int
-            m.
-        window : int
-            n, in verdicts.
-        severity : array (K,), optional
-            Default that of the part.
-
-        Returns
-        -------
-        array (K,)
-            -inf until m verdicts are there.
-        """
-        severity = self.severity if severity is None else severity
-        level = np.empty(len(severity))
-        for start, stop in zip(self.starts, [*self.starts[1:], len(severity)], strict=True):
-            padded = np.concatenate([np.full(window - 1, -np.inf), severity[start:stop]])
-            if stop > start:
-                windows = np.lib.stride_tricks.sliding_window_view(padded, window)
-                level[start:stop] = np.partition(windows, window - violations, axis=1)[:, window - violations]
-        return level
-
-    def alarms(self, rule: AlarmRule) -> int:
-        """How often the alarm is raised (rising edges).
-
-        Parameters
-        ----------
-        rule : AlarmRule
-            The alarm rule, with its margin.
-
-        Returns
-        -------
-        int
-            Rising edges.
-        """
-        return rising(self.level(rule.violations, rule.window) > rule.margin, self.starts)
-
-
-def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
-    """Number of what each part was left out with: its group, or a number of its own.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-
-    Returns
-    -------
-    array (parts,) of int
-        From 0, in order of first appearance.
-    """
-    numbers: dict[str, int] = {}
-    found = [
-        numbers.setdefault(f"group {p.group}" if p.group else f"part {i}", len(numbers)) for i, p in enumerate(parts)
-    ]
-    return np.array(found, dtype=np.intp)
-
-
-def by_unit(parts: Sequence[Part], values: ArrayLike) -> Array:
-    """Sums over what was left out together.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    values : array (..., parts)
-        One value per part.
-
-    Returns
-    -------
-    array (..., units)
-        Sums over each group, or the values themselves if every part was left out alone.
-    """
-    values = np.asarray(values, dtype=np.float64)
-    numbers = unit_numbers(parts)
-    member = numbers[:, None] == np.arange(int(numbers.max(initial=-1)) + 1)
-    return np.asarray(values @ member)
-
-
-def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:
-    """Rising edges of an alarm that starts anew, lowered, at each of `starts`.
-
-    Parameters
-    ----------
-    raised : array (K,) of bool
-        Whether the alarm is raised.
-    starts : sequence of int
-        Positions at which it starts lowered.
-
-    Returns
-    -------
-    int
-        Rising edges.
-    """
-    before = np.concatenate([[False], raised[:-1]])
-    before[[s for s in starts if s < len(raised)]] = False
-    return int(np.count_nonzero(raised & ~before))
 
 
 @dataclass(frozen=True, repr=False)
@@ -408,60 +239,6 @@ def validate(
     kind = "transients" if blocks is None else "blocks"
     hint = "" if grouping or blocks is not None else likely_groups(transients)
     return Validation(full, tuple(parts[i] for i in sorted(parts)), kind, float(gap), confidence, grouping, hint)
-
-
-def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str, group: str = "") -> Part:
-    """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted without the transient.
-    full : UncertainLTI
-        Gives the widths that the left-out ones are compared with.
-    transient : Transient
-        What was left out.
-    name : str
-        What it is called.
-    group : str, default ""
-        What was left out together with it.
-
-    Returns
-    -------
-    Part
-        The verdicts.
-    """
-    verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
-    judged = verdicts.judged
-    steps = transient.transitions()
-    steps = steps.take(judged[steps.k + 1])
-    width = (verdicts.upper - verdicts.lower)[judged]
-    point = full.operating_point
-    low, high = full.bounds(point.normalise_x(steps.x), point.normalise_u(steps.u), steps.dt)
-    whole = (high - low) * point.X
-    flags = verdicts.flags[judged] == 1.0
-    resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
-    starts = sorted({0, *(int(np.count_nonzero(judged[:r])) for r in resets)})
-    n = model.n
-    empty = not len(width)
-    utilisation = verdicts.utilisation[judged]
-    # what lies on the edge is judged by the flags: there rounding decides
-    size = np.where(flags, np.maximum(np.abs(utilisation), np.nextafter(1.0, 2.0)), np.minimum(np.abs(utilisation), 1))
-    return Part(
-        name,
-        steps.dt,
-        np.copysign(size, utilisation),
-        np.ones(width.shape) if empty else width.mean(axis=0) / np.maximum(width, 1e-300),
-        tuple(starts),
-        flags.sum(axis=0),
-        int(flags.any(axis=1).sum()),
-        int(verdicts.outside_domain.sum()),
-        int((flags.any(axis=1) & ~verdicts.outside_domain[judged]).sum()),
-        np.full(n, np.nan) if empty else width.mean(axis=0),
-        np.full(n, np.nan) if empty else width.max(axis=0),
-        np.full(n, np.nan) if empty else width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
-        group,
-    )
 
 
 def cut(transient: Transient, start: int, stop: int) -> Transient:
