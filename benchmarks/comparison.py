@@ -30,7 +30,7 @@ from tanks import Tanks  # noqa: E402
 
 from uncertain_lti import OperatingPoint, Transient, fit, read_transients  # noqa: E402
 from uncertain_lti.base.errors import FitError  # noqa: E402
-from uncertain_lti.validation.left_out import cut  # noqa: E402
+from uncertain_lti.validation.blocks import cut  # noqa: E402
 
 Array = np.ndarray
 MARK = "<!-- comparison -->"

@@ -20,7 +20,7 @@ from measure import table
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.sampling.reading import read_as_fitted
-from uncertain_lti.validation.left_out import cut
+from uncertain_lti.validation.blocks import cut
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -16,9 +16,10 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.validation.blocks import cut, remaining_spans
 from uncertain_lti.validation.calibration import calibrate, detection
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
-from uncertain_lti.validation.left_out import _rest, cut, leave_out_with_fit, validate, validate_model
+from uncertain_lti.validation.left_out import leave_out_with_fit, validate, validate_model
 from uncertain_lti.validation.part import Part, judge
 
 # --- intervals ---
@@ -188,7 +189,7 @@ def test_blocks_keep_their_distance():
     assert validation.kind == "blocks" and len(validation.parts) == 8 and validation.gap == 2.0
     assert sum(p.judged for p in validation.parts) == 2000
     for start, stop in ((0, 251), (750, 1001), (1750, 2001)):
-        pieces = _rest(run, start, stop, 2.0)
+        pieces = remaining_spans(run, start, stop, 2.0)
         kept = np.concatenate([np.arange(a, b) for a, b in pieces])
         assert len(set(kept) & set(range(start, stop))) == 0
         distance = np.minimum(np.abs(run.t[kept] - run.t[start]), np.abs(run.t[kept] - run.t[stop - 1]))
@@ -200,7 +201,7 @@ def test_blocks_keep_their_distance():
 def test_a_block_is_judged_by_a_model_that_has_not_seen_it():
     (run,) = Tanks().transients(1, seed=6, steps=1000, noise=1e-3)
     validation = validate(run, additive="noise", blocks=4, gap=1.0)
-    model = fit([cut(run, a, b) for a, b in _rest(run, 250, 501, 1.0)], additive="noise")
+    model = fit([cut(run, a, b) for a, b in remaining_spans(run, 250, 501, 1.0)], additive="noise")
     expected = EnvelopeMonitor(model).check(cut(run, 250, 501))
     assert validation.parts[1].violated == expected.violated.sum()
     assert validation.parts[1].mean_width == pytest.approx(np.nanmean(expected.upper - expected.lower, axis=0))
@@ -218,7 +219,7 @@ def test_weights_go_with_their_samples():
     (whole,) = Tanks().transients(1, seed=8, noise=1e-3, steps=400)
     w = rng.uniform(0.1, 10, (400, 3))
     blocks = validate(whole, weights=[w], additive="noise", blocks=4, gap=0.0)
-    a, b = _rest(whole, 100, 201, 0.0)
+    a, b = remaining_spans(whole, 100, 201, 0.0)
     model = fit([cut(whole, *a), cut(whole, *b)], weights=[w[a[0] : a[1] - 1], w[b[0] : b[1] - 1]], additive="noise")
     assert blocks.parts[1].mean_width == pytest.approx(judge(model, model, cut(whole, 100, 201), "").mean_width)
 

@@ -22,6 +22,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.validation.blocks import BLOCKS, block_spans, cut, guard_interval, remaining_spans
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.intervals import (
     cluster_size,
@@ -32,8 +33,6 @@ from uncertain_lti.validation.intervals import (
 )
 from uncertain_lti.validation.part import Part, by_unit, judge, rising, unit_numbers
 
-BLOCKS = 10
-"""Parts that a single recording is cut into, unless told otherwise."""
 VOID = 0.9
 """A bound on the probability of leaving the envelope that is above this says nothing."""
 NEARBY = 0.75
@@ -205,8 +204,8 @@ def validate(
     else:
         if gap is not None and not (math.isfinite(gap) and gap >= 0):
             raise FitError(f"gap is {gap}; it must be 0 s or more")
-        cuts = [(t, *span) for t in transients for span in _blocks(t, blocks)]
-        gap = _gap(full, cuts) if gap is None else gap
+        cuts = [(t, *span) for t in transients for span in block_spans(t, blocks)]
+        gap = guard_interval(full, cuts) if gap is None else gap
     parts: dict[int, Part] = {}
     own = _split_weights(weights, transients, full.n)
     units: dict[Any, list[int]] = {}
@@ -223,7 +222,7 @@ def validate(
         for transient, weight in zip(transients, own, strict=True):
             whole = (0, len(transient))
             gone = absent.get(id(transient))
-            for a, b in [whole] if gone is None else _rest(transient, *gone, gap):
+            for a, b in [whole] if gone is None else remaining_spans(transient, *gone, gap):
                 if b - a >= 2:
                     pieces.append(transient if (a, b) == whole else cut(transient, a, b))
                     kept.append(None if weight is None else weight[a : b - 1])
@@ -239,67 +238,6 @@ def validate(
     kind = "transients" if blocks is None else "blocks"
     hint = "" if grouping or blocks is not None else likely_groups(transients)
     return Validation(full, tuple(parts[i] for i in sorted(parts)), kind, float(gap), confidence, grouping, hint)
-
-
-def cut(transient: Transient, start: int, stop: int) -> Transient:
-    """Samples start..stop-1 as a transient of their own.
-
-    Parameters
-    ----------
-    transient : Transient
-        The whole.
-    start : int
-        First sample.
-    stop : int
-        First sample after it.
-
-    Returns
-    -------
-    Transient
-        Without counters and notes.
-    """
-    part = slice(start, stop)
-    return Transient(
-        transient.t_ns[part],
-        transient.x[part],
-        transient.u[part],
-        name=transient.name,
-        signals=transient.signals,
-        state_names=transient.state_names,
-        control_names=transient.control_names,
-        max_gap=transient.max_gap,
-        min_step=transient.min_step,
-        sources=transient.sources,
-    )
-
-
-def _blocks(transient: Transient, blocks: int) -> list[tuple[int, int]]:
-    """[start, stop) of contiguous blocks with equal numbers of usable transitions; neighbours share one sample."""
-    usable = np.flatnonzero(transient.usable)
-    if len(usable) < 2 * blocks:
-        raise FitError(
-            f"{transient.name}: {plural(len(usable), 'usable transition')} "
-            f"{'is' if len(usable) == 1 else 'are'} too few for {plural(blocks, 'block')}; use fewer blocks"
-        )
-    edges = [int(part[0]) for part in np.array_split(usable, blocks)] + [int(usable[-1]) + 1]
-    return [(a, b + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-
-
-def _gap(model: UncertainLTI, cuts: Sequence[tuple[Transient, int, int]]) -> float:
-    """Three of the slowest stable time constants, at most half of the shortest block, s."""
-    stable = [-v.real for v in model.eigenvalues() if v.real < 0]
-    shortest = min(float(t.t[stop - 1] - t.t[start]) for t, start, stop in cuts)
-    return min(3.0 / min(stable) if stable else math.inf, 0.5 * shortest)
-
-
-def _rest(transient: Transient, start: int, stop: int, gap: float) -> list[tuple[int, int]]:
-    """What is left of a transient without samples start..stop-1 and `gap` s on both sides, as [start, stop)."""
-    if (start, stop) == (0, len(transient)):
-        return []
-    t = transient.t
-    before = int(np.count_nonzero(t[: start + 1] <= t[start] - gap))
-    after = stop - 1 + int(np.count_nonzero(t[stop - 1 :] < t[stop - 1] + gap))
-    return [(0, min(before, start + 1)), (min(after, len(t)), len(t))]
 
 
 def _split_weights(

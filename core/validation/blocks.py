@@ -1,0 +1,125 @@
+"""Blocks of a recording, each left out with a guard interval on both sides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.transient import Transient
+
+BLOCKS = 10
+"""Parts that a single recording is cut into, unless told otherwise."""
+
+
+def cut(transient: Transient, start: int, stop: int) -> Transient:
+    """Samples start..stop-1 as a transient of their own.
+
+    Parameters
+    ----------
+    transient : Transient
+        The whole.
+    start : int
+        First sample.
+    stop : int
+        First sample after it.
+
+    Returns
+    -------
+    Transient
+        Without counters and notes.
+    """
+    part = slice(start, stop)
+    return Transient(
+        transient.t_ns[part],
+        transient.x[part],
+        transient.u[part],
+        name=transient.name,
+        signals=transient.signals,
+        state_names=transient.state_names,
+        control_names=transient.control_names,
+        max_gap=transient.max_gap,
+        min_step=transient.min_step,
+        sources=transient.sources,
+    )
+
+
+def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
+    """Contiguous blocks with equal numbers of usable transitions; neighbours share one sample.
+
+    Parameters
+    ----------
+    transient : Transient
+        The whole recording.
+    blocks : int
+        How many.
+
+    Returns
+    -------
+    list of (int, int)
+        First sample, and first sample after it, of each block.
+
+    Raises
+    ------
+    FitError
+        There are fewer than two usable transitions per block.
+    """
+    usable = np.flatnonzero(transient.usable)
+    if len(usable) < 2 * blocks:
+        raise FitError(
+            f"{transient.name}: {plural(len(usable), 'usable transition')} "
+            f"{'is' if len(usable) == 1 else 'are'} too few for {plural(blocks, 'block')}; use fewer blocks"
+        )
+    edges = [int(part[0]) for part in np.array_split(usable, blocks)] + [int(usable[-1]) + 1]
+    return [(a, b + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def guard_interval(model: UncertainLTI, cuts: Sequence[tuple[Transient, int, int]]) -> float:
+    """Three of the slowest stable time constants of the model, at most half of the shortest block.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The fit to all recordings.
+    cuts : sequence of (Transient, int, int)
+        Each block: its recording, first sample, and first sample after it.
+
+    Returns
+    -------
+    float
+        Time on each side of a block that is not fitted, s.
+    """
+    stable = [-v.real for v in model.eigenvalues() if v.real < 0]
+    shortest = min(float(t.t[stop - 1] - t.t[start]) for t, start, stop in cuts)
+    return min(3.0 / min(stable) if stable else math.inf, 0.5 * shortest)
+
+
+def remaining_spans(transient: Transient, start: int, stop: int, gap: float) -> list[tuple[int, int]]:
+    """What is left of a transient without a block and the guard intervals on both sides of it.
+
+    Parameters
+    ----------
+    transient : Transient
+        The whole recording.
+    start : int
+        First sample of the block.
+    stop : int
+        First sample after the block.
+    gap : float
+        Guard interval, s.
+
+    Returns
+    -------
+    list of (int, int)
+        First sample, and first sample after it, of what is left before and after; empty if the block is the whole.
+    """
+    if (start, stop) == (0, len(transient)):
+        return []
+    t = transient.t
+    before = int(np.count_nonzero(t[: start + 1] <= t[start] - gap))
+    after = stop - 1 + int(np.count_nonzero(t[stop - 1 :] < t[stop - 1] + gap))
+    return [(0, min(before, start + 1)), (min(after, len(t)), len(t))]
