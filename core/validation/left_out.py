@@ -23,20 +23,18 @@ from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.blocks import BLOCKS, block_spans, cut, guard_interval, remaining_spans
+from uncertain_lti.validation.false_alarms import false_alarms
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.intervals import (
-    cluster_size,
     discarding_bound,
     rate_interval,
     scenario_interval,
     share_interval,
 )
-from uncertain_lti.validation.part import Part, by_unit, judge, rising, unit_numbers
+from uncertain_lti.validation.part import Part, by_unit, judge, unit_numbers
 
 VOID = 0.9
 """A bound on the probability of leaving the envelope that is above this says nothing."""
-NEARBY = 0.75
-"""Down to this share of the margin, alarms are taken to come in clusters as they do at the margin."""
 LIMIT = 1e9
 """Elements of all left-out problems together up to which a fit leaves out as well: some minutes."""
 REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
@@ -382,104 +380,6 @@ def _whole_interval(validation: Validation) -> list[float]:
         return list(share_interval(len(parts) - sum(left), len(parts), v.confidence))
     low, high = rate_interval(by_unit(parts, left), len(parts), v.confidence)
     return [max(0.0, 1.0 - high), 1.0 - low]
-
-
-def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> dict[str, Any]:
-    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to so many parts.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    rule : AlarmRule
-        The alarm rule.
-    confidence : float
-        Of the interval, two-sided.
-
-    Returns
-    -------
-    dict
-        The rule, counts, `raised_share` of the time, `per_hour` and its `interval`; None without a verdict.
-    """
-    counts = [p.alarms(rule) for p in parts]
-    hours = sum(p.hours for p in parts)
-    raised = sum(float(p.dt[p.level(rule.violations, rule.window) > rule.margin].sum()) for p in parts) / 3600.0
-    low, high = rate_interval(by_unit(parts, counts), hours, confidence, typical_cluster(parts, rule))
-    return {
-        "violations": rule.violations,
-        "window": rule.window,
-        "margin": rule.margin,
-        "alarms": sum(counts),
-        "parts_with_alarm": sum(c > 0 for c in counts),
-        "raised_share": raised / hours if hours else None,
-        "per_hour": sum(counts) / hours if hours else None,
-        "interval": [low, high if math.isfinite(high) else None],
-    }
-
-
-def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
-    """Alarms that come at once, where few or none are counted: those of the same rule at a smaller margin.
-
-    The margin is that at which three parts or groups alarm, but not below NEARBY times the rule's: far below, alarms
-    are of another kind.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    rule : AlarmRule
-        The alarm rule.
-
-    Returns
-    -------
-    float
-        As `cluster_size`.
-    """
-    levels = [p.level(rule.violations, rule.window) for p in parts]
-    margin = borrowed_margin(peaks(parts, levels), rule.margin)
-    counts = [rising(level > margin, p.starts) for p, level in zip(parts, levels, strict=True)]
-    return cluster_size(by_unit(parts, counts))
-
-
-def peaks(parts: Sequence[Part], levels: Sequence[Array]) -> list[float]:
-    """Largest level of each part that was left out alone, and of each group.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    levels : sequence of array (K,)
-        `Part.level` of each.
-
-    Returns
-    -------
-    list of float
-        One per part or group.
-    """
-    found: dict[int, float] = {}
-    for unit, level in zip(unit_numbers(parts).tolist(), levels, strict=True):
-        found[unit] = max(found.get(unit, 0.0), float(level.max(initial=0.0)))
-    return list(found.values())
-
-
-def borrowed_margin(largest: Sequence[float], margin: float) -> float:
-    """The margin at which to see how many alarms come at once.
-
-    Parameters
-    ----------
-    largest : sequence of float
-        Of `peaks`.
-    margin : float
-        The rule's.
-
-    Returns
-    -------
-    float
-        At most the rule's, at least NEARBY times it.
-    """
-    third = sorted(largest, reverse=True)[min(2, len(largest) - 1)]
-    # a little below the third peak: an alarm that only just starts is always alone
-    return min(margin, max(0.95 * third, NEARBY * margin))
 
 
 def scenario(validation: Validation) -> dict[str, Any]:
