@@ -19,22 +19,18 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
-from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.blocks import BLOCKS, block_spans, cut, guard_interval, remaining_spans
 from uncertain_lti.validation.false_alarms import false_alarms
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.intervals import (
-    discarding_bound,
     rate_interval,
-    scenario_interval,
     share_interval,
 )
 from uncertain_lti.validation.part import Part, by_unit, judge, unit_numbers
+from uncertain_lti.validation.scenario import scenario
 
-VOID = 0.9
-"""A bound on the probability of leaving the envelope that is above this says nothing."""
 LIMIT = 1e9
 """Elements of all left-out problems together up to which a fit leaves out as well: some minutes."""
 REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
@@ -320,7 +316,7 @@ def summary(validation: Validation) -> dict[str, Any]:
         "violated_inside_domain": sum(p.unseen for p in parts),
         "states": states,
         "false_alarms": alarms,
-        "scenario": scenario(v),
+        "scenario": scenario(model, parts, v.what, v.confidence),
         "part": [
             {"name": p.name, "verdicts": p.judged, "violated": p.violated, "outside_domain": p.outside_domain}
             for p in parts
@@ -380,74 +376,6 @@ def _whole_interval(validation: Validation) -> list[float]:
         return list(share_interval(len(parts) - sum(left), len(parts), v.confidence))
     low, high = rate_interval(by_unit(parts, left), len(parts), v.confidence)
     return [max(0.0, 1.0 - high), 1.0 - low]
-
-
-def scenario(validation: Validation) -> dict[str, Any]:
-    """The scenario bound on leaving the envelope anywhere in a whole fresh transient or group, or why there is none.
-
-    Parameters
-    ----------
-    validation : Validation
-        Of `validate`.
-
-    Returns
-    -------
-    dict
-        `words`, and where there is a bound its `interval` and what was counted.
-    """
-    v = validation
-    G, what = v.units, v.what
-    discarded = _discarded(v.model)
-    condition = (
-        f"holds if the {what}s were drawn independently of one another from one and the same distribution, and the "
-        f"machine will be run like that again; counted by whole {what}s, margin 1; a guide rather than a theorem, as "
-        f"the theorem asks for an objective that does not depend on the recordings, and the sum of squared widths does"
-    )
-    if v.kind == "blocks":
-        return {"words": "no scenario bound: blocks of one recording are not independent of one another"}
-    counted = "transients" if what == "recording" else "groups"
-    if discarded:
-        variables = _variables(v.model)
-        upper = discarding_bound(variables, discarded, G, v.confidence)
-        if upper > VOID:
-            return {
-                "words": f"not enough {counted} for a scenario bound: {G} with {variables} unknowns and at most "
-                f"{discarded} with discarded transitions"
-            }
-        return {
-            "interval": [0.0, upper],
-            "discarded": discarded,
-            "variables": variables,
-            "words": f"a fresh {what} leaves the envelope with a probability of at most {upper:.1%} "
-            f"(confidence {v.confidence:.0%}); {condition}, and each {what} with a discarded transition counted as "
-            f"discarded",
-        }
-    support = int(np.count_nonzero(by_unit(v.parts, [p.violated for p in v.parts])))
-    low, high = scenario_interval(support, G, v.confidence)
-    if high > VOID:
-        return {
-            "support": support,
-            "words": f"not enough {counted} for a scenario bound: {support} of {G} left the envelope of the others; "
-            f"record more of them",
-        }
-    return {
-        "support": support,
-        "interval": [low, high],
-        "words": f"a fresh {what} leaves the envelope somewhere with a probability between {low:.1%} and "
-        f"{high:.1%} (confidence {v.confidence:.0%}, {support} of {G} {what}s left the envelope of the others); "
-        f"{condition}",
-    }
-
-
-def _variables(model: UncertainLTI) -> int:
-    nominal = model.n * (model.n + model.m)
-    return 2 * nominal + sum(int(getattr(model, name).any()) * model.n for term in ADDITIVE for name in term.names)
-
-
-def _discarded(model: UncertainLTI) -> int:
-    """Recordings at most that lost a transition to the budget of outliers."""
-    listed = model.fit_summary.get("discarded", [])
-    return len(listed) if isinstance(listed, (list, tuple)) else 0
 
 
 def full_widths(model: UncertainLTI) -> tuple[list[float], list[float]]:

@@ -1,0 +1,89 @@
+"""Scenario bound: how likely a whole fresh recording leaves the envelope somewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.model.terms import ADDITIVE
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.validation.intervals import discarding_bound, scenario_interval
+from uncertain_lti.validation.part import Part, by_unit, unit_numbers
+
+VOID = 0.9
+"""A bound on the probability of leaving the envelope that is above this says nothing."""
+
+
+def scenario(model: UncertainLTI, parts: Sequence[Part], what: str, confidence: float) -> dict[str, Any]:
+    """The scenario bound on leaving the envelope anywhere in a whole fresh transient or group, or why there is none.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The fit to all recordings.
+    parts : sequence of Part
+        Left-out parts.
+    what : str
+        What was left out at a time: `recording`, `group` or `block`.
+    confidence : float
+        Of the bound.
+
+    Returns
+    -------
+    dict
+        `words`, and where there is a bound its `interval` and what was counted.
+    """
+    G = int(unit_numbers(parts).max(initial=-1)) + 1
+    discarded = _discarded(model)
+    condition = (
+        f"holds if the {what}s were drawn independently of one another from one and the same distribution, and the "
+        f"machine will be run like that again; counted by whole {what}s, margin 1; a guide rather than a theorem, as "
+        f"the theorem asks for an objective that does not depend on the recordings, and the sum of squared widths does"
+    )
+    if what == "block":
+        return {"words": "no scenario bound: blocks of one recording are not independent of one another"}
+    counted = "transients" if what == "recording" else "groups"
+    if discarded:
+        variables = _variables(model)
+        upper = discarding_bound(variables, discarded, G, confidence)
+        if upper > VOID:
+            return {
+                "words": f"not enough {counted} for a scenario bound: {G} with {variables} unknowns and at most "
+                f"{discarded} with discarded transitions"
+            }
+        return {
+            "interval": [0.0, upper],
+            "discarded": discarded,
+            "variables": variables,
+            "words": f"a fresh {what} leaves the envelope with a probability of at most {upper:.1%} "
+            f"(confidence {confidence:.0%}); {condition}, and each {what} with a discarded transition counted as "
+            f"discarded",
+        }
+    support = int(np.count_nonzero(by_unit(parts, [p.violated for p in parts])))
+    low, high = scenario_interval(support, G, confidence)
+    if high > VOID:
+        return {
+            "support": support,
+            "words": f"not enough {counted} for a scenario bound: {support} of {G} left the envelope of the others; "
+            f"record more of them",
+        }
+    return {
+        "support": support,
+        "interval": [low, high],
+        "words": f"a fresh {what} leaves the envelope somewhere with a probability between {low:.1%} and "
+        f"{high:.1%} (confidence {confidence:.0%}, {support} of {G} {what}s left the envelope of the others); "
+        f"{condition}",
+    }
+
+
+def _variables(model: UncertainLTI) -> int:
+    nominal = model.n * (model.n + model.m)
+    return 2 * nominal + sum(int(getattr(model, name).any()) * model.n for term in ADDITIVE for name in term.names)
+
+
+def _discarded(model: UncertainLTI) -> int:
+    """Recordings at most that lost a transition to the budget of outliers."""
+    listed = model.fit_summary.get("discarded", [])
+    return len(listed) if isinstance(listed, (list, tuple)) else 0
