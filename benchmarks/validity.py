@@ -30,7 +30,8 @@ from tanks import DT, Tanks  # noqa: E402
 from uncertain_lti import Transient, UncertainLTI  # noqa: E402
 from uncertain_lti.model.alarm_rule import AlarmRule  # noqa: E402
 from uncertain_lti.validation.calibration import calibrate  # noqa: E402
-from uncertain_lti.validation.left_out import Validation, validate  # noqa: E402
+from uncertain_lti.validation.left_out import validate  # noqa: E402
+from uncertain_lti.validation.result import Validation  # noqa: E402
 
 CONFIDENCE = 0.9
 LEAST = 0.87

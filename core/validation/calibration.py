@@ -14,8 +14,8 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.validation.false_alarms import borrowed_margin, peaks
 from uncertain_lti.validation.intervals import cluster_size, rate_interval
-from uncertain_lti.validation.left_out import Validation, short_condition
 from uncertain_lti.validation.part import Part, by_unit, rising
+from uncertain_lti.validation.result import Validation, short_condition
 
 RULES = ((1, 1), (3, 5), (5, 10))
 """(violations, window) tried unless told otherwise."""

@@ -1,0 +1,295 @@
+"""Result of a validation: the parts, with what follows from them as plain data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.validation.false_alarms import false_alarms
+from uncertain_lti.validation.intervals import rate_interval, share_interval
+from uncertain_lti.validation.part import Part, by_unit, unit_numbers
+from uncertain_lti.validation.scenario import scenario
+
+REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
+"""Alarm rules whose false alarms are counted beside the model's own."""
+
+
+@dataclass(frozen=True, repr=False)
+class Validation:
+    """What `validate` found.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The fit to all recordings.
+    parts : tuple of Part
+        What was left out, one after the other.
+    kind : str
+        `transients` or `blocks`.
+    gap : float
+        Time on both sides of a left-out block that was not fitted either, s; 0 for transients.
+    confidence : float
+        Of every interval.
+    grouping : str
+        In words, what the groups are that were left out as a whole; "" if every part was left out alone.
+    hint : str
+        A sentence if the recordings seem to come in groups and none were given, else "".
+    """
+
+    model: UncertainLTI
+    parts: tuple[Part, ...]
+    kind: str
+    gap: float
+    confidence: float
+    grouping: str = ""
+    hint: str = ""
+
+    @property
+    def what(self) -> str:
+        """What was left out at a time, and what every interval takes for independent: recording, block or group."""
+        return "group" if self.grouping else "recording" if self.kind == "transients" else "block"
+
+    @property
+    def units(self) -> int:
+        """How many of them there are."""
+        return int(unit_numbers(self.parts).max(initial=-1)) + 1
+
+    def __repr__(self) -> str:
+        judged, violated = sum(p.judged for p in self.parts), sum(p.violated for p in self.parts)
+        inside = f"{1 - violated / judged:.3%} of {plural(judged, 'verdict')} inside" if judged else "no verdict"
+        whole = int(np.count_nonzero(by_unit(self.parts, [p.violated for p in self.parts]) == 0))
+        of = "groups" if self.grouping else self.kind
+        return f"Validation(left out one of {self.units} {of}: {inside}, {whole} whole)"
+
+    def _repr_html_(self) -> str:
+        """Coverage beside widths, from `Validation.to_dict()`."""
+        data = self.to_dict()
+        rows = [
+            [
+                name_with_unit(name, s["unit"]),
+                "–" if s["inside"] is None else f"{s['inside']:.3%}",
+                f"{s['parts_inside']}/{data['parts']}",
+                number_text(s["mean_width_left_out"]),
+                number_text(s["mean_width_full"]),
+            ]
+            for name, s in data["states"].items()
+        ]
+        below = []
+        if data["inside"] is not None:
+            low, high = data["inside_interval"]
+            below.append(
+                f"inside all bounds: {data['inside']:.3%} of {plural(data['verdicts'], 'verdict')} "
+                f"({data['confidence']:.0%} interval {low:.3%} to {high:.3%})"
+            )
+        for rule in data["false_alarms"][:1]:
+            of = f"{rule['violations']} of {rule['window']}"
+            below.append(f"false alarms per hour at {of}: {number_text(rule['per_hour'])}")
+        below += [data["scenario"]["words"], *(f"note: {note}" for note in data["notes"])]
+        return html_table(repr(self), ("left out", "inside", "whole parts", "mean width", "fitted"), rows, below)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: coverage beside widths, false alarms per hour with intervals, scenario bound in words.
+
+        Returns
+        -------
+        dict
+            As `summary`.
+        """
+        return summary(self)
+
+
+def summary(validation: Validation) -> dict[str, Any]:
+    """Everything `validate` found as plain data; the fields are described in docs/validation.md.
+
+    Parameters
+    ----------
+    validation : Validation
+        Of `validate`.
+
+    Returns
+    -------
+    dict
+        Plain data for JSON; widths in recorded units.
+    """
+    v, model, parts = validation, validation.model, validation.parts
+    judged = sum(p.judged for p in parts)
+    hours = sum(p.hours for p in parts)
+    violated = [p.violated for p in parts]
+    inside = sum(p.violated == 0 for p in parts)
+    held_width = _average(parts, [p.mean_width for p in parts])
+    full_mean, full_max = full_widths(model)
+    states = {}
+    for i, name in enumerate(model.state_names):
+        bad = sum(int(p.violations[i]) for p in parts)
+        states[name] = {
+            "inside": 1.0 - bad / judged if judged else None,
+            "parts_inside": sum(int(p.violations[i]) == 0 for p in parts),
+            "mean_width_left_out": float(held_width[i]),
+            "max_width_left_out": float(np.nanmax([p.max_width[i] for p in parts])),
+            "mean_width_full": full_mean[i],
+            "max_width_full": full_max[i],
+            "left_out_to_full": float(_average(parts, [p.relative_width for p in parts])[i]),
+            "unit": model.signals.states[i].unit,
+        }
+    units = by_unit(parts, violated)
+    low, high = rate_interval(units, judged, v.confidence) if judged else (0.0, math.inf)
+    rules = [model.alarm_rule, *(AlarmRule(m, n, model.alarm_rule.margin) for m, n in REFERENCE_RULES)]
+    alarms = [false_alarms(parts, rule, v.confidence) for rule in dict.fromkeys(rules)]
+    return {
+        "kind": v.kind,
+        "parts": len(parts),
+        "gap": v.gap,
+        "confidence": v.confidence,
+        "verdicts": judged,
+        "hours": hours,
+        "inside": 1.0 - sum(violated) / judged if judged else None,
+        "inside_interval": [max(0.0, 1.0 - high), 1.0 - low],
+        "parts_inside": inside,
+        "parts_inside_share": inside / len(parts),
+        "parts_inside_interval": _whole_interval(v),
+        "groups": None
+        if not v.grouping
+        else {
+            "key": v.grouping,
+            "count": v.units,
+            "inside": int(np.count_nonzero(units == 0)),
+            "recordings": {p.group: [q.name for q in parts if q.group == p.group] for p in parts},
+        },
+        "condition": condition(v),
+        "condition_short": short_condition(v),
+        "hint": v.hint,
+        "outside_domain": sum(p.outside_domain for p in parts),
+        "violated_inside_domain": sum(p.unseen for p in parts),
+        "states": states,
+        "false_alarms": alarms,
+        "scenario": scenario(model, parts, v.what, v.confidence),
+        "part": [
+            {"name": p.name, "verdicts": p.judged, "violated": p.violated, "outside_domain": p.outside_domain}
+            for p in parts
+        ],
+        "notes": _notes(v),
+    }
+
+
+def short_condition(validation: Validation) -> str:
+    """What must be true for the intervals to hold, in a few words.
+
+    Parameters
+    ----------
+    validation : Validation
+        Of `validate`.
+
+    Returns
+    -------
+    str
+        A clause to stand beside an interval.
+    """
+    return f"if the {validation.what}s are independent"
+
+
+def condition(validation: Validation) -> str:
+    """What must be true for the intervals to hold.
+
+    Parameters
+    ----------
+    validation : Validation
+        Of `validate`.
+
+    Returns
+    -------
+    str
+        A sentence.
+    """
+    v = validation
+    if v.kind == "blocks":
+        return (
+            f"every interval counts {plural(v.units, 'block')}, and holds for more of the same runs if the blocks are "
+            f"independent of one another; of another day, machine or operator it says nothing"
+        )
+    alike = "" if v.grouping else ", machines or operators"
+    return (
+        f"every interval counts {plural(v.units, v.what)}, and holds if they are independent of one another and the "
+        f"machine is run like that again: no other days{alike} that differ by more than these do, no wear, no kind of "
+        f"event that none of them shows"
+    )
+
+
+def _whole_interval(validation: Validation) -> list[float]:
+    """For the share of whole parts inside all bounds: exact of independent parts, by clusters of groups."""
+    v, parts = validation, validation.parts
+    left = [p.violated > 0 for p in parts]
+    if not v.grouping:
+        return list(share_interval(len(parts) - sum(left), len(parts), v.confidence))
+    low, high = rate_interval(by_unit(parts, left), len(parts), v.confidence)
+    return [max(0.0, 1.0 - high), 1.0 - low]
+
+
+def full_widths(model: UncertainLTI) -> tuple[list[float], list[float]]:
+    """Widths of the full fit on its own samples.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit`.
+
+    Returns
+    -------
+    list of float
+        Mean width of each state, recorded units.
+    list of float
+        Largest width of each state, recorded units.
+    """
+    return (
+        [float(w) for w in model.fit_summary["mean_width_recorded"]],
+        [float(w) for w in model.fit_summary["max_width_recorded"]],
+    )
+
+
+def _average(parts: Sequence[Part], values: Sequence[Array]) -> Array:
+    """Mean over parts by their verdicts, (n,)."""
+    weight = np.array([p.judged for p in parts], dtype=np.float64)
+    stacked = np.array(values)
+    used = weight > 0
+    if not used.any():
+        return np.full(stacked.shape[1], np.nan)
+    return np.asarray(weight[used] @ stacked[used] / weight[used].sum())
+
+
+def _notes(validation: Validation) -> list[str]:
+    v = validation
+    G, what = v.units, f"{v.what}s"
+    notes = [
+        f"the numbers are those of models fitted to {G - 1} of the {G} {what}: the model of all {G} is a little "
+        f"better, so they err on the safe side"
+    ]
+    if v.hint:
+        notes.insert(0, v.hint)
+    if G < 6:
+        notes.append(f"{G} {what} say little: an interval from so few is wide, and rests on them being typical")
+    if count := len(v.model.fit_summary.get("discarded", [])):
+        notes.append(
+            f"every left-out fit may discard {count} transitions as well; in what is left out nothing is discarded, so "
+            f"outliers there count as violations"
+        )
+    if v.kind == "blocks":
+        notes.append(
+            "blocks show how the model does on the same run at another time; another run, load or day can differ by "
+            "more than blocks of one run do: record several"
+        )
+    left = sum(p.outside_domain for p in v.parts)
+    judged = sum(p.judged for p in v.parts)
+    if judged and left > 0.01 * judged:
+        notes.append(
+            f"{left / judged:.1%} of the left-out verdicts lie outside the domain fitted without them, so the "
+            f"{what} do not repeat one another: nothing fitted vouches for the bounds there"
+        )
+    return notes
