@@ -18,8 +18,9 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.validation.blocks import cut, remaining_spans
 from uncertain_lti.validation.calibration import calibrate, detection
+from uncertain_lti.validation.fitted_model import leave_out_with_fit, validate_model
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
-from uncertain_lti.validation.left_out import leave_out_with_fit, validate, validate_model
+from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.part import Part, judge
 
 # --- intervals ---
@@ -591,7 +592,7 @@ def test_what_a_fit_says_of_itself_does_not_depend_on_the_load(folder, capsys, m
 
 
 def test_what_was_not_left_out_is_unknown_and_said_so(folder, capsys, monkeypatch):
-    monkeypatch.setattr("uncertain_lti.validation.left_out.leave_out_with_fit.__defaults__", (None, None, 100.0))
+    monkeypatch.setattr("uncertain_lti.validation.fitted_model.leave_out_with_fit.__defaults__", (None, None, 100.0))
     capsys.readouterr()
     assert fitted(folder) == 0
     assert "not validated, so how it does on other recordings is unknown: it takes 6 fits" in capsys.readouterr().out

@@ -78,8 +78,8 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti.base.files import sha256
     from uncertain_lti.reports.fit_text import fit_text, next_text, recording_text
     from uncertain_lti.reports.validation_text import left_out_text
+    from uncertain_lti.validation.fitted_model import leave_out_with_fit
     from uncertain_lti.validation.groups import resolve_groups
-    from uncertain_lti.validation.left_out import leave_out_with_fit
 
     output = model_target(options.output)
     if options.workers is not None and options.workers < 1:

@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti.reports.validation_text import validation_text
     from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.calibration import calibrate
-    from uncertain_lti.validation.left_out import validate_model
+    from uncertain_lti.validation.fitted_model import validate_model
 
     model = UncertainLTI.load(options.model)
     sources = model.fit_summary.get("sources", [])

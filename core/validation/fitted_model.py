@@ -1,0 +1,170 @@
+"""Validation of a model that was fitted before, with the options that it names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import fit
+from uncertain_lti.identification.structure import Structure
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.validation.blocks import BLOCKS
+from uncertain_lti.validation.groups import resolve_groups
+from uncertain_lti.validation.left_out import validate
+from uncertain_lti.validation.result import Validation
+
+LIMIT = 1e9
+"""Elements of all left-out problems together up to which a fit leaves out as well: some minutes."""
+
+
+def validate_model(
+    model: UncertainLTI,
+    transients: Sequence[Transient],
+    *,
+    blocks: int | None = None,
+    gap: float | None = None,
+    groups: Sequence[Any] | str | None = None,
+    confidence: float = 0.9,
+    progress: Callable[[str], None] | None = None,
+) -> Validation:
+    """Validate a fitted model, or one from a file, with the recordings it was fitted to and the options it names.
+
+    The key by which its file says that the recordings are grouped, `fit --group`, counts unless groups or blocks are
+    given.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit`, with its summary.
+    transients : sequence of Transient
+        The recordings it was fitted to.
+    blocks : int, optional
+        As in `validate`.
+    gap : float, optional
+        As in `validate`.
+    groups : sequence or str, optional
+        As in `validate`; "none" leaves out single recordings all the same.
+    confidence : float, default 0.9
+        As in `validate`.
+    progress : callable, optional
+        As in `validate`.
+
+    Returns
+    -------
+    Validation
+        As of `validate`.
+
+    Raises
+    ------
+    FitError
+        Beside those of `validate`: the model does not say how it was fitted, or the recordings do not give it again.
+    """
+    if isinstance(groups, str) and groups == "none":
+        groups = None
+    elif groups is None and blocks is None:
+        groups = model.fit_summary.get("group")
+    if progress is not None:
+        progress("the fit to all recordings")
+    again = fit(transients, operating_point=model.operating_point, **_options(model))
+    if not _same(again, model):
+        raise FitError(
+            "these recordings do not give this model again, so what was left out of them would say nothing of it; "
+            "name the recordings it was fitted to, or fit it anew"
+        )
+    return validate(
+        transients,
+        operating_point=model.operating_point,
+        alarm_rule=model.alarm_rule,
+        blocks=blocks,
+        gap=gap,
+        groups=groups,
+        confidence=confidence,
+        full=again,
+        progress=progress,
+        **_options(model),
+    )
+
+
+def leave_out_with_fit(
+    transients: Sequence[Transient],
+    model: UncertainLTI,
+    groups: Sequence[Any] | str | None = None,
+    progress: Callable[[str], None] | None = None,
+    limit: float = LIMIT,
+) -> dict[str, Any]:
+    """The summary of `validate` for a model that was just fitted, or `{"not_done": why}`.
+
+    Whether it is done depends on the recordings and the model alone, never on how long anything took: it is done
+    if the elements of all left-out problems together (fits, transitions, states, signals) are at most `limit`.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    model : UncertainLTI
+        Fitted to them.
+    groups : sequence or str, optional
+        As in `validate`.
+    progress : callable, optional
+        Called with one line of text per fit.
+    limit : float, default LIMIT
+        Elements of all left-out problems together.
+
+    Returns
+    -------
+    dict
+        As `summary`, or with the key `not_done` alone.
+
+    Raises
+    ------
+    FitError
+        The groups do not fit the recordings.
+    """
+    names, _ = resolve_groups(transients, groups)
+    fits = len(set(names)) if names else len(transients) if len(transients) > 1 else BLOCKS
+    size = float(model.fit_summary["transitions"]) * model.n * (model.n + model.m)
+    if fits * size > limit:
+        return {
+            "not_done": f"it takes {fits} fits of a problem as large as this one ({size:.2g} elements each); run "
+            f"uncertain-lti validate"
+        }
+    if model.fit_summary.get("weights", "ones") != "ones":
+        return {"not_done": "the weights belong to the samples; use validate() from Python"}
+    try:
+        return validate(
+            transients,
+            operating_point=model.operating_point,
+            alarm_rule=model.alarm_rule,
+            groups=groups,
+            full=model,
+            progress=progress,
+            **_options(model),
+        ).to_dict()
+    except FitError as error:  # too little is left when a part is left out: the fit itself stands
+        return {"not_done": str(error)}
+
+
+def _options(model: UncertainLTI) -> Mapping[str, Any]:
+    """Options of `fit` that a model says it was fitted with; see `validate_model`."""
+    facts = model.fit_summary
+    for key in ("criterion", "additive"):
+        if key not in facts:
+            raise FitError(f"the model does not say by which {key} it was fitted; fit it again")
+    if facts.get("weights", "ones") != "ones":
+        raise FitError("the model was fitted with weights, which its file does not hold; use validate() from Python")
+    options: dict[str, Any] = {"criterion": facts["criterion"], "additive": facts["additive"]}
+    options |= {key: facts[key] for key in ("discard", "count") if key in facts}
+    if "structure" in facts:
+        options["structure"] = Structure.from_dict(facts["structure"], model.n, model.m)
+    return options
+
+
+def _same(one: UncertainLTI, other: UncertainLTI) -> bool:
+    """The same widths from as many transitions; another numpy may round otherwise, so not to the bit."""
+    if one.fit_summary["transitions"] != other.fit_summary.get("transitions"):
+        return False
+    return np.allclose(one.fit_summary["mean_width"], np.asarray(other.fit_summary["mean_width"]), rtol=1e-6, atol=0.0)
