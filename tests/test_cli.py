@@ -161,7 +161,7 @@ def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
         (["check", "leibov206", run], "(is leibov2006 meant?)"),
         (
             ["topics", signals],
-            "this is a signals file, and an MCAP recording is wanted here; are the arguments swapped?",
+            "this is a signals file, and a recording is wanted here; are the arguments swapped?",
         ),
         (
             ["fit", run, "--signals", str(folder), "--output", out],

@@ -114,5 +114,5 @@ def test_recordings_of_several_formats_are_named_together(run):
 
 
 def test_without_an_entry_the_file_is_refused_in_a_sentence(run):
-    with pytest.raises(BagError, match=r"run\.csv: a text file, while an MCAP recording is wanted"):
+    with pytest.raises(BagError, match=r"run\.csv: a text file, while a recording is wanted"):
         open_recording(run)

@@ -528,7 +528,7 @@ def test_no_recording_is_an_error() -> None:
         ("odd/empty.mcap", "empty"),
         ("odd/lfs_pointer.mcap", "Git LFS"),
         ("odd/none.mcap", "no such"),
-        ("neato/db3", "sqlite"),
+        ("neato/db3", "there is no topic /x; topics there: "),
         ("odd/talker.mcap", "there is no topic /x; topics there: "),
     ],
 )

@@ -169,7 +169,8 @@ def kind_of(path: str | os.PathLike[str]) -> str:
     Returns
     -------
     str
-        `a folder`, `an MCAP recording`, `a model file`, `a signals file`, or an empty text where the kind is unknown.
+        `a folder`, `an MCAP recording`, `a recorded bag`, `a model file`, `a signals file`, or an empty text where the
+        kind is unknown.
     """
     if os.path.isdir(path):
         return "a folder"
@@ -180,6 +181,8 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return ""
     if head.startswith(MAGIC[:5]):
         return "an MCAP recording"
+    if head.startswith((b"SQLite format 3\0", b"#ROSBAG V")):
+        return "a recorded bag"
     if head.lstrip().startswith(b"{") and b'"uncertain-lti/' in head:
         return "a model file"
     lines = head.splitlines()

@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
-    parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders")
+    parser.add_argument("bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag) and folders")
     parser.add_argument("--violations", type=int, help="alarm: number of violations (default: the model's)")
     parser.add_argument(
         "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"

@@ -22,7 +22,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     parser.add_argument(
-        "bags", metavar="BAG", nargs="+", help="MCAP files and folders; parts of a split bag are one recording"
+        "bags",
+        metavar="BAG",
+        nargs="+",
+        help="recordings (MCAP, .db3, .bag) and folders; parts of a split bag are one recording",
     )
     parser.add_argument(
         "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"

@@ -18,7 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders of the same machine")
+    parser.add_argument(
+        "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag) and folders of the same machine"
+    )
     parser.add_argument(
         "--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)"
     )

@@ -16,7 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
-    parser.add_argument("bags", metavar="BAG", nargs="+", help="MCAP files and folders to check against it")
+    parser.add_argument(
+        "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag) and folders to check against it"
+    )
     parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
     parser.add_argument("--json", action="store_true", help="print the same facts as JSON")
 

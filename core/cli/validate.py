@@ -18,7 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("model", metavar="MODEL", help="model file")
     parser.add_argument(
-        "bags", metavar="BAG", nargs="*", help="MCAP files and folders (default: those the model was fitted to)"
+        "bags",
+        metavar="BAG",
+        nargs="*",
+        help="recordings (MCAP, .db3, .bag) and folders (default: those the model was fitted to)",
     )
     parser.add_argument("--blocks", type=int, help="leave out blocks: their number per recording (a single one: 10)")
     parser.add_argument(

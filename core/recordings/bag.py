@@ -15,9 +15,8 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.bag_arrays import in_reach, read_columns
 from uncertain_lti.recordings.bag_files import parts_of
 from uncertain_lti.recordings.bag_seams import not_one_recording
-from uncertain_lti.recordings.mcap_index import outline_or_scan
-from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages, read_block
-from uncertain_lti.recordings.mcap_scan import scan
+from uncertain_lti.recordings.containers import outline_or_scan, scan
+from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages
 from uncertain_lti.recordings.message_types import define, lines_of, normal_name, undefined
 from uncertain_lti.recordings.raw_messages import RawMessage, RecordedChannel
 from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo
@@ -442,7 +441,7 @@ class Bag:
         held = 0
         for position, (_, part, number, block) in enumerate(blocks):
             wanted = channels[part]
-            records = read_block(self._contents[part].path, block)
+            records = self._contents[part].records(block, wanted)
             found: list[tuple[int, int, int, int, RawMessage]] = []
             for key, log_time, publish_time, begin, end in messages(records):
                 if channel := wanted.get(key):

@@ -7,9 +7,9 @@ from pathlib import Path, PurePosixPath
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import natural
-from uncertain_lti.recordings.unreadable import file_names, no_recording, os_error, sqlite_advice
+from uncertain_lti.recordings.unreadable import SUFFIXES, file_names, no_recording, os_error
 
-_PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.mcap")
+_PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.(?:mcap|db3|bag)")
 
 
 def stem_and_index(path: Path) -> tuple[str, int] | None:
@@ -45,7 +45,7 @@ def listed_parts(folder: Path) -> list[Path] | None:
     Raises
     ------
     BagError
-        metadata.yaml says that the recording is not MCAP, or that its files are compressed as a whole.
+        metadata.yaml says that the recording is in another storage, or that its files are compressed as a whole.
     """
     import yaml
 
@@ -60,9 +60,7 @@ def listed_parts(folder: Path) -> list[Path] | None:
     parts = [folder / name for name in names]
     parts = [part if part.exists() else folder / PurePosixPath(part).name for part in parts]
     storage = str(about.get("storage_identifier") or "")  # `ros2 bag reindex` may leave it empty
-    if storage == "sqlite3" or (not storage and any(part.suffix == ".db3" for part in parts)):
-        raise sqlite_advice(folder, [folder], parts)
-    if storage not in ("", "mcap"):
+    if storage not in ("", "mcap", "sqlite3"):
         raise BagError(f"{folder}: a recording in '{storage}' storage; convert it to MCAP with ros2 bag convert")
     return parts or None
 
@@ -70,7 +68,7 @@ def listed_parts(folder: Path) -> list[Path] | None:
 def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
     """Files of a folder that is one recording.
 
-    Without metadata.yaml the parts are the folder's `<stem>_<i>.mcap` of one stem in natural order.
+    Without metadata.yaml the parts are the folder's `<stem>_<i>.mcap`, `.db3` or `.bag` of one stem in natural order.
 
     Parameters
     ----------
@@ -95,7 +93,7 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
         inside = sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=natural)
     except OSError as error:
         raise os_error(folder, error) from None
-    found = [p for p in inside if p.suffix == ".mcap" and not p.is_dir()]
+    found = [p for p in inside if p.suffix in SUFFIXES and not p.is_dir()]
     listed = listed_parts(folder)
     if listed:
         there = [part for part in listed if part.exists()]

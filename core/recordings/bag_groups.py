@@ -10,8 +10,7 @@ from uncertain_lti.base.files import natural
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_files import listed_parts, stem_and_index
 from uncertain_lti.recordings.bag_seams import not_one_recording
-from uncertain_lti.recordings.mcap_index import outline_or_scan
-from uncertain_lti.recordings.mcap_scan import scan
+from uncertain_lti.recordings.containers import outline_or_scan, scan
 
 
 def group_bags(paths: Sequence[Path], indexed: bool = False) -> list[Bag]:

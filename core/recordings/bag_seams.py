@@ -6,8 +6,8 @@ import itertools
 from collections.abc import Sequence
 
 from uncertain_lti.recordings.bag_files import stem_and_index
-from uncertain_lti.recordings.mcap_records import Contents, messages, read_block
-from uncertain_lti.recordings.mcap_scan import scan
+from uncertain_lti.recordings.containers import scan
+from uncertain_lti.recordings.mcap_records import Contents, messages
 from uncertain_lti.recordings.message_types import normal_name
 
 
@@ -64,5 +64,5 @@ def _longest_pause(contents: Contents) -> int:
         contents = scan(contents.path)
     times: list[int] = []
     for block in contents.blocks:
-        times += (message[1] for message in messages(read_block(contents.path, block)))
+        times += (message[1] for message in messages(contents.records(block)))
     return max((b - a for a, b in itertools.pairwise(sorted(times))), default=0)

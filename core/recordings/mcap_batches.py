@@ -105,6 +105,11 @@ def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
     wanted[list(channels)] = True
     missing = {channel: contents.tally[channel].count for channel in channels if channel in contents.tally}
     groups = list(_groups([block for block in contents.blocks if not block.channels.isdisjoint(missing)]))
+    if contents.converted:
+        for group in groups:
+            data, places = _converted(contents, group, channels)
+            yield _messages(data, _starts(data, places, contents), wanted, contents)
+        return
     try:
         with open(contents.path, "rb", buffering=0) as stream:
             for data, places in _loaded(contents, stream, groups):
@@ -161,6 +166,20 @@ def _loaded(
             loader = loaders[number % 2]
             places = loader.place(runs) if places_there is None else places_there
             yield loader.data, places
+
+
+def _converted(
+    contents: Contents, blocks: Sequence[Block], channels: Collection[int]
+) -> tuple[bytearray, list[_Place]]:
+    """Blocks of a file that is no MCAP, in a buffer with SLACK bytes around."""
+    data = bytearray(SLACK)
+    places = []
+    for block in blocks:
+        begin = len(data)
+        data += contents.records(block, channels)
+        places.append(_Place(block, begin, len(data), None))
+    data += bytes(SLACK)
+    return data, places
 
 
 def _begin(block: Block) -> int:

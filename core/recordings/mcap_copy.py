@@ -114,9 +114,12 @@ class Copier:
     ----------
     notes : list of str
         What could not be copied, each one sentence that begins with the file.
+    unconverted : dict of Path to int
+        Messages of files that are no MCAP which could not be converted, and so not be copied.
     """
 
     def __init__(self, writer: McapWriter) -> None:
+        self.unconverted: dict[Path, int] = {}
         self._writer = writer
         self._schemas: dict[int, _Schema] = {}
         self._channels: dict[int, _Channel] = {}
@@ -258,12 +261,16 @@ class Copier:
         channels: Mapping[int, int],
         same: Mapping[int, bool],
     ) -> int:
-        data = source.all_at(block.offset, block.size)
-        records, trouble = inflate(block.compression, memoryview(data), block.length)
-        if len(records) < block.length:
-            raise source.changed()
-        whole = not block.cut and not trouble and len(records) == block.length
-        records = bytes(records[: block.length])
+        records: bytes | memoryview
+        if contents.converted:
+            records, whole, data = contents.records(block), False, b""
+        else:
+            data = source.all_at(block.offset, block.size)
+            records, trouble = inflate(block.compression, memoryview(data), block.length)
+            if len(records) < block.length:
+                raise source.changed()
+            whole = not block.cut and not trouble and len(records) == block.length
+            records = bytes(records[: block.length])
         found: list[tuple[int, int, int, int]] = []  # channel, log time, begin and end of the record
         as_it_stands, end = whole, 0
         for opcode, begin, end in walk(records):
@@ -276,6 +283,9 @@ class Copier:
                     as_it_stands = False
                     continue
                 as_it_stands = as_it_stands and same[channel]
+                if contents.converted and end - begin == MESSAGE.size:
+                    self.unconverted[contents.path] = self.unconverted.get(contents.path, 0) + 1
+                    continue
                 found.append((channel, log_time, begin - RECORD.size, end))
             elif opcode == _SCHEMA or opcode == _CHANNEL:
                 as_it_stands = as_it_stands and self._declared(contents, opcode, records[begin:end], same)
@@ -290,7 +300,7 @@ class Copier:
             index.setdefault(channel, bytearray()).extend(pack(log_time, begin))
         times = [entry[1] for entry in found]
         packed = (block.compression, data) if as_it_stands and block.compression else None
-        if not block.compression:
+        if not block.compression and not contents.converted:
             packed = ("", records)
         self._writer.chunk(records, index, (min(times), max(times)), packed)
         return len(found)

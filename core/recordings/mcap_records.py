@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -34,6 +34,8 @@ CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, leng
 FOOTER_SIZE = RECORD.size + 20
 PRIVATE = 0x80  # opcodes from here on mean something to their maker alone
 LATEST = 2**63 - 1  # ns; times are kept with a sign
+_MESSAGE = int(Opcode.MESSAGE)
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ").pack
 
 
 class Block(NamedTuple):
@@ -135,10 +137,35 @@ class Contents:
     summed: bool = False
     others: array[int] = field(default_factory=lambda: array("Q"))
 
+    converted: ClassVar[bool] = False
+    """Whether the file is no MCAP, so that the records of its blocks are made while they are read."""
+
     @property
     def count(self) -> int:
         """Messages that can be read."""
         return sum(entry.count for entry in self.tally.values())
+
+    def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
+        """Records of one block, not compressed.
+
+        Parameters
+        ----------
+        block : Block
+            Of this file.
+        channels : collection of int, optional
+            Channels that are wanted; what is converted leaves the others out.
+
+        Returns
+        -------
+        bytes
+            The records.
+
+        Raises
+        ------
+        BagError
+            The file changed, or cannot be read any more.
+        """
+        return read_block(self.path, block)
 
 
 def read_block(path: Path, block: Block) -> bytes:
@@ -172,6 +199,31 @@ def read_block(path: Path, block: Block) -> bytes:
     if len(records) < block.length:
         raise BagError(f"{path}: the file changed while it was read; read it again when it is written")
     return bytes(records[: block.length])
+
+
+def message_record(channel: int, sequence: int, log_time: int, publish_time: int, data: bytes | memoryview) -> bytes:
+    """One message as an MCAP file has it.
+
+    Parameters
+    ----------
+    channel : int
+        Number of its channel.
+    sequence : int
+        Its number on the channel.
+    log_time : int
+        Log time, ns.
+    publish_time : int
+        Publish time, ns.
+    data : bytes or memoryview
+        Serialised message.
+
+    Returns
+    -------
+    bytes
+        The record.
+    """
+    head = _MESSAGE_HEAD(_MESSAGE, MESSAGE.size + len(data), channel, sequence & 0xFFFFFFFF, log_time, publish_time)
+    return b"".join((head, data))
 
 
 def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:

@@ -133,6 +133,45 @@ class Definition:
             raise BagError(f"it is {left} bytes longer than its definition" if left > 0 else "it is cut")
         return message
 
+    def from_ros1(self, data: bytes) -> bytes:
+        """One message of a ROS 1 bag as ROS 2 has it (`rosbags`); of a definition that `ros2_text` made.
+
+        Parameters
+        ----------
+        data : bytes
+            As in the bag.
+
+        Returns
+        -------
+        bytes
+            CDR; empty where it does not fit the definition, so that `decode` refuses it.
+        """
+        if self._endless:
+            return b""
+        self.store.max_sequence_length = max(1, len(data))
+        try:
+            return bytes(self.store.ros1_to_cdr(data, self.type_name))
+        except Exception:  # the generated converters raise whatever the bytes lead them to
+            return b""
+
+    @functools.cached_property
+    def _endless(self) -> bool:
+        """Whether a few bytes can state any number of elements: sequences of messages that have no field."""
+
+        def bytes_of(type_name: str) -> bool:
+            for name, (node, what) in self.types[type_name][1]:
+                if node == Nodetype.ARRAY:
+                    node, what = what[0]
+                if name != _NOTHING and (node != Nodetype.NAME or bytes_of(what)):
+                    return True
+            return False
+
+        return any(
+            node == Nodetype.SEQUENCE and what[0][0] == Nodetype.NAME and not bytes_of(what[0][1])
+            for _, fields in self.types.values()
+            for _, (node, what) in fields
+        )
+
     def _may_end(self, data: bytes, left: int) -> bool:
         """Whether these bytes may be left behind a message."""
         if 0 <= left <= PADDING:
@@ -380,6 +419,59 @@ def jazzy_text(type_name: str) -> str:
     return str(_jazzy().generate_msgdef(type_name, ros_version=2)[0])
 
 
+def distribution_text(type_name: str, distribution: str) -> tuple[str, str]:
+    """Definition of a type as a distribution of ROS 2 has it, for a recording that holds none.
+
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name.
+    distribution : str
+        For example `humble`; Jazzy is taken for one that is not known.
+
+    Returns
+    -------
+    text : str
+        As `jazzy_text`; empty where the distribution does not have the type.
+    words : str
+        What the distribution is called; empty likewise.
+    """
+    name = distribution.upper() if f"ROS2_{distribution.upper()}" in Stores.__members__ else "JAZZY"
+    store = _store(name)
+    if type_name not in store.fielddefs:
+        return "", ""
+    return str(store.generate_msgdef(type_name, ros_version=2)[0]), f"ROS 2 {name.capitalize()}"
+
+
+def ros2_text(type_name: str, text: bytes) -> bytes:
+    """A definition in a ROS 1 bag as ROS 2 has it: without constants, and without the number in a header.
+
+    Parameters
+    ----------
+    type_name : str
+        As package/msg/Name.
+    text : bytes
+        As in the bag.
+
+    Returns
+    -------
+    bytes
+        For `define`, whose messages `Definition.from_ros1` gives; the text itself where it cannot be used.
+    """
+    try:
+        if len(text) > _LARGEST_SCHEMA:
+            return text
+        types = _parse(type_name, "ros2msg", _readable("ros2msg", text))
+        types.pop("std_msgs/msg/Header", None)
+        used: dict[str, int] = {}
+        _complete(type_name, types, (), used)
+        store = get_typestore(Stores.EMPTY)
+        store.register({name: ([], types[name][1]) for name in used})
+        return str(store.generate_msgdef(type_name, ros_version=2)[0]).encode()
+    except Exception:  # parsers raise whatever a text leads them to; `define` says what is wrong with it
+        return text
+
+
 def undefined(type_name: str, reason: str) -> Definition:
     """Definition of something that is not decoded, for the reason given.
 
@@ -398,9 +490,13 @@ def undefined(type_name: str, reason: str) -> Definition:
     return Definition(type_name, {}, get_typestore(Stores.EMPTY), reason)
 
 
-@functools.cache
 def _jazzy() -> Typestore:
-    return get_typestore(Stores.ROS2_JAZZY)
+    return _store("JAZZY")
+
+
+@functools.cache
+def _store(distribution: str) -> Typestore:
+    return get_typestore(Stores[f"ROS2_{distribution}"])
 
 
 def _readable(encoding: str, text: bytes) -> str:

@@ -28,12 +28,14 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.monitor.outputs import NODE, RECORDED
 from uncertain_lti.monitor.verdict_messages import VerdictRecords
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.containers import scan
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of
-from uncertain_lti.recordings.mcap_records import LATEST, Contents
-from uncertain_lti.recordings.mcap_scan import scan
+from uncertain_lti.recordings.mcap_records import LATEST, Contents, count
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
 from uncertain_lti.recordings.recording import Progress, Recording
+from uncertain_lti.recordings.unreadable import SUFFIXES
 from uncertain_lti.sampling.sampler_arrays import Decisions
 
 METADATA = "uncertain_lti_check"
@@ -87,9 +89,13 @@ def targets(output: str | os.PathLike[str], bags: Sequence[Recording]) -> list[P
     Raises
     ------
     BagError
-        A file would take the place of another one or lie among the parts of a recording, or is one for several.
+        A recording is a table; or a file would take the place of another one or lie among the parts of a recording, or
+        is one for several.
     """
     path = Path(output)
+    for bag in bags:
+        if not isinstance(bag, Bag):
+            raise BagError(f"{bag.path}: a table, and only ROS recordings are copied; leave out --write, or use --json")
     if path.suffix == ".mcap" and not path.is_dir():
         if len(bags) > 1:
             raise BagError(
@@ -103,7 +109,7 @@ def targets(output: str | os.PathLike[str], bags: Sequence[Recording]) -> list[P
             raise BagError(f"{path}: is neither a folder nor called *.mcap; choose another name")
         chosen = []
         for bag in bags:
-            stem = bag.path.resolve().stem if bag.path.suffix == ".mcap" else bag.path.resolve().name
+            stem = bag.path.resolve().stem if bag.path.suffix in SUFFIXES else bag.path.resolve().name
             name, number = f"{stem}_annotated.mcap", 1
             while path / name in chosen:
                 number += 1
@@ -172,7 +178,7 @@ def annotate(
         raise BagError(f"{output.parent}: cannot be made: {error.strerror}; choose another folder") from None
     try:
         with whole_file(output) as stream:
-            profile = profile_of(contents[0].path)
+            profile = "ros2" if contents[0].converted else profile_of(contents[0].path)
             writer = McapWriter(stream, f"uncertain-lti {__version__}", profile, _compression(contents))
             copier = Copier(writer)
             numbers = [copier.declare(part) for part in contents]
@@ -195,6 +201,9 @@ def annotate(
         why = error.strerror or error
         raise BagError(f"{output}: cannot be written: {why}; make room or choose another place") from None
     notes = list(copier.notes)
+    for part, number in copier.unconverted.items():
+        total -= number
+        notes.append(f"{part}: {count(number, 'message')} that cannot be converted to CDR not copied")
     if base != NODE:
         notes.append(f"{output}: the recording has topics below {NODE}, so the verdicts are below {base}")
     return Annotated(output, total, len(verdict_stream), base, tuple(notes))
@@ -206,10 +215,10 @@ def _weave(
     """Copy block after block, verdicts in between; yields the messages of each block."""
     horizon = 0
     for part, renumbered in zip(contents, numbers, strict=True):
-        for count, last in copier.copy(part, renumbered):
+        for messages, last in copier.copy(part, renumbered):
             horizon = min(max(horizon, last), LATEST)  # of other topics it may be anything
             verdict_stream.until(horizon)
-            yield count
+            yield messages
     verdict_stream.finish()
 
 
@@ -271,7 +280,7 @@ def _rows(values: NDArray[Any], at: Integers) -> NDArray[Any]:
 def _compression(contents: Sequence[Contents]) -> str:
     """That of the recording: the one that most of its bytes have."""
     sizes: dict[str, int] = {}
-    for block in (block for part in contents for block in part.blocks):
+    for block in (block for part in contents if not part.converted for block in part.blocks):
         sizes[block.compression] = sizes.get(block.compression, 0) + block.length
     return max(sizes, key=lambda name: sizes[name], default="zstd")
 

@@ -1,0 +1,337 @@
+"""rosbag2 databases and ROS 1 bags: what they give is what the same data in MCAP gives, and damage is a sentence."""
+
+import random
+import shutil
+import sqlite3
+import time
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from uncertain_lti import read_transients
+from uncertain_lti.base.errors import BagError
+from uncertain_lti.cli.main import main
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.containers import scan
+from uncertain_lti.recordings.formats import group_recordings
+from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
+from uncertain_lti.signals.signal_map import SignalMap
+
+ROOT = Path(__file__).resolve().parents[1]
+SHIPPED = ROOT / "bags/turbofan_pulses_up_large_noise.mcap"
+SIGNALS = ROOT / "config/signals/turbofan.yaml"
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+NOETIC = get_typestore(Stores.ROS1_NOETIC)
+
+
+def to_database(source, folder):
+    with Rosbag2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections = {}
+        for raw in Bag(source).raw_messages():
+            if raw.topic not in connections:
+                connections[raw.topic] = writer.add_connection(raw.topic, raw.type, typestore=JAZZY)
+            writer.write(connections[raw.topic], raw.log_time_ns, raw.data)
+    return next(folder.glob("*.db3"))
+
+
+def to_ros1(source, path, compression=None, chunk=1 << 18):
+    writer = Ros1Writer(path)
+    if compression:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    writer.chunk_threshold = chunk
+    with writer:
+        connections = {}
+        for raw in Bag(source).raw_messages():
+            if raw.topic not in connections:
+                connections[raw.topic] = writer.add_connection(raw.topic, raw.type, typestore=NOETIC)
+            whole = bytes(JAZZY.serialize_cdr(raw.channel.definition.decode(raw.data), raw.type))
+            writer.write(connections[raw.topic], raw.log_time_ns, JAZZY.cdr_to_ros1(whole, raw.type))
+    return path
+
+
+@pytest.fixture(scope="module")
+def converted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("converted")
+    made = {"db3": to_database(SHIPPED, folder / "run")}
+    made["folder"] = folder / "run"
+    made["old db3"] = folder / "old.db3"  # as recorders before Iron wrote it
+    shutil.copy(made["db3"], made["old db3"])
+    with closing(sqlite3.connect(made["old db3"])) as database:
+        database.execute("DROP TABLE message_definitions")
+        database.execute("UPDATE schema SET ros_distro = 'humble'")
+        database.commit()
+    made["ROS 1"] = to_ros1(SHIPPED, folder / "plain.bag")
+    made["ROS 1 bz2"] = to_ros1(SHIPPED, folder / "bz2.bag", "BZ2")
+    made["ROS 1 lz4"] = to_ros1(SHIPPED, folder / "lz4.bag", "LZ4", 1 << 14)
+    return made
+
+
+EVERY = ("db3", "folder", "old db3", "ROS 1", "ROS 1 bz2", "ROS 1 lz4")
+
+
+@pytest.mark.parametrize("kind", EVERY)
+def test_the_same_bits_as_in_mcap(converted, kind):
+    (expected,) = read_transients(SHIPPED, SIGNALS)
+    (read,) = read_transients(converted[kind], SIGNALS)
+    assert len(read) > 1000 and read.t_ns.tobytes() == expected.t_ns.tobytes()
+    assert read.x.tobytes() == expected.x.tobytes() and read.u.tobytes() == expected.u.tobytes()
+    assert [n.partition(": ")[2] for n in read.notes] == (
+        ["the file does not hold the definitions of all its types; those of ROS 2 Humble are used"]
+        if kind == "old db3"
+        else []
+    )
+
+
+@pytest.mark.parametrize("kind", EVERY)
+def test_columns_are_what_messages_give_and_come_in_blocks(converted, kind):
+    signals = SignalMap.load(SIGNALS)
+    bag = Bag(converted[kind])
+    whole, alone = read_stream(bag, signals), read_stream_by_message(bag, signals)
+    assert whole.topic.tobytes() == alone.topic.tobytes() and whole.arrival.tobytes() == alone.arrival.tobytes()
+    assert whole.stamp.tobytes() == alone.stamp.tobytes()
+    assert [v.tobytes() for v in whole.values] == [v.tobytes() for v in alone.values]
+    from uncertain_lti.sampling.streams import check_paths
+
+    columns = bag.columns(signals.topics, check_paths(bag, signals))
+    assert columns.alone <= 4 < len(columns.topic)  # the rest went through the vectorised path
+
+
+@pytest.mark.parametrize("kind", ["db3", "ROS 1 bz2"])
+def test_every_command_takes_them(converted, kind, tmp_path, capsys):
+    path = str(converted[kind])
+    model, signals = str(tmp_path / "m.model.json"), str(tmp_path / "s.yaml")
+    assert main(["topics", path]) == 0
+    assert "/engine/state: position[fan_speed]" in capsys.readouterr().out
+    assert main(["init", path, "--output", signals]) == 0
+    with open(signals) as stream:
+        assert "position[fan_speed]" in stream.read()
+    assert main(["fit", path, "--signals", str(SIGNALS), "--additive", "noise", "--output", model]) == 0
+    assert main(["check", model, path]) == 0
+    assert main(["check", model, str(SHIPPED)]) == 0
+    out = capsys.readouterr().out.split("\n")
+    at = [i for i, line in enumerate(out) if "verdicts, " in line]
+    assert len(at) == 2
+    one, two = ([line.partition(": ")[2] or line for line in out[i : i + 8]] for i in at)
+    assert one == two
+    assert main(["validate", model]) == 0
+
+
+@pytest.mark.parametrize("kind", EVERY)
+def test_an_annotated_copy_is_that_of_the_mcap(converted, kind, tmp_path, capsys):
+    model = str(tmp_path / "m.model.json")
+    assert main(["fit", str(SHIPPED), "--signals", str(SIGNALS), "--additive", "noise", "--output", model, "-q"]) == 0
+    copies = []
+    for name, source in (("a", SHIPPED), ("b", converted[kind])):
+        copies.append(Bag(tmp_path / f"{name}.mcap") if main(
+            ["check", model, str(source), "--write", str(tmp_path / f"{name}.mcap")]
+        ) == 0 else None)  # fmt: skip
+    assert all(copies)
+    expected, copy = copies
+    assert {t: i.count for t, i in copy.topics.items()} == {t: i.count for t, i in expected.topics.items()}
+    below = [t for t in copy.topics if t.startswith("/envelope_monitor")]
+    assert len(below) == 6
+    for mine, theirs in zip(copy.raw_messages(below), expected.raw_messages(below), strict=True):
+        assert (mine.log_time_ns, mine.data) == (theirs.log_time_ns, theirs.data)
+    for mine, theirs in zip(copy.messages(["/engine/state"]), expected.messages(["/engine/state"]), strict=True):
+        assert mine[1] == theirs[1] and mine[2].position.tobytes() == theirs[2].position.tobytes()
+    assert "messages and the verdicts below" in capsys.readouterr().out
+
+
+def test_parts_of_a_split_database_are_one_recording(converted, tmp_path):
+    parts = [tmp_path / "run_0.db3", tmp_path / "run_1.db3"]
+    for number, part in enumerate(parts):
+        shutil.copy(converted["db3"], part)
+        with closing(sqlite3.connect(part)) as database:
+            (middle,) = database.execute("SELECT timestamp FROM messages ORDER BY id LIMIT 1 OFFSET 1000").fetchone()
+            database.execute(f"DELETE FROM messages WHERE timestamp {'>=' if number == 0 else '<'} ?", (middle,))
+            database.commit()
+    (bag,) = group_recordings(parts)
+    assert [p.name for p in bag.parts] == ["run_0.db3", "run_1.db3"]
+    assert [len(t) for t in read_transients(parts, SIGNALS)] == [len(read_transients(SHIPPED, SIGNALS)[0])]
+    assert Bag(tmp_path).parts == tuple(parts)
+
+
+def test_the_definitions_in_the_file_come_first(tmp_path):
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg("float64 thrust\nuint8 mode", "own_msgs/msg/Command"))
+    own = store.types["own_msgs/msg/Command"]
+    with Rosbag2Writer(tmp_path / "a", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/c", "own_msgs/msg/Command", typestore=store)
+        writer.write(connection, 5, store.serialize_cdr(own(2.5, 3), "own_msgs/msg/Command"))
+    with Ros1Writer(tmp_path / "a.bag") as writer:
+        connection = writer.add_connection("/c", "own_msgs/msg/Command", typestore=store)
+        writer.write(connection, 5, store.serialize_ros1(own(2.5, 3), "own_msgs/msg/Command"))
+    for path in (tmp_path / "a", tmp_path / "a.bag"):
+        assert [(t, m.thrust, m.mode) for _, t, m in Bag(path).messages(["/c"])] == [(5, 2.5, 3)]
+        assert Bag(path).topics["/c"].type == "own_msgs/msg/Command"
+
+
+def test_real_ones(recordings):
+    for path in (recordings / "neato/db3", recordings / "neato/db3/wall_follower_0.db3"):
+        bag = Bag(path)
+        assert (bag.topics["/odom"].count, bag.topics["/odom"].readable) == (52, True)
+        assert "no definition of neato2_interfaces/msg/Bump" in bag.topics["/bump"].reason
+        (transient,) = read_transients(path, ROOT / "config/signals/neato.yaml")
+        assert len(transient) == 52 and np.isfinite(transient.x).all()
+
+
+# --- damaged and hostile --------------------------------------------------------------------------------------
+
+
+def test_a_database_without_its_end_is_refused_with_the_remedy(converted, tmp_path):
+    data = converted["db3"].read_bytes()
+    path = tmp_path / "cut.db3"
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(BagError, match=r"the database is damaged .*; copy it again, or mend it with `sqlite3 cut\.db3"):
+        Bag(path)
+
+
+def test_the_rows_before_damage_count(converted, tmp_path):
+    data = bytearray(converted["db3"].read_bytes())
+    begin = len(data) // 2 // 4096 * 4096
+    data[begin : begin + 4096] = b"\xff" * 4096
+    path = tmp_path / "hurt.db3"
+    path.write_bytes(data)
+    bag = Bag(path)
+    (warning,) = bag.warnings
+    assert warning.startswith(f"{path}: the database is cut or damaged (") and "before that count" in warning
+    (cut,) = read_transients(path, SIGNALS)
+    (whole,) = read_transients(SHIPPED, SIGNALS)
+    assert 100 < len(cut) < len(whole) and cut.x[:-1].tobytes() == whole.x[: len(cut) - 1].tobytes()
+
+
+def test_a_ros_1_bag_without_its_end(converted, tmp_path):
+    data = converted["ROS 1 lz4"].read_bytes()
+    path = tmp_path / "cut.bag"
+    path.write_bytes(data[: len(data) // 2])
+    bag = Bag(path)
+    (warning,) = bag.warnings
+    assert "the file is cut at byte" in warning and "before that count" in warning
+    (cut,) = read_transients(path, SIGNALS)
+    (whole,) = read_transients(SHIPPED, SIGNALS)
+    assert 100 < len(cut) < len(whole) and cut.x[:-1].tobytes() == whole.x[: len(cut) - 1].tobytes()
+
+
+def test_a_ros_1_bag_whose_recorder_was_killed(converted, tmp_path):
+    """The header says that there is no index, and nothing is behind the last chunk."""
+    data = bytearray(converted["ROS 1"].read_bytes())
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    begin = int.from_bytes(data[at : at + 8], "little")
+    data[at : at + 8] = bytes(8)
+    path = tmp_path / "active.bag"
+    path.write_bytes(data[:begin])
+    assert "its recorder was ended" in Bag(path).warnings[0]
+    assert len(read_transients(path, SIGNALS)[0]) == len(read_transients(SHIPPED, SIGNALS)[0])
+
+
+def database_of(path, *statements):
+    with closing(sqlite3.connect(path)) as database:
+        for statement in statements:
+            database.execute(statement)
+        database.commit()
+    return path
+
+
+TOPICS = "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
+MESSAGES = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+
+
+def test_databases_that_are_no_recording(tmp_path):
+    endless = "CREATE VIEW messages AS WITH RECURSIVE r(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM r) SELECT id, 1 AS topic_id, 1 AS timestamp, x'00' AS data FROM r"  # noqa: E501
+    for number, statements in enumerate(
+        [["CREATE TABLE cookies(id)"], [TOPICS, endless], [TOPICS, "CREATE TABLE messages(id, payload)"]]
+    ):
+        path = database_of(tmp_path / f"{number}.db3", *statements)
+        with pytest.raises(BagError, match=r"\d\.db3: (a database without the tables|its tables topics and messages)"):
+            Bag(path)
+
+
+def test_rows_that_are_no_messages_are_left_out(tmp_path):
+    path = database_of(
+        tmp_path / "odd.db3",
+        TOPICS,
+        MESSAGES,
+        "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/Float64', 'cdr')",
+        "INSERT INTO messages VALUES (1, 1, -5, x'00010000000000000000f03f')",
+        "INSERT INTO messages VALUES (2, 7, 5, x'00010000000000000000f03f')",
+        "INSERT INTO messages VALUES (3, 1, 'soon', x'00010000000000000000f03f')",
+        "INSERT INTO messages VALUES (4, 1, 6, NULL)",
+        "INSERT INTO messages VALUES (5, 1, 7, 'text')",
+        "INSERT INTO messages VALUES (6, 1, 8, x'0001000000000000000000000000f03f')",
+        "INSERT INTO messages VALUES (7, 1, 9, x'000100000000')",
+    )
+    bag = Bag(path)
+    assert bag.topics["/a"].count == 2
+    assert [t for _, t, _ in bag.messages(["/a"])] == []  # cut, and longer than its type
+    assert any("5 messages left out, of no topic or without a log time or data" in w for w in bag.warnings)
+    assert any("2 messages left out that cannot be decoded" in w for w in bag.warnings)
+
+
+def test_what_was_not_yet_written_to_a_database_is_reported(converted, tmp_path):
+    path = tmp_path / "a.db3"
+    shutil.copy(converted["db3"], path)
+    path.with_name("a.db3-wal").write_bytes(b"x")
+    assert "a.db3-wal and are not read" in Bag(path).warnings[0]
+
+
+def test_other_versions_and_no_space_for_nothing(tmp_path):
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V1.2\n" + bytes(100))
+    with pytest.raises(BagError, match="of another version than 2.0"):
+        Bag(tmp_path / "a.bag")
+    (tmp_path / "b.bag").write_bytes(b"#ROSBAG V2.0\n")
+    assert Bag(tmp_path / "b.bag").topics == {}
+    (tmp_path / "c.db3").write_bytes(b"SQLite format 3\0" + bytes(5000))
+    with pytest.raises(BagError, match="the database is damaged"):
+        Bag(tmp_path / "c.db3")
+
+
+def test_elements_without_bytes_do_not_take_for_ever(tmp_path):
+    """A few bytes state 2^31 elements of a type that has no field."""
+    store = get_typestore(Stores.EMPTY)
+    text = f"std_msgs/Empty[] nothing\n{'=' * 80}\nMSG: std_msgs/Empty\n"
+    store.register(get_types_from_msg(text, "own/msg/Many"))
+    with Ros1Writer(tmp_path / "a.bag") as writer:
+        connection = writer.add_connection("/c", "own/msg/Many", msgdef=text, md5sum="0")
+        writer.write(connection, 5, (2**31).to_bytes(4, "little"))
+    begin = time.process_time()
+    bag = Bag(tmp_path / "a.bag")
+    assert list(bag.messages(["/c"])) == [] and "cannot be decoded" in bag.warnings[-1]
+    assert time.process_time() - begin < 5
+
+
+@pytest.mark.parametrize("kind", ["db3", "ROS 1", "ROS 1 bz2", "ROS 1 lz4"])
+def test_damage_anywhere_is_read_or_a_sentence(converted, kind, tmp_path):
+    data = converted[kind].read_bytes()
+    path = tmp_path / converted[kind].name
+    rng = random.Random(5)
+    read = refused = 0
+    for _ in range(40):
+        hurt = bytearray(data)
+        where = rng.randrange(len(hurt)) if rng.random() < 0.6 else rng.randrange(9000)
+        hurt[where : where + rng.choice([1, 4, 200])] = rng.randbytes(rng.choice([1, 4, 200]))
+        path.write_bytes(hurt[: rng.randrange(1, len(hurt))] if rng.random() < 0.2 else hurt)
+        try:
+            bag = Bag(path)
+            for _ in bag.messages([t for t, info in bag.topics.items() if info.readable]):
+                pass
+            read_stream(bag, SignalMap.load(SIGNALS)) if len(bag.topics) == 2 else None
+            read += 1
+        except BagError as error:
+            assert str(path) in str(error) and "\n" not in str(error)
+            refused += 1
+        except Exception as error:
+            assert type(error).__name__ == "SignalError", repr(error)
+    assert read > 5
+
+
+def test_a_scan_leaves_nothing_beside_the_file(converted, tmp_path):
+    path = tmp_path / "a.db3"
+    shutil.copy(converted["db3"], path)
+    scan(path)
+    assert list(tmp_path.iterdir()) == [path]
