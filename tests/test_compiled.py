@@ -394,7 +394,7 @@ def test_an_output_that_fails_is_reported_and_the_node_goes_on(ros: None, tmp_pa
         if k == 70:
             node._outputs["upper"].send = kept
         node.arrive(*message)
-    assert node._failures == node.session.failures > 0
+    assert node.failures.count == node.session.failures > 0
     assert node.session.verdicts > 45
     end([node])
 
@@ -420,7 +420,7 @@ def test_an_interrupt_while_something_is_sent_ends_the_process(ros: None, tmp_pa
     node._outputs["upper"].send = interrupt
     with pytest.raises(KeyboardInterrupt):
         node.arrive(*last)
-    assert not node._failures
+    assert not node.failures.count
     end([node])
 
 
@@ -449,7 +449,7 @@ def test_the_shortest_messages_are_taken(ros: None, tmp_path: Path) -> None:
         at = START_NS + k * STEP_NS
         messages += [(at, SETPOINT, bytes([0, 1, 0, 0, k])), (at, STATE, vector(at, {"x0": 3.0 * (k % 7 == 0)})), None]
     _, sent, node = played(tmp_path / "model.json", messages, False)
-    assert node.verdicts == 59 and not node._failures and sent
+    assert node.verdicts == 59 and not node.failures.count and sent
 
 
 def test_formats_that_come_and_go_are_learnt(ros: None, tmp_path: Path) -> None:
@@ -476,7 +476,7 @@ def test_durations_without_end_are_as_good_as_others(ros: None, tmp_path: Path, 
         content["sampling"][name] = LONGEST_S
     (tmp_path / "model.json").write_text(json.dumps(content))
     node = same(tmp_path / "model.json", with_ticks(stream(model, rng, 60, 0.0), rng, 0.1))
-    assert not node._failures
+    assert not node.failures.count
 
 
 def test_a_clock_that_fails_is_reported_and_the_sampler_starts_over(ros: None, tmp_path: Path) -> None:
@@ -488,7 +488,7 @@ def test_a_clock_that_fails_is_reported_and_the_sampler_starts_over(ros: None, t
             node._clock.now = lambda: 1 / 0
         node.arrive(*message)
         node._clock = Clock()
-    assert node.session.failures == node._failures == 1 and node.session.verdicts > 50
+    assert node.session.failures == node.failures.count == 1 and node.session.verdicts > 50
     end([node])
 
 
@@ -599,7 +599,7 @@ def test_alarms_delays_angles_and_states_on_several_topics_are_alike(
         given |= {"latch": seed == 1, "grace": 0.15 * (seed == 2), "masked": "x0" if seed == 3 else ""}
         messages = with_ticks(stream_with(rng, 300, rate), rng, 0.05)
         node = same(tmp_path / "model.json", [*messages[:500], "reset", *messages[500:]], **given)
-        assert not node._failures
+        assert not node.failures.count
         alarms += node.alarms
     assert alarms
 

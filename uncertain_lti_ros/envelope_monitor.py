@@ -7,7 +7,6 @@ import json
 import math
 import os
 import time
-import traceback
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial, wraps
 from pathlib import Path
@@ -32,6 +31,7 @@ from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
+from uncertain_lti.monitor.failures import Failures
 from uncertain_lti.monitor.journal import Journal
 from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED, VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session, topic_types
@@ -58,7 +58,6 @@ _NOTE = 0.05  # s between two looks for what the log should say
 _OUTPUT_DEPTH = 1000
 _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 _LAST_WORDS = 1.0  # s that the end waits for readers of /diagnostics to have the last report
-_LOGGED = 5.0  # s between two log entries on unexpected errors
 _MIB = 1 << 20
 
 _TRANSITIONS = {
@@ -123,8 +122,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._candidate: Session | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
         self._published = self._looked = self._reported = time.monotonic()
-        self._failures, self._failed_how, self._failures_told = 0, "", 0
-        self._failure_logged: dict[str, float] = {}  # where: when
+        self.failures = Failures(self.get_logger().error)
         self._clock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
         self._simulated = self._clock.ros_time_is_active
         self._largest = round(self._real("largest_message") * _MIB)
@@ -473,13 +471,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         error : Exception
             The error.
         """
-        self._failures += 1
-        self._failed_how = f"{where}: {error!r}"[:300]
-        now = time.monotonic()
-        if now - self._failure_logged.get(where, -_LOGGED) >= _LOGGED:
-            self._failure_logged[where] = now
-            trace = "".join(traceback.format_exception(error))
-            self.get_logger().error(f"unexpected error {self._failures}, {where}; the node goes on\n{trace}")
+        self.failures.note(where, error)
 
     # --- messages ---
 
@@ -695,9 +687,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         problems += self._lasting_problems()
         if self._album is not None and self._album.problem:
             problems.append(self._album.problem)
-        if self._failures > self._failures_told:
-            problems.append(f"{self._failures} unexpected errors, the last {self._failed_how}")
-        return problems
+        return problems + self.failures.problems()
 
     def _report(self) -> None:
         now = self._reported = time.monotonic()
@@ -711,7 +701,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                     f"deadlines missed {topic}": str(subscription.late),
                     f"qos {topic}": f"{subscription.qos.reliability.name} {subscription.qos.durability.name}".lower(),
                 }
-            extra["unexpected errors"] = str(self._failures)
+            extra["unexpected errors"] = str(self.failures.count)
             if self._album is not None:
                 extra |= {"snapshots": str(self._album.written), "last snapshot": self._album.last}
             reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
@@ -719,7 +709,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             state = self._state_machine.current_state[1]
             message = f"{state}: {self._reason}" if self._reason else f"{state}: no verdicts are given"
             level = ERROR if self._reason else STALE
-            reports = [Report(level, "monitor", message, {"unexpected errors": str(self._failures)})]
+            reports = [Report(level, "monitor", message, {"unexpected errors": str(self.failures.count)})]
             if self.session is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
         self._note_told()
@@ -742,7 +732,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._diagnostics.publish(message)
 
     def _note_told(self) -> None:
-        self._failures_told = self._failures
+        self.failures.reported()
         self._told = {topic: (subscription.lost, subscription.late) for topic, subscription in self._inputs.items()}
 
     # --- services ---
@@ -809,7 +799,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "unreadable": dict(session.unreadable) if session else {},
                 "future": dict(session.future) if session else {},
                 "decoded": session.decoded if session else {},
-                "unexpected_errors": self._failures,
+                "unexpected_errors": self.failures.count,
                 "snapshot": self._album.last if self._album else "",
                 "problems": self._problems(),
             }

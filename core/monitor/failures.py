@@ -1,0 +1,63 @@
+"""Failures: unexpected errors that a node counts, logs and survives."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+
+_LOGGED = 5.0  # s between two log entries on unexpected errors
+
+
+class Failures:
+    """Errors that nobody foresaw: how many there were, and the last one.
+
+    Parameters
+    ----------
+    log : callable
+        Takes an entry for the log.
+
+    Attributes
+    ----------
+    count : int
+        Errors so far.
+    """
+
+    def __init__(self, log: Callable[[str], None]) -> None:
+        self._log = log
+        self.count, self._last, self._reported = 0, "", 0
+        self._logged: dict[str, float] = {}  # where: when
+
+    def note(self, where: str, error: Exception) -> None:
+        """Count an error, and log it unless one from the same place was logged just before.
+
+        Parameters
+        ----------
+        where : str
+            What was being done.
+        error : Exception
+            The error.
+        """
+        self.count += 1
+        self._last = f"{where}: {error!r}"[:300]
+        now = time.monotonic()
+        if now - self._logged.get(where, -_LOGGED) >= _LOGGED:
+            self._logged[where] = now
+            trace = "".join(traceback.format_exception(error))
+            self._log(f"unexpected error {self.count}, {where}; the node goes on\n{trace}")
+
+    def problems(self) -> list[str]:
+        """What went wrong since the last report.
+
+        Returns
+        -------
+        list of str
+            One sentence, or none.
+        """
+        if self.count > self._reported:
+            return [f"{self.count} unexpected errors, the last {self._last}"]
+        return []
+
+    def reported(self) -> None:
+        """The errors so far are in a report."""
+        self._reported = self.count
