@@ -44,7 +44,8 @@ from uncertain_lti_ros.messages import definition, live_fields, message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living, spare_the_middleware
-from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, MatchedSubscription, Wish
+from uncertain_lti_ros.settings import Settings
+from uncertain_lti_ros.subscriptions import MatchedSubscription
 
 NAME = "envelope_monitor"
 _SUMMARY = (
@@ -58,7 +59,6 @@ _NOTE = 0.05  # s between two looks for what the log should say
 _OUTPUT_DEPTH = 1000
 _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 _LAST_WORDS = 1.0  # s that the end waits for readers of /diagnostics to have the last report
-_MIB = 1 << 20
 
 _TRANSITIONS = {
     getattr(Transition, name): name.removeprefix("TRANSITION_").lower()
@@ -110,7 +110,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         declare(self, PARAMETERS)
-        self._reals: dict[str, float] = {}
+        self.settings = Settings(self)
         self.session: Session | None = None
         self.active = False
         self._reason = ""  # why the last configure failed
@@ -125,7 +125,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.failures = Failures(self.get_logger().error)
         self._clock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
         self._simulated = self._clock.ros_time_is_active
-        self._largest = round(self._real("largest_message") * _MIB)
         self._recent: Recent | None = None  # kept while snapshots can be asked for
         self._album: Album | None = None
         self._snapshot_due: float | None = None
@@ -140,29 +139,12 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._on_have_set)
-        tick = min(_TICK, self._real("heartbeat") / 4, self._real("diagnostics_period") / 2)
+        tick = min(_TICK, self.settings.real("heartbeat") / 4, self.settings.real("diagnostics_period") / 2)
         self.create_timer(tick, self._on_tick, clock=self._steady)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
 
     # --- parameters ---
-
-    def _real(self, name: str) -> float:
-        if name not in self._reals:  # to ask rclpy takes 10 µs
-            self._reals[name] = float(self.get_parameter(name).value)
-        return self._reals[name]
-
-    def _rule(self, changes: dict[str, Any]) -> Rule:
-        return Rule(**{name: changes.get(name, self.get_parameter(name).value) for name in RULE})
-
-    def _wish(self) -> Wish:
-        chosen: dict[str, Any] = {}
-        for name, known in (("reliability", RELIABILITY), ("durability", DURABILITY)):
-            text = self.get_parameter(f"qos.{name}").value
-            if text != "match" and text not in known:
-                raise ModelError(f"parameter qos.{name} is {text!r}; choose match, {' or '.join(known)}")
-            chosen[name] = known.get(text)
-        return Wish(self.get_parameter("qos.depth").value, **chosen)
 
     def _make_session(self, path: str, rule: Rule) -> Session:
         if not path:
@@ -181,7 +163,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         kind = message_class(type_name)
 
         def decode(data: bytes) -> Any:
-            if len(data) > self._largest:
+            if len(data) > self.settings.largest_message:
                 raise ValueError(f"{len(data)} bytes are more than parameter largest_message allows")
             return deserialize_message(data, kind)
 
@@ -193,11 +175,11 @@ class EnvelopeMonitorNode(LifecycleNode):
         changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
         self._candidate = None
         try:
-            self._hold_folder(given.get("snapshot.on_alarm", False))
+            self.settings.check_snapshots(given.get("snapshot.on_alarm", False))
             if "model" in changes:
-                self._candidate = self._make_session(changes["model"], self._rule(changes))
+                self._candidate = self._make_session(changes["model"], self.settings.rule(changes))
             elif changes and self.session is not None:
-                self._candidate = self._rule(changes)
+                self._candidate = self.settings.rule(changes)
                 self.session.check(self._candidate)
             elif "enable" in changes:
                 Condition.parse(changes["enable"])
@@ -212,10 +194,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _on_have_set(self, parameters: Sequence[Parameter]) -> None:
-        self._reals.clear()
+        self.settings.changed()
         self._look_at_clock()
-        if any(p.name == "largest_message" for p in parameters):
-            self._largest = round(self._real("largest_message") * _MIB)
         candidate, self._candidate = self._candidate, None
         if isinstance(candidate, Rule) and self.session is not None:
             if candidate == self.session.rule:
@@ -240,7 +220,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._recent.clear()
         if self.active:
             self._subscribe()
-        name = Path(str(self.get_parameter("model").value)).name
+        name = Path(str(self.settings.value("model"))).name
         self.get_logger().info(f"model swapped: {name}: {session.model}; {session.whole_rule_text()}")
         self._journal.begin(session, time.monotonic())
 
@@ -279,10 +259,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         TransitionCallbackReturn
             FAILURE where the model or a parameter cannot be used.
         """
-        path = str(self.get_parameter("model").value)
+        path = str(self.settings.value("model"))
         try:
-            self._wish()
-            self.session = self._make_session(path, self._rule({}))
+            self.settings.wish()
+            self.session = self._make_session(path, self.settings.rule({}))
             self._open_album()
         except Exception as error:
             self.session = None
@@ -293,7 +273,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         self._reason = ""
         qos = QoSProfile(depth=_OUTPUT_DEPTH)
-        beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=self._real("heartbeat")))
+        beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=self.settings.real("heartbeat")))
         for output in OUTPUTS:
             kind = message_class(output.type)
             self._outputs[output.name] = _Publisher(self, kind, output.name, beat if output is VIOLATION else qos)
@@ -304,22 +284,13 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.get_logger().info("the model has no median step, so nothing is predicted")
         return super().on_configure(state)
 
-    def _hold_folder(self, on_alarm: bool) -> None:
-        if on_alarm and not self.get_parameter("snapshot.folder").value:
-            raise ModelError(
-                "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the "
-                "node with the other"
-            )
-
     def _open_album(self) -> None:
-        folder = str(self.get_parameter("snapshot.folder").value)
-        self._hold_folder(self.get_parameter("snapshot.on_alarm").value)
+        folder = str(self.settings.value("snapshot.folder"))
+        self.settings.check_snapshots(self.settings.value("snapshot.on_alarm"))
         if folder:
-            limit = round(self._real("snapshot.megabytes") * _MIB)
-            self._album = Album(
-                folder, self.get_fully_qualified_name(), self.get_parameter("snapshot.keep").value, limit
-            )
-            self._recent = Recent(self._real("snapshot.seconds"), round(self._real("snapshot.memory") * _MIB))
+            limit = self.settings.size("snapshot.megabytes")
+            self._album = Album(folder, self.get_fully_qualified_name(), self.settings.value("snapshot.keep"), limit)
+            self._recent = Recent(self.settings.real("snapshot.seconds"), self.settings.size("snapshot.memory"))
 
     def _prepare_outputs(self) -> None:
         assert self.session is not None
@@ -485,8 +456,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         for topic, type_name in types.items():
             if topic not in self._inputs:
                 self._inputs[topic] = MatchedSubscription(
-                    self, topic, type_name, message_class(type_name), partial(self._on_message, topic), self._wish(),
-                    raw=True,
+                    self, topic, type_name, message_class(type_name), partial(self._on_message, topic),
+                    self.settings.wish(), raw=True,
                 )  # fmt: skip
 
     def _unsubscribe(self) -> None:
@@ -519,7 +490,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self._recent is not None:
             self._recent.add(Entry(now, arrival, topic, data, verdicts, session.alarm))
             if session.alarms > alarms and self._snapshot_due is None and self._is_first_alarm(now):
-                self._snapshot_due = now + self._real("snapshot.after")
+                self._snapshot_due = now + self.settings.real("snapshot.after")
         if turned and not session.alarm:
             self._alarmed = now
         if verdicts or opened or turned:
@@ -527,7 +498,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _is_first_alarm(self, now: float) -> bool:
         """There was none for as long as a snapshot goes back: one that flaps must not drive out the first file."""
-        return now - self._alarmed >= self._real("snapshot.seconds")
+        return now - self._alarmed >= self.settings.real("snapshot.seconds")
 
     def _publish(self, session: Session, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
         """Publish what is listened to; turned: the alarm did, which is said in any case.
@@ -579,7 +550,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._simulated = self._clock.ros_time_is_active
 
     def _keep_beating(self) -> None:
-        if self.active and time.monotonic() - self._published >= self._real("heartbeat") / 2:
+        if self.active and time.monotonic() - self._published >= self.settings.real("heartbeat") / 2:
             self._beat()
 
     def _look_around(self) -> None:
@@ -609,7 +580,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _keep_reporting(self) -> None:
         now = time.monotonic()
-        if now - self._reported < self._real("diagnostics_period"):
+        if now - self._reported < self.settings.real("diagnostics_period"):
             return
         if self.session is not None and self.active and not self._diagnostics.get_subscription_count():
             self._reported = now
@@ -626,7 +597,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         problems = [problem for subscription in self._inputs.values() for problem in subscription.problems]
         problems += self._lasting_problems()
         publishers = {topic: subscription.publishers for topic, subscription in self._inputs.items()}
-        self._journal.look(self.session, now, self._real("state_timeout"), publishers, problems)
+        self._journal.look(self.session, now, self.settings.real("state_timeout"), publishers, problems)
 
     def _log(self, level: int, line: str) -> None:
         if level == WARN:
@@ -640,7 +611,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _take_due_snapshot(self) -> None:
         assert self._album is not None
-        if not self.get_parameter("snapshot.on_alarm").value:
+        if not self.settings.value("snapshot.on_alarm"):
             self._snapshot_due = None
         elif not self._album.busy:
             self._snapshot_due = None
@@ -661,7 +632,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             {
                 "node": self.get_fully_qualified_name(),
                 "why": why,
-                "model": str(self.get_parameter("model").value),
+                "model": str(self.settings.value("model")),
                 "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
             },
             definition,
@@ -692,7 +663,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _report(self) -> None:
         now = self._reported = time.monotonic()
         if self.session is not None and self.active:
-            reports = self.session.report(now, self._real("state_timeout"), self._problems())
+            reports = self.session.report(now, self.settings.real("state_timeout"), self._problems())
             extra: dict[str, str] = {}
             for topic, subscription in self._inputs.items():
                 extra |= {
@@ -714,10 +685,10 @@ class EnvelopeMonitorNode(LifecycleNode):
                 reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
         self._note_told()
         full_name = self.get_fully_qualified_name().lstrip("/")
-        hardware = str(self.get_parameter("hardware_id").value) or self.get_name()
+        hardware = str(self.settings.value("hardware_id")) or self.get_name()
         message = DiagnosticArray()
         message.header.stamp = self._clock.now().to_msg()
-        path = str(self.get_parameter("model").value)
+        path = str(self.settings.value("model"))
         for report in reports:
             values = {"model": path, **report.values} if report is reports[0] else report.values
             message.status.append(
@@ -764,14 +735,14 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Read the model file once more."""
         if self.session is None:
             raise ModelError("the node is not configured; configure it, which reads the model file")
-        path = str(self.get_parameter("model").value)
-        self._swap(self._make_session(path, self._rule({})))
+        path = str(self.settings.value("model"))
+        self._swap(self._make_session(path, self.settings.rule({})))
         response.success, response.message = True, f"{Path(path).name}: {self.session.model}"
 
     def _on_snapshot(self, response: Trigger.Response) -> None:
         """Write the last seconds to a file."""
         if self._album is None or self.session is None:
-            if self.get_parameter("snapshot.folder").value:
+            if self.settings.value("snapshot.folder"):
                 raise ModelError("the node is not configured, so there is nothing to write")
             raise ModelError("parameter snapshot.folder is empty; start the node with a folder for snapshots")
         response.message = self._album.take(self._scene("asked for"), _SERVICE_WAIT)
@@ -785,9 +756,9 @@ class EnvelopeMonitorNode(LifecycleNode):
             {
                 "state": self._state_machine.current_state[1],
                 "reason": self._reason,
-                "model": self.get_parameter("model").value,
+                "model": self.settings.value("model"),
                 "now_ns": self._clock.now().nanoseconds,
-                "use_sim_time": self.get_parameter("use_sim_time").value,
+                "use_sim_time": self.settings.value("use_sim_time"),
                 "received": {s.topic: s.received for s in self._inputs.values()},
                 "lost": {s.topic: s.lost for s in self._inputs.values()},
                 "verdicts": session.verdicts if session else 0,

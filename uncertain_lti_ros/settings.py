@@ -1,0 +1,142 @@
+"""Values of the node's parameters, in the types of what uses them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.node import Node
+
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.monitor.session import Rule
+from uncertain_lti_ros.parameters import RULE
+from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, Wish
+
+MIB = 1 << 20
+"""Bytes; parameters of size are in MiB."""
+
+
+class Settings:
+    """What the parameters of a node are set to.
+
+    Parameters
+    ----------
+    node : Node
+        Its parameters are declared.
+
+    Attributes
+    ----------
+    largest_message : int
+        Bytes of the largest message that is read.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._reals: dict[str, float] = {}
+        self.largest_message = self.size("largest_message")
+
+    def value(self, name: str) -> Any:
+        """A parameter as it is set.
+
+        Parameters
+        ----------
+        name : str
+            Of the parameter.
+
+        Returns
+        -------
+        object
+            Of the type that was declared.
+        """
+        return self._node.get_parameter(name).value
+
+    def real(self, name: str) -> float:
+        """A parameter that is a number.
+
+        Parameters
+        ----------
+        name : str
+            Of the parameter.
+
+        Returns
+        -------
+        float
+            In the parameter's own unit.
+        """
+        if name not in self._reals:  # to ask rclpy takes 10 µs
+            self._reals[name] = float(self._node.get_parameter(name).value)
+        return self._reals[name]
+
+    def size(self, name: str) -> int:
+        """A parameter that is a size in MiB.
+
+        Parameters
+        ----------
+        name : str
+            Of the parameter.
+
+        Returns
+        -------
+        int
+            Bytes.
+        """
+        return round(self.real(name) * MIB)
+
+    def changed(self) -> None:
+        """Read the parameters again: some were set."""
+        self._reals.clear()
+        self.largest_message = self.size("largest_message")
+
+    def rule(self, changes: dict[str, Any]) -> Rule:
+        """The alarm rule that the parameters ask for.
+
+        Parameters
+        ----------
+        changes : dict
+            Parameters of the rule that are about to be set, and their values.
+
+        Returns
+        -------
+        Rule
+            With these changes.
+        """
+        return Rule(**{name: changes.get(name, self.value(name)) for name in RULE})
+
+    def wish(self) -> Wish:
+        """The quality of service that the parameters ask for.
+
+        Returns
+        -------
+        Wish
+            Of every subscription to a topic of the model.
+
+        Raises
+        ------
+        ModelError
+            A parameter of the quality of service is set to a word that is none.
+        """
+        chosen: dict[str, Any] = {}
+        for name, known in (("reliability", RELIABILITY), ("durability", DURABILITY)):
+            text = self.value(f"qos.{name}")
+            if text != "match" and text not in known:
+                raise ModelError(f"parameter qos.{name} is {text!r}; choose match, {' or '.join(known)}")
+            chosen[name] = known.get(text)
+        return Wish(self.value("qos.depth"), **chosen)
+
+    def check_snapshots(self, on_alarm: bool) -> None:
+        """Refuse snapshots on an alarm without a folder for them.
+
+        Parameters
+        ----------
+        on_alarm : bool
+            Whether alarms ask for snapshots.
+
+        Raises
+        ------
+        ModelError
+            There is no folder.
+        """
+        if on_alarm and not self.value("snapshot.folder"):
+            raise ModelError(
+                "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the "
+                "node with the other"
+            )
