@@ -5,10 +5,9 @@ from __future__ import annotations
 import gc
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial, wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -23,27 +22,24 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.compiled import why_not
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.failures import Failures
 from uncertain_lti.monitor.journal import Journal
 from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED, VIOLATION
-from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session, topic_types
+from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session
 from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
-from uncertain_lti.recordings.message_reader import MessageReader
-from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti_ros.arguments import declare, run_node
-from uncertain_lti_ros.messages import definition, live_fields, message_class
+from uncertain_lti_ros.messages import definition, message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living, spare_the_middleware
+from uncertain_lti_ros.sessions import make_session
 from uncertain_lti_ros.settings import Settings
 from uncertain_lti_ros.subscriptions import MatchedSubscription
 
@@ -64,8 +60,6 @@ _TRANSITIONS = {
     getattr(Transition, name): name.removeprefix("TRANSITION_").lower()
     for name in ("TRANSITION_CONFIGURE", "TRANSITION_CLEANUP", "TRANSITION_ACTIVATE", "TRANSITION_DEACTIVATE")
 }
-
-_type_fields = cache(live_fields)
 
 
 class _Publisher:
@@ -147,27 +141,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- parameters ---
 
     def _make_session(self, path: str, rule: Rule) -> Session:
-        if not path:
-            raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")
-        file = Path(path).expanduser()  # no shell does that behind :=
-        if not (file.is_absolute() or os.path.exists(file)):
-            raise ModelError(f"{path}: there is no such model file in {Path.cwd()}; give the whole path")
-        model = UncertainLTI.load(file)
-        types = topic_types(model, path, _type_fields)
-        for names in (model.state_names, model.control_names):
-            sendable(names)
-        arming = self.session.arming if self.session else None
-        return Session(model, rule, types, _type_fields, self._make_reader, time.monotonic(), arming)
-
-    def _make_reader(self, type_name: str, paths: Sequence[FieldPath]) -> MessageReader:
-        kind = message_class(type_name)
-
-        def decode(data: bytes) -> Any:
-            if len(data) > self.settings.largest_message:
-                raise ValueError(f"{len(data)} bytes are more than parameter largest_message allows")
-            return deserialize_message(data, kind)
-
-        return MessageReader(type_name, paths, _type_fields, decode)
+        return make_session(path, rule, self.settings, self.session.arming if self.session else None)
 
     def _on_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Make what the new values ask for, or say why not; it takes its place in `_on_have_set`."""

@@ -1,0 +1,73 @@
+"""Session of a model file: its topics read by the message types that are installed here."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from rclpy.serialization import deserialize_message
+
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.arming import Arming
+from uncertain_lti.monitor.session import Rule, Session, topic_types
+from uncertain_lti.recordings.message_reader import MessageReader
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti_ros.messages import live_fields, message_class
+from uncertain_lti_ros.outputs import sendable
+from uncertain_lti_ros.settings import Settings
+
+_type_fields = cache(live_fields)
+
+
+def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | None = None) -> Session:
+    """Load a model file, and start a session with it.
+
+    Parameters
+    ----------
+    path : str
+        Of the file.
+    rule : Rule
+        The alarm rule.
+    settings : Settings
+        Of the node; messages over its `largest_message` are not read.
+    arming : Arming, optional
+        Of the session before.
+
+    Returns
+    -------
+    Session
+        With no sample.
+
+    Raises
+    ------
+    ModelError
+        There is no such file, it is no model, or the rule does not fit it.
+    SignalError
+        A field is not in its type, or the model does not say how samples are cut.
+    """
+    if not path:
+        raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")
+    file = Path(path).expanduser()  # no shell does that behind :=
+    if not (file.is_absolute() or os.path.exists(file)):
+        raise ModelError(f"{path}: there is no such model file in {Path.cwd()}; give the whole path")
+    model = UncertainLTI.load(file)
+    types = topic_types(model, path, _type_fields)
+    for names in (model.state_names, model.control_names):
+        sendable(names)
+
+    def make_reader(type_name: str, paths: Sequence[FieldPath]) -> MessageReader:
+        kind = message_class(type_name)
+
+        def decode(data: bytes) -> Any:
+            if len(data) > settings.largest_message:
+                raise ValueError(f"{len(data)} bytes are more than parameter largest_message allows")
+            return deserialize_message(data, kind)
+
+        return MessageReader(type_name, paths, _type_fields, decode)
+
+    return Session(model, rule, types, _type_fields, make_reader, time.monotonic(), arming)
