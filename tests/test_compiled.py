@@ -36,7 +36,6 @@ from uncertain_lti.model import bounds
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.monitor.envelope_monitor import NUMBERS
-from uncertain_lti.monitor.snapshot import Recent
 from uncertain_lti.monitor.verdict_messages import AnyVerdict
 from uncertain_lti.sampling import sampler as sampler_module
 from uncertain_lti.signals.signal_map import Signal
@@ -96,20 +95,10 @@ class Node(node_module.EnvelopeMonitorNode):
             output.send = self._keeps(name)
             output.listeners = int(name not in silent)
             output.look = lambda: None
-        self._recent = Recent(1e9, 1 << 30)
         self._on_tick()
 
     def _keeps(self, name: str) -> Callable[[bytes], None]:
         return lambda data: self.sent.append((name, data))
-
-    def _keep_beating(self) -> None:
-        """Never: it goes by the time that the test takes."""
-
-    def _keep_reporting(self) -> None:
-        """Never, likewise."""
-
-    def _take_due_snapshot(self) -> None:
-        """Never: what is remembered is only looked at."""
 
     def arrive(self, at_ns: int, topic: str, data: bytes) -> None:
         self._clock.nanoseconds = at_ns
@@ -133,7 +122,8 @@ class Node(node_module.EnvelopeMonitorNode):
             "last": last and (last.t_ns, last.outside_domain, last.alarm),
             "last numbers": last and [last.packed(name) for name in NUMBERS],
             "remembered": [
-                (e.arrival_ns, e.topic, e.data, e.alarm, [told(v) for v in e.verdicts]) for e in self._recent.entries()
+                (e.arrival_ns, e.topic, e.data, e.alarm, [told(v) for v in e.verdicts])
+                for e in self.snapshots.recent.entries()
             ],
             "period": (session._period.verdicts, session._period.outside, session._period.alarm),
         }
@@ -145,10 +135,14 @@ def told(verdict: AnyVerdict) -> tuple[Any, ...]:
 
 
 @pytest.fixture
-def ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def ros(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """Nodes whose inputs are `Input`, that keep all messages, and do nothing by the time that the test takes."""
     monkeypatch.setattr(node_module, "MatchedSubscription", Input)
+    given = {"heartbeat": 3600.0, "diagnostics_period": 3600.0, "snapshot.seconds": 3600.0, "snapshot.memory": 1024.0}
+    given |= {"snapshot.folder": tmp_path / "snapshots"}
+    arguments = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
     with own_domain() as domain:
-        rclpy.init(domain_id=domain)
+        rclpy.init(args=["--ros-args", *arguments], domain_id=domain)
         try:
             yield
         finally:

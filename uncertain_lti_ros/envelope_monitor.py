@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import json
-import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial, wraps
@@ -30,17 +29,18 @@ from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.failures import Failures
 from uncertain_lti.monitor.journal import Journal
-from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED, VIOLATION
+from uncertain_lti.monitor.outputs import OUTPUTS, VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session
-from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
+from uncertain_lti.monitor.snapshot import Entry
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
 from uncertain_lti_ros.arguments import declare, run_node
-from uncertain_lti_ros.messages import definition, message_class
+from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
 from uncertain_lti_ros.process import living, spare_the_middleware
 from uncertain_lti_ros.sessions import make_session
 from uncertain_lti_ros.settings import Settings
+from uncertain_lti_ros.snapshots import Snapshots
 from uncertain_lti_ros.subscriptions import MatchedSubscription
 
 NAME = "envelope_monitor"
@@ -53,7 +53,6 @@ _TICK = 0.2  # s between two looks at what goes by time
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
 _NOTE = 0.05  # s between two looks for what the log should say
 _OUTPUT_DEPTH = 1000
-_SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 _LAST_WORDS = 1.0  # s that the end waits for readers of /diagnostics to have the last report
 
 _TRANSITIONS = {
@@ -119,10 +118,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.failures = Failures(self.get_logger().error)
         self._clock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
         self._simulated = self._clock.ros_time_is_active
-        self._recent: Recent | None = None  # kept while snapshots can be asked for
-        self._album: Album | None = None
-        self._snapshot_due: float | None = None
-        self._alarmed = -math.inf  # when an alarm was last over
+        self.snapshots = Snapshots(self, self.settings)
         self._journal = Journal(self._log)
         self._noted = 0.0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -190,8 +186,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             session.go_on_from(self.session)
         self.session = session
         self._prepare_outputs()
-        if self._recent is not None:
-            self._recent.clear()
+        self.snapshots.clear()
         if self.active:
             self._subscribe()
         name = Path(str(self.settings.value("model"))).name
@@ -237,7 +232,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         try:
             self.settings.wish()
             self.session = self._make_session(path, self.settings.rule({}))
-            self._open_album()
+            self.snapshots.open()
         except Exception as error:
             self.session = None
             self._reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
@@ -257,14 +252,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session.model.sampling.dt_median is None:
             self.get_logger().info("the model has no median step, so nothing is predicted")
         return super().on_configure(state)
-
-    def _open_album(self) -> None:
-        folder = str(self.settings.value("snapshot.folder"))
-        self.settings.check_snapshots(self.settings.value("snapshot.on_alarm"))
-        if folder:
-            limit = self.settings.size("snapshot.megabytes")
-            self._album = Album(folder, self.get_fully_qualified_name(), self.settings.value("snapshot.keep"), limit)
-            self._recent = Recent(self.settings.real("snapshot.seconds"), self.settings.size("snapshot.memory"))
 
     def _prepare_outputs(self) -> None:
         assert self.session is not None
@@ -386,11 +373,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _put_away(self) -> None:
         self._unsubscribe()
-        if self._snapshot_due is not None:
-            self._take_due_snapshot()
-        if self._album is not None:
-            self._album.close()
-        self._album = self._recent = self._snapshot_due = None
+        self.snapshots.close(self.session)
         for output in self._outputs.values():
             self.destroy_lifecycle_publisher(output.publisher)
         self._outputs.clear()
@@ -461,18 +444,12 @@ class EnvelopeMonitorNode(LifecycleNode):
         turned = session.alarm != alarm
         if turned:
             self._journal.turned(session, verdicts, now)
-        if self._recent is not None:
-            self._recent.add(Entry(now, arrival, topic, data, verdicts, session.alarm))
-            if session.alarms > alarms and self._snapshot_due is None and self._is_first_alarm(now):
-                self._snapshot_due = now + self.settings.real("snapshot.after")
+        if self.snapshots.recent is not None:
+            self.snapshots.add(Entry(now, arrival, topic, data, verdicts, session.alarm), session.alarms > alarms)
         if turned and not session.alarm:
-            self._alarmed = now
+            self.snapshots.alarm_over(now)
         if verdicts or opened or turned:
             self._publish(session, verdicts, opened, now, turned)
-
-    def _is_first_alarm(self, now: float) -> bool:
-        """There was none for as long as a snapshot goes back: one that flaps must not drive out the first file."""
-        return now - self._alarmed >= self.settings.real("snapshot.seconds")
 
     def _publish(self, session: Session, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
         """Publish what is listened to; turned: the alarm did, which is said in any case.
@@ -512,7 +489,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_tick(self) -> None:
         self._look_at_clock()
-        tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_album, self._keep_journal
+        tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_snapshots, self._keep_journal
         for task in tasks:
             try:
                 task()
@@ -579,38 +556,9 @@ class EnvelopeMonitorNode(LifecycleNode):
         else:
             self.get_logger().info(line)
 
-    def _keep_album(self) -> None:
-        if self._snapshot_due is not None and time.monotonic() >= self._snapshot_due:
-            self._take_due_snapshot()
-
-    def _take_due_snapshot(self) -> None:
-        assert self._album is not None
-        if not self.settings.value("snapshot.on_alarm"):
-            self._snapshot_due = None
-        elif not self._album.busy:
-            self._snapshot_due = None
-            try:
-                self.get_logger().info(f"alarm: {self._album.take(self._scene('alarm'), 0.0)}")
-            except UncertainLTIError as error:
-                self.get_logger().error(str(error))
-
-    def _scene(self, why: str) -> Scene:
-        assert self.session is not None and self._recent is not None
-        session = self.session
-        rule = session.monitor.rule
-        return Scene(
-            self._recent.entries(),
-            session.model.state_names,
-            session.types,
-            {output.name: self.resolve_topic_name(f"~/{output.name}") for output in RECORDED},
-            {
-                "node": self.get_fully_qualified_name(),
-                "why": why,
-                "model": str(self.settings.value("model")),
-                "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
-            },
-            definition,
-        )
+    def _keep_snapshots(self) -> None:
+        if self.session is not None:
+            self.snapshots.write_due(self.session)
 
     def _lasting_problems(self) -> list[str]:
         """The same where no topic of the model is concerned, and only what lasts."""
@@ -630,9 +578,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             if subscription.late > late:
                 problems.append(f"{subscription.topic}: {subscription.late - late} deadlines missed by its publishers")
         problems += self._lasting_problems()
-        if self._album is not None and self._album.problem:
-            problems.append(self._album.problem)
-        return problems + self.failures.problems()
+        return problems + self.snapshots.problems + self.failures.problems()
 
     def _report(self) -> None:
         now = self._reported = time.monotonic()
@@ -647,8 +593,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                     f"qos {topic}": f"{subscription.qos.reliability.name} {subscription.qos.durability.name}".lower(),
                 }
             extra["unexpected errors"] = str(self.failures.count)
-            if self._album is not None:
-                extra |= {"snapshots": str(self._album.written), "last snapshot": self._album.last}
+            extra |= self.snapshots.values
             reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
         else:
             state = self._state_machine.current_state[1]
@@ -715,11 +660,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_snapshot(self, response: Trigger.Response) -> None:
         """Write the last seconds to a file."""
-        if self._album is None or self.session is None:
-            if self.settings.value("snapshot.folder"):
-                raise ModelError("the node is not configured, so there is nothing to write")
-            raise ModelError("parameter snapshot.folder is empty; start the node with a folder for snapshots")
-        response.message = self._album.take(self._scene("asked for"), _SERVICE_WAIT)
+        response.message = self.snapshots.write(self.session)
         response.success = True
 
     def _on_status(self, response: Trigger.Response) -> None:
@@ -745,7 +686,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "future": dict(session.future) if session else {},
                 "decoded": session.decoded if session else {},
                 "unexpected_errors": self.failures.count,
-                "snapshot": self._album.last if self._album else "",
+                "snapshot": self.snapshots.last,
                 "problems": self._problems(),
             }
         )

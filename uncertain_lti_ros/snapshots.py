@@ -1,0 +1,183 @@
+"""Snapshots of the node: what it keeps in memory for them, and when it writes one."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from rclpy.node import Node
+
+from uncertain_lti.base.errors import ModelError, UncertainLTIError
+from uncertain_lti.monitor.outputs import RECORDED
+from uncertain_lti.monitor.session import Session
+from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
+from uncertain_lti_ros.messages import definition
+from uncertain_lti_ros.settings import Settings
+
+_SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
+
+
+class Snapshots:
+    """The last seconds of a node, written to a file when a service asks for it or after an alarm.
+
+    Parameters
+    ----------
+    node : Node
+        Gives its name and its topics.
+    settings : Settings
+        The parameters `snapshot.*` of the node.
+
+    Attributes
+    ----------
+    recent : Recent or None
+        The messages in memory; None while there is no folder to write to, or no session.
+    """
+
+    def __init__(self, node: Node, settings: Settings) -> None:
+        self._node, self._settings = node, settings
+        self.recent: Recent | None = None
+        self._album: Album | None = None
+        self._due: float | None = None
+        self._alarmed = -math.inf  # when an alarm was last over
+
+    def open(self) -> None:
+        """Keep messages from now on, if there is a folder to write to.
+
+        Raises
+        ------
+        ModelError
+            The folder cannot be written to, or is missing and alarms ask for snapshots.
+        """
+        folder = str(self._settings.value("snapshot.folder"))
+        self._settings.check_snapshots(self._settings.value("snapshot.on_alarm"))
+        if folder:
+            limit = self._settings.size("snapshot.megabytes")
+            name = self._node.get_fully_qualified_name()
+            self._album = Album(folder, name, self._settings.value("snapshot.keep"), limit)
+            self.recent = Recent(self._settings.real("snapshot.seconds"), self._settings.size("snapshot.memory"))
+
+    def close(self, session: Session | None) -> None:
+        """Write what is due, and forget all messages.
+
+        Parameters
+        ----------
+        session : Session, optional
+            The session that ends.
+        """
+        if self._due is not None and session is not None:
+            self._take_due(session)
+        if self._album is not None:
+            self._album.close()
+        self._album = self.recent = self._due = None
+
+    def clear(self) -> None:
+        """Forget all messages: another model reads the next ones."""
+        if self.recent is not None:
+            self.recent.clear()
+
+    def add(self, entry: Entry, raised: bool) -> None:
+        """Keep one more message; call it while `recent` is not None.
+
+        Parameters
+        ----------
+        entry : Entry
+            The latest.
+        raised : bool
+            Whether it raised the alarm.
+        """
+        assert self.recent is not None
+        self.recent.add(entry)
+        if raised and self._due is None and self._is_first_alarm(entry.now):
+            self._due = entry.now + self._settings.real("snapshot.after")
+
+    def alarm_over(self, now: float) -> None:
+        """The alarm is over.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+        """
+        self._alarmed = now
+
+    def _is_first_alarm(self, now: float) -> bool:
+        """There was none for as long as a snapshot goes back: one that flaps must not drive out the first file."""
+        return now - self._alarmed >= self._settings.real("snapshot.seconds")
+
+    def write_due(self, session: Session) -> None:
+        """Begin to write the snapshot of an alarm, if its time has come.
+
+        Parameters
+        ----------
+        session : Session
+            The session.
+        """
+        if self._due is not None and time.monotonic() >= self._due:
+            self._take_due(session)
+
+    def _take_due(self, session: Session) -> None:
+        assert self._album is not None
+        if not self._settings.value("snapshot.on_alarm"):
+            self._due = None
+        elif not self._album.busy:
+            self._due = None
+            try:
+                self._node.get_logger().info(f"alarm: {self._album.take(self._scene(session, 'alarm'), 0.0)}")
+            except UncertainLTIError as error:
+                self._node.get_logger().error(str(error))
+
+    def write(self, session: Session | None) -> str:
+        """Write the last seconds to a file.
+
+        Parameters
+        ----------
+        session : Session, optional
+            The session, where there is one.
+
+        Returns
+        -------
+        str
+            What became of it, a sentence.
+
+        Raises
+        ------
+        ModelError
+            There is no folder, nothing to write, or writing failed; says why.
+        """
+        if self._album is None or session is None:
+            if self._settings.value("snapshot.folder"):
+                raise ModelError("the node is not configured, so there is nothing to write")
+            raise ModelError("parameter snapshot.folder is empty; start the node with a folder for snapshots")
+        return self._album.take(self._scene(session, "asked for"), _SERVICE_WAIT)
+
+    def _scene(self, session: Session, why: str) -> Scene:
+        assert self.recent is not None
+        rule = session.monitor.rule
+        return Scene(
+            self.recent.entries(),
+            session.model.state_names,
+            session.types,
+            {output.name: self._node.resolve_topic_name(f"~/{output.name}") for output in RECORDED},
+            {
+                "node": self._node.get_fully_qualified_name(),
+                "why": why,
+                "model": str(self._settings.value("model")),
+                "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
+            },
+            definition,
+        )
+
+    @property
+    def last(self) -> str:
+        """Path of the last file; empty where there is none."""
+        return self._album.last if self._album else ""
+
+    @property
+    def values(self) -> dict[str, str]:
+        """What diagnostics say of the files; nothing while there is no folder."""
+        return {} if self._album is None else {"snapshots": str(self._album.written), "last snapshot": self._album.last}
+
+    @property
+    def problems(self) -> list[str]:
+        """Why the last file was not written, if it was not."""
+        return [self._album.problem] if self._album is not None and self._album.problem else []
