@@ -10,7 +10,6 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
@@ -34,6 +33,7 @@ from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Sess
 from uncertain_lti.monitor.snapshot import Entry
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
 from uncertain_lti_ros.arguments import declare, run_node
+from uncertain_lti_ros.diagnostics import Diagnostics, input_values
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
@@ -109,7 +109,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._reason = ""  # why the last configure failed
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self._inputs: dict[str, MatchedSubscription] = {}
-        self._told: dict[str, tuple[int, int]] = {}  # topic: lost and late messages that the last report told of
         self._outputs: dict[str, _Publisher] = {}
         self._enable_problem = ""
         self._candidate: Session | Rule | None = None  # accepted, not yet in place
@@ -121,7 +120,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.snapshots = Snapshots(self, self.settings)
         self._journal = Journal(self._log)
         self._noted = 0.0
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = Diagnostics(self, str(self.settings.value("hardware_id")))
         services = {
             "status": self._on_status, "reset": self._on_reset, "reload": self._on_reload, "snapshot": self._on_snapshot
         }  # fmt: skip
@@ -385,7 +384,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.trigger_shutdown()
         self._reason = ""
         self._report()
-        self._diagnostics.wait_for_all_acked(Duration(seconds=_LAST_WORDS))
+        self._diagnostics.wait(_LAST_WORDS)
 
     # --- what nobody thought of ---
 
@@ -533,7 +532,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = time.monotonic()
         if now - self._reported < self.settings.real("diagnostics_period"):
             return
-        if self.session is not None and self.active and not self._diagnostics.get_subscription_count():
+        if self.session is not None and self.active and not self._diagnostics.listeners:
             self._reported = now
             self.session.pass_over(now)
             self._note_told()
@@ -569,31 +568,15 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _problems(self) -> list[str]:
         """What keeps messages from coming, beside silence, and what went wrong here since the last report."""
-        problems = []
-        for topic, subscription in self._inputs.items():
-            problems += subscription.problems
-            lost, late = self._told.get(topic, (0, 0))
-            if subscription.lost > lost:
-                problems.append(f"{subscription.topic}: {subscription.lost - lost} messages lost on the way")
-            if subscription.late > late:
-                problems.append(f"{subscription.topic}: {subscription.late - late} deadlines missed by its publishers")
-        problems += self._lasting_problems()
+        problems = self._diagnostics.problems(self._inputs) + self._lasting_problems()
         return problems + self.snapshots.problems + self.failures.problems()
 
     def _report(self) -> None:
         now = self._reported = time.monotonic()
         if self.session is not None and self.active:
             reports = self.session.report(now, self.settings.real("state_timeout"), self._problems())
-            extra: dict[str, str] = {}
-            for topic, subscription in self._inputs.items():
-                extra |= {
-                    f"publishers {topic}": str(subscription.publishers),
-                    f"lost {topic}": str(subscription.lost),
-                    f"deadlines missed {topic}": str(subscription.late),
-                    f"qos {topic}": f"{subscription.qos.reliability.name} {subscription.qos.durability.name}".lower(),
-                }
-            extra["unexpected errors"] = str(self.failures.count)
-            extra |= self.snapshots.values
+            extra = input_values(self._inputs)
+            extra |= {"unexpected errors": str(self.failures.count), **self.snapshots.values}
             reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
         else:
             state = self._state_machine.current_state[1]
@@ -603,27 +586,11 @@ class EnvelopeMonitorNode(LifecycleNode):
             if self.session is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
         self._note_told()
-        full_name = self.get_fully_qualified_name().lstrip("/")
-        hardware = str(self.settings.value("hardware_id")) or self.get_name()
-        message = DiagnosticArray()
-        message.header.stamp = self._clock.now().to_msg()
-        path = str(self.settings.value("model"))
-        for report in reports:
-            values = {"model": path, **report.values} if report is reports[0] else report.values
-            message.status.append(
-                DiagnosticStatus(
-                    level=bytes([report.level]),
-                    name=f"{full_name}: {report.name}",
-                    message=report.message,
-                    hardware_id=hardware,
-                    values=[KeyValue(key=key, value=value) for key, value in values.items()],
-                )
-            )
-        self._diagnostics.publish(message)
+        self._diagnostics.publish(reports, self._clock.now().to_msg(), str(self.settings.value("model")))
 
     def _note_told(self) -> None:
         self.failures.reported()
-        self._told = {topic: (subscription.lost, subscription.late) for topic, subscription in self._inputs.items()}
+        self._diagnostics.reported(self._inputs)
 
     # --- services ---
 
