@@ -82,11 +82,11 @@ def recordings(plants: Iterable[int]) -> Held:
         if "interval" in data["scenario"]:
             low, high = data["scenario"]["interval"]
             held.setdefault("recordings that leave, by support", []).append(low <= risk <= high)
-        wish = rng.uniform(0.2, 1.0) / (100 * DT / 3600)
-        found = calibrate(validation, wish)
+        target = rng.uniform(0.2, 1.0) / (100 * DT / 3600)
+        found = calibrate(validation, target)
         if found.alarm_rule is not None:
             alarms, _ = true_alarms(validation.model, x, u, found.alarm_rule)
-            held.setdefault("calibrated alarm keeps to the wish", []).append(alarms.sum() / hours <= wish)
+            held.setdefault("calibrated alarm keeps to the target", []).append(alarms.sum() / hours <= target)
     return held
 
 
@@ -126,7 +126,7 @@ def groups(plants: Iterable[int]) -> Held:
         runs = [r for g in range(3) for r in variant(base, rng, 0.1).transients(4, 100 * seed + g, noise=1e-3)]
         days = [variant(base, rng, 0.1).arrays(5, 500_000 + 100 * seed + i, noise=1e-3) for i in range(50)]
         x, u = (np.concatenate(arrays) for arrays in zip(*days, strict=True))
-        hours, wish = len(x) * 100 * DT / 3600, rng.uniform(0.2, 1.0) / (100 * DT / 3600)
+        hours, target = len(x) * 100 * DT / 3600, rng.uniform(0.2, 1.0) / (100 * DT / 3600)
         for name, by in (("by day", [g for g in range(3) for _ in range(4)]), (IN_VAIN, None)):
             validation = validate(runs, criterion=("qp", "lp")[seed % 2], additive="noise", groups=by)
             data = validation.to_dict()
@@ -136,10 +136,12 @@ def groups(plants: Iterable[int]) -> Held:
                 held.setdefault(f"{name}: alarms per hour", []).append(low <= alarms.sum() / hours <= (high or np.inf))
             low, high = data["inside_interval"]
             held.setdefault(f"{name}: verdicts inside", []).append(low <= 1 - left.mean() <= high)
-            found = calibrate(validation, wish)
+            found = calibrate(validation, target)
             if found.alarm_rule is not None:
                 alarms, _ = true_alarms(validation.model, x, u, found.alarm_rule)
-                held.setdefault(f"{name}: calibrated alarm keeps to the wish", []).append(alarms.sum() / hours <= wish)
+                held.setdefault(f"{name}: calibrated alarm keeps to the target", []).append(
+                    alarms.sum() / hours <= target
+                )
     return held
 
 
@@ -205,11 +207,11 @@ def _compare(
         )
     low, high = data["inside_interval"]
     held.setdefault(f"{rest_of}: verdicts inside", []).append(low <= 1 - left.mean() <= high)
-    wish = rng.uniform(0.2, 1.0) / (100 * DT / 3600)
-    found = calibrate(validation, wish)
+    target = rng.uniform(0.2, 1.0) / (100 * DT / 3600)
+    found = calibrate(validation, target)
     if found.alarm_rule is not None:
         alarms, _ = true_alarms(validation.model, x, u, found.alarm_rule)
-        held.setdefault(f"{rest_of}: calibrated alarm keeps to the wish", []).append(alarms.sum() / hours <= wish)
+        held.setdefault(f"{rest_of}: calibrated alarm keeps to the target", []).append(alarms.sum() / hours <= target)
 
 
 STUDIES: dict[str, Callable[[Iterable[int]], Held]] = {

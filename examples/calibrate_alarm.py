@@ -7,7 +7,7 @@ from uncertain_lti import EnvelopeMonitor, fit, read_transients, validate
 from uncertain_lti.validation.calibration import calibrate
 
 ROOT = Path(__file__).resolve().parents[1]
-WISH = 1500  # false alarms per hour at most: the recordings are two minutes long and cannot show less
+TARGET = 1500  # false alarms per hour at most: the recordings are two minutes long and cannot show less
 
 
 def main() -> None:
@@ -18,7 +18,7 @@ def main() -> None:
     model = fit(runs, criterion="lp", additive="noise")
 
     validation = validate(runs, blocks=10, full=model, criterion="lp", additive="noise")
-    calibration = calibrate(validation, WISH)
+    calibration = calibrate(validation, TARGET)
     print(calibration.words)
     if calibration.alarm_rule is None:
         return

@@ -363,14 +363,14 @@ def test_groups_that_are_likely_are_named_if_none_were_given(runs, hours, words)
 # --- calibration ---
 
 
-def test_calibration_keeps_to_the_wish_and_says_what_it_costs(validation, runs):
+def test_calibration_keeps_to_the_target_and_says_what_it_costs(validation, runs):
     hours = 120 / 3600
     strict, loose = calibrate(validation, 5 / hours), calibrate(validation, 40 / hours)
     assert strict.alarm_rule is not None and loose.alarm_rule is not None
     for found in (strict, loose):
         for c in found.candidates:
             if c.margin is not None:
-                assert c.upper <= found.wish
+                assert c.upper <= found.target
                 assert sum(p.alarms(AlarmRule(c.violations, c.window, c.margin)) for p in validation.parts) == c.alarms
         assert "confidence" in found.words and "is seen" in found.words
         json.dumps(found.to_dict(), allow_nan=False)
@@ -519,7 +519,7 @@ def test_a_rule_that_sees_little_is_warned_of(folder, capsys, monkeypatch):
     """The warning stands on its own line exactly when some state's faults are mostly missed."""
     model, target = str(folder / "m.json"), str(folder / "found.json")
     lines = {}
-    for size in (1e-6, 1.0):  # a fault of next to nothing is not seen by a rule that keeps to the wish
+    for size in (1e-6, 1.0):  # a fault of next to nothing is not seen by a rule that keeps to the target
         monkeypatch.setattr("uncertain_lti.validation.calibration.detection.__defaults__", (size,))
         capsys.readouterr()
         assert main(["validate", model, "--false-alarms", "2000", "--output", target]) == 0

@@ -387,7 +387,7 @@ def _entry(channel: Channel) -> tuple[int, int, str, str, dict[str, str]]:
 
 
 def _free(taken: Mapping[int, object], preferred: int) -> int:
-    """The number wished for, or the next one that is free."""
+    """The number asked for, or the next one that is free."""
     if preferred not in taken:
         return preferred
     number = max(taken) + 1

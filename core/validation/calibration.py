@@ -1,4 +1,4 @@
-"""Calibration: the alarm rule that keeps to a wished rate of false alarms, learnt on what was left out of the fit."""
+"""Calibration: the alarm rule that keeps to a target rate of false alarms, by what was left out of the fit."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STARTS = 8
 
 @dataclass(frozen=True)
 class Candidate:
-    """One alarm rule at the smallest margin that keeps to the wish.
+    """One alarm rule at the smallest margin that keeps to the target.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Candidate:
     window : int
         n of the rule, in verdicts.
     margin : float or None
-        The smallest margin; None where none keeps to the wish.
+        The smallest margin; None where none keeps to the target.
     alarms : int
         False alarms on the left-out parts at that margin.
     upper : float
@@ -67,15 +67,15 @@ class Calibration:
     Parameters
     ----------
     alarm_rule : AlarmRule or None
-        The choice; None where no rule can be shown to keep to the wish.
-    wish : float
-        False alarms per hour at most.
+        The choice; None where no rule can be shown to keep to the target.
+    target : float
+        Target rate: false alarms per hour at most.
     confidence : float
-        That the true rate is below the wish.
+        That the true rate is below the target.
     hours : float
         Time under verdict in the left-out parts, h.
     needed_hours : float
-        Time without a false alarm that would show the wish, h.
+        Time without a false alarm that would show the target, h.
     candidates : tuple of Candidate
         One per rule tried.
     words : str
@@ -85,7 +85,7 @@ class Calibration:
     """
 
     alarm_rule: AlarmRule | None
-    wish: float
+    target: float
     confidence: float
     hours: float
     needed_hours: float
@@ -103,7 +103,7 @@ class Calibration:
             Plain data for JSON; null for what is infinite.
         """
         return {
-            "wish_per_hour": self.wish,
+            "target_per_hour": self.target,
             "confidence": self.confidence,
             "hours": self.hours,
             "needed_hours": self.needed_hours,
@@ -128,15 +128,15 @@ class Calibration:
 
 def calibrate(
     validation: Validation,
-    wish: float,
+    target: float,
     *,
     rules: Sequence[tuple[int, int]] = RULES,
     confidence: float | None = None,
 ) -> Calibration:
-    """Find the rule and margin whose false alarms stay below a wish, and which then see a stated fault soonest.
+    """Find the rule and margin whose false alarms stay below a target, and which then see a stated fault soonest.
 
     For each rule, margins are tried from the largest down, as long as the upper confidence limit of the false alarms
-    on the left-out parts stays at or below the wish; going in a fixed order and stopping at the first failure, the
+    on the left-out parts stays at or below the target; going in a fixed order and stopping at the first failure, the
     confidence of one test holds for the whole search. The error is shared equally among the rules, so that choosing
     among them costs no confidence. Chosen is the rule that detects the largest share of the stated faults, then the
     one that does so soonest, then the one with the smallest margin.
@@ -145,12 +145,12 @@ def calibrate(
     ----------
     validation : Validation
         Of `validate`; its parts are what the search counts on.
-    wish : float
-        False alarms per hour at most.
+    target : float
+        Target rate: false alarms per hour at most.
     rules : sequence of (int, int), optional
         (violations, window) of each rule; default RULES.
     confidence : float, optional
-        That the true rate is below the wish; default that of the validation.
+        That the true rate is below the target; default that of the validation.
 
     Returns
     -------
@@ -160,10 +160,10 @@ def calibrate(
     Raises
     ------
     FitError
-        The wish is not positive, or a rule is none.
+        The target is not positive, or a rule is none.
     """
-    if not (math.isfinite(wish) and wish > 0):
-        raise FitError(f"the wished false alarms per hour are {wish}; give a positive number")
+    if not (math.isfinite(target) and target > 0):
+        raise FitError(f"the target is {target} false alarms per hour; give a positive number")
     if not rules:
         raise FitError("no alarm rule to choose from; give at least one (violations, window)")
     for m, n in rules:
@@ -173,11 +173,13 @@ def calibrate(
     each = 1.0 - (1.0 - confidence) / len(rules)
     parts = validation.parts
     hours = sum(p.hours for p in parts)
-    candidates = tuple(_candidate(parts, m, n, wish, each, hours) for m, n in rules)
-    needed = rate_interval(np.zeros(validation.units), 1.0, each, one_sided=True)[1] / wish
+    candidates = tuple(_candidate(parts, m, n, target, each, hours) for m, n in rules)
+    needed = rate_interval(np.zeros(validation.units), 1.0, each, one_sided=True)[1] / target
     found = [c for c in candidates if c.margin is not None]
     if not found:
-        return Calibration(None, wish, confidence, hours, needed, candidates, _refusal(candidates, wish, hours, needed))
+        return Calibration(
+            None, target, confidence, hours, needed, candidates, _refusal(candidates, target, hours, needed)
+        )
     best = max(found, key=lambda c: (float(c.detected.min()), -float(c.delay.max()), -(c.margin or 0.0)))
     assert best.margin is not None
     names = validation.model.state_names
@@ -185,7 +187,7 @@ def calibrate(
     missed = 1.0 - float(best.detected[slow])
     words = (
         f"alarm at {best.violations} of {best.window} verdicts outside {best.margin:.3g} times the half-widths: at "
-        f"most {wish:g} false alarms per hour with {confidence:.0%} confidence {short_condition(validation)} "
+        f"most {target:g} false alarms per hour with {confidence:.0%} confidence {short_condition(validation)} "
         f"({best.alarms} in {hours:.3g} h left "
         f"out, limit {best.upper:.3g} per hour); a fault that moves one state by {FAULT_SIZE:g} mean width more in "
         f"every step is seen "
@@ -196,7 +198,7 @@ def calibrate(
         )
     )
     rule = AlarmRule(best.violations, best.window, best.margin)
-    return Calibration(rule, wish, confidence, hours, needed, candidates, words, _deaf(best.detected, names))
+    return Calibration(rule, target, confidence, hours, needed, candidates, words, _deaf(best.detected, names))
 
 
 def _deaf(detected: Array, names: Sequence[str]) -> str:
@@ -210,7 +212,7 @@ def _deaf(detected: Array, names: Sequence[str]) -> str:
     )
 
 
-def _candidate(parts: Sequence[Part], m: int, n: int, wish: float, confidence: float, hours: float) -> Candidate:
+def _candidate(parts: Sequence[Part], m: int, n: int, target: float, confidence: float, hours: float) -> Candidate:
     levels = [p.level(m, n) for p in parts]
     counts = by_unit(
         parts,
@@ -222,7 +224,7 @@ def _candidate(parts: Sequence[Part], m: int, n: int, wish: float, confidence: f
         nearby = int(np.argmax(np.array([*MARGINS, 0.0]) <= borrowed_margin(largest, margin)))
         typical = cluster_size(counts[min(nearby, len(counts) - 1)])
         upper = rate_interval(row, hours, confidence, typical, one_sided=True)[1]
-        if upper > wish:
+        if upper > target:
             if chosen is None:
                 count, limit = int(row.sum()), upper
             break
@@ -280,15 +282,16 @@ def detection(parts: Sequence[Part], rule: AlarmRule, size: float = FAULT_SIZE) 
     return detected, delay
 
 
-def _refusal(candidates: Sequence[Candidate], wish: float, hours: float, needed: float) -> str:
+def _refusal(candidates: Sequence[Candidate], target: float, hours: float, needed: float) -> str:
     if hours < needed:
         return (
-            f"no alarm rule can be shown to stay below {wish:g} false alarms per hour: the left-out recordings cover "
-            f"{hours:.3g} h, and even without a single alarm {needed:.3g} h are needed; record more, or wish for less"
+            f"no alarm rule can be shown to stay below {target:g} false alarms per hour: the left-out recordings cover "
+            f"{hours:.3g} h, and even without a single alarm {needed:.3g} h are needed; record more, or "
+            f"choose a higher target"
         )
     best = min(candidates, key=lambda c: c.upper)
     return (
-        f"no alarm rule can be shown to stay below {wish:g} false alarms per hour: even at {MARGINS[0]:g} times the "
+        f"no alarm rule can be shown to stay below {target:g} false alarms per hour: even at {MARGINS[0]:g} times the "
         f"half-widths, {best.violations} of {best.window} verdicts raise {best.alarms} alarms in {hours:.3g} h left "
-        f"out (limit {best.upper:.3g} per hour); look at what leaves the envelope so far, or wish for less"
+        f"out (limit {best.upper:.3g} per hour); look at what leaves the envelope so far, or choose a higher target"
     )
