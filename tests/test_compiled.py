@@ -116,7 +116,7 @@ class Node(node_module.EnvelopeMonitorNode):
             "unreadable": session.unreadable,
             "future": session.future,
             "judged": (session.verdicts, session.violations, session.alarms, session.alarm, session.failures),
-            "window": (list(session.monitor._window._recent), session.monitor._window._violations),
+            "window": session.monitor.alarm_statistic.recent,
             "latest": repr(session.sampler.latest()),
             "enable": (session.arming.on, session.arming.value),
             "last": last and (last.t_ns, last.outside_domain, last.alarm),
@@ -125,7 +125,7 @@ class Node(node_module.EnvelopeMonitorNode):
                 (e.arrival_ns, e.topic, e.data, e.alarm, [told(v) for v in e.verdicts])
                 for e in self.snapshots.recent.entries()
             ],
-            "period": (session._period.verdicts, session._period.outside, session._period.alarm),
+            "period": (session.period.verdicts, session.period.outside, session.period.alarm),
         }
 
 

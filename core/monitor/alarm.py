@@ -65,6 +65,11 @@ class AlarmWindow:
         self._violations = 0
         self.alarm = False
 
+    @property
+    def recent(self) -> tuple[bool, ...]:
+        """The verdicts in the window, oldest first: whether each is a violation that counts."""
+        return tuple(self._recent)
+
     def push(self, violated: bool) -> bool:
         """Take one verdict.
 

@@ -268,6 +268,11 @@ class EnvelopeMonitor:
     masked : sequence of str, optional
         States that are judged like the others, and whose violations never count for the alarm.
 
+    Attributes
+    ----------
+    alarm_statistic : AlarmStatistic
+        What raises the alarm.
+
     Raises
     ------
     ModelError
@@ -308,7 +313,7 @@ class EnvelopeMonitor:
             self._counted,
             None if domain.measure is None else domain.measure.occupied,
         )
-        self._window: AlarmStatistic = AlarmWindow(self.rule)
+        self.alarm_statistic: AlarmStatistic = AlarmWindow(self.rule)
         self._shortest, self._longest = model.sampling.step_range
 
     def __repr__(self) -> str:
@@ -321,11 +326,11 @@ class EnvelopeMonitor:
     @property
     def alarm(self) -> bool:
         """The alarm after the last verdict."""
-        return self._window.alarm
+        return self.alarm_statistic.alarm
 
     def reset(self) -> None:
         """Forget the recent verdicts and the alarm."""
-        self._window.reset()
+        self.alarm_statistic.reset()
 
     def predict(self, x: ArrayLike, u: ArrayLike, dt: float) -> tuple[Array, Array]:
         """Bounds one step ahead, recorded units.
@@ -399,7 +404,7 @@ class EnvelopeMonitor:
         Verdict
             With the alarm after it.
         """
-        window = self._window
+        window = self.alarm_statistic
         if step.status is Status.RESET or not armed:
             window.reset()
         if step.status is not Status.OK:

@@ -112,8 +112,32 @@ class Report:
 
 
 @dataclass
-class _Period:
-    """What has happened since the last report."""
+class Period:
+    """What has happened since the last report.
+
+    Parameters
+    ----------
+    began : float
+        Steady time, s.
+    verdicts : int, default 0
+        Verdicts given in it.
+    outside : int, default 0
+        Those from outside the fitted domain.
+    alarm : bool, default False
+        The alarm was raised at some time in it.
+    violations : Counter of int
+        By number of the state.
+    statuses : Counter of Status
+        Of the samples in it.
+    counters : Counter of str
+        Those of the sampler when it began.
+    late : int, default 0
+        Late messages when it began.
+    unreadable : int, default 0
+        Unreadable messages when it began.
+    future : int, default 0
+        Messages with a stamp in the future when it began.
+    """
 
     began: float
     verdicts: int = 0
@@ -121,7 +145,7 @@ class _Period:
     alarm: bool = False
     violations: Counter[int] = field(default_factory=Counter)
     statuses: Counter[Status] = field(default_factory=Counter)
-    counters: Counter[str] = field(default_factory=Counter)  # at its beginning, as those below
+    counters: Counter[str] = field(default_factory=Counter)
     late: int = 0
     unreadable: int = 0
     future: int = 0
@@ -201,6 +225,8 @@ class Session:
         An alarm has been raised that lasts until `reset`.
     enable_topic : str
         Topic of the enable condition; empty without one.
+    period : Period
+        What has happened since the last report.
 
     Raises
     ------
@@ -251,7 +277,7 @@ class Session:
         self.last: Verdict | None = None
         self._heard: dict[str, float] = {}
         self._began, self._judged = now, -math.inf
-        self._period = _Period(now)
+        self.period = Period(now)
 
     def _start(self) -> None:
         self.sampler = Sampler(self.model.signals)
@@ -470,7 +496,7 @@ class Session:
         self.why_unreadable[topic] = str(error)[:200]
 
     def _count(self, verdict: Verdict, alarm_before: bool, now: float) -> None:
-        period = self._period
+        period = self.period
         if verdict.status is not Status.OK:  # looking up one of these is slow
             period.statuses[verdict.status] += 1
             if verdict.status is Status.STEP:  # the sampler does not know the model's range
@@ -571,7 +597,7 @@ class Session:
         """
         return now - self._heard.get(self.sampler.clock, self._began)
 
-    def pass_over(self, now: float) -> _Period:
+    def pass_over(self, now: float) -> Period:
         """Begin another period for `report`.
 
         Parameters
@@ -581,15 +607,15 @@ class Session:
 
         Returns
         -------
-        _Period
+        Period
             The period that ends.
         """
-        period, self._period = self._period, _Period(now)
-        self._period.alarm = self.alarm
-        self._period.late = self.late
-        self._period.unreadable = self.unreadable.total()
-        self._period.future = self.future.total()
-        self._period.counters = Counter(self.sampler.counters)
+        period, self.period = self.period, Period(now)
+        self.period.alarm = self.alarm
+        self.period.late = self.late
+        self.period.unreadable = self.unreadable.total()
+        self.period.future = self.future.total()
+        self.period.counters = Counter(self.sampler.counters)
         return period
 
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
@@ -618,7 +644,7 @@ class Session:
         return reports
 
     def _report_monitor(
-        self, period: _Period, now: float, without: float, timeout: float, problems: Sequence[str]
+        self, period: Period, now: float, without: float, timeout: float, problems: Sequence[str]
     ) -> Report:
         never = [topic for topic in self.types if topic not in self._heard]
         complaints, calm = list(problems), list[str]()
@@ -711,7 +737,7 @@ class Session:
         parts += ["latched"] if rule.latch else []
         return ", ".join(parts)
 
-    def _report_state(self, i: int, name: str, period: _Period, without: float, timeout: float) -> Report:
+    def _report_state(self, i: int, name: str, period: Period, without: float, timeout: float) -> Report:
         values = {"verdicts": str(self.verdicts), "violations": str(self.violations[i])}
         masked = name in self.monitor.masked
         values["masked"] = str(int(masked))
