@@ -11,6 +11,7 @@ from typing import Any
 
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.command import DONE, GROUP, SILENT, Command, model_target, print_json, print_notes, print_summary
+from uncertain_lti.signals.additive import CHOICES
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--criterion", choices=("qp", "lp"), default="qp", help="(10) squared or (11) largest width")
     parser.add_argument(
         "--additive",
-        choices=("none", "disturbance", "noise", "both"),
+        choices=CHOICES,
         help="further terms: drift with its half-width, measurement noise (default: the signals file's, else none)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -17,7 +17,7 @@ from uncertain_lti.identification.cluster import DaskFleet
 from uncertain_lti.identification.diagnosis import too_few
 from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, is_constant
+from uncertain_lti.identification.problem import Columns, Problem, assemble, is_constant
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
@@ -27,6 +27,7 @@ from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.sampling.reading import load_signals, sample, time_source
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.streams import read_stream
+from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.signal_map import SignalMap
 
 Recording = tuple[str, tuple[str, ...]]

@@ -19,7 +19,7 @@ from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Judged, Moments
-from uncertain_lti.identification.problem import Additive, Columns, Problem, assemble, median_step
+from uncertain_lti.identification.problem import Columns, Problem, assemble, median_step
 from uncertain_lti.identification.repair import repair
 from uncertain_lti.identification.row import LEAST, InfeasibleError
 from uncertain_lti.identification.structure import Structure
@@ -30,6 +30,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 

@@ -16,8 +16,7 @@ from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.terms import ADDITIVE, Term
 from uncertain_lti.sampling.transient import Transient
-
-Additive = Literal["none", "disturbance", "noise", "both"]
+from uncertain_lti.signals.additive import CHOICES, CHOICES_TEXT, Additive
 
 BLOCK = 16384
 """Transitions per pass block: their regressors stay in the cache."""
@@ -99,8 +98,8 @@ class Columns:
         FitError
             There is no such option.
         """
-        if additive not in ("none", "disturbance", "noise", "both"):
-            raise FitError(f"additive is {additive!r}; it must be none, disturbance, noise or both")
+        if additive not in CHOICES:
+            raise FitError(f"additive is {additive!r}; it must be {CHOICES_TEXT}")
         names = {"none": "", "disturbance": "c dc", "noise": "v", "both": "c v" if constant_dt else "c dc v"}
         return cls(frozenset(names[additive].split()))
 

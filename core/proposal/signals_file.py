@@ -10,6 +10,7 @@ from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.proposal.candidates import Candidate, Source
 from uncertain_lti.proposal.quantities import longest_hold
 from uncertain_lti.recordings.recording import Recording
+from uncertain_lti.signals.additive import CHOICES_TEXT
 
 _LONGEST_LINE = 1 << 20  # letters
 
@@ -47,7 +48,7 @@ def signals_file(
         "# States are what the machine remembers from one sample to the next; controls are what is done to it, as",
         "# it is commanded. Then: uncertain-lti fit BAG... --signals THIS_FILE --output machine.model.json",
         "",
-        "# The further term that measured data needs: none, disturbance, noise or both; compare the widths they give.",
+        f"# The further term that measured data needs: {CHOICES_TEXT}; compare the widths they give.",
         "additive: noise",
         "",
         f"# Its messages define the sample instants: {clock.rate:.4g} a second.",

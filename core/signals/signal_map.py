@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
+from uncertain_lti.signals.additive import CHOICES, CHOICES_TEXT, Additive
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti.signals.file_values import checked_mapping, checked_number, kind_in_yaml, load_yaml
@@ -118,7 +119,7 @@ class SignalMap:
     min_step: float = 0.0
     max_skew: float | None = None
     time: Mapping[str, TimeSource] = field(default_factory=dict)
-    additive: Literal["none", "disturbance", "noise", "both"] | None = None
+    additive: Additive | None = None
     structure: Any = None
     source: str = "signals"
 
@@ -315,8 +316,8 @@ class SignalMap:
                 )
             time[topic] = source_of_time
         additive = top.get("additive")
-        if additive not in (None, "none", "disturbance", "noise", "both"):
-            raise SignalError(f"{source}: additive is {reprlib.repr(additive)}; write none, disturbance, noise or both")
+        if additive not in (None, *CHOICES):
+            raise SignalError(f"{source}: additive is {reprlib.repr(additive)}; write {CHOICES_TEXT}")
         clock = top.get("clock")
         if clock is not None and not isinstance(clock, str):
             raise SignalError(f"{source}: clock is {reprlib.repr(clock)}; write the name of a state topic")
