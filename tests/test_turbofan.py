@@ -22,6 +22,7 @@ from uncertain_lti.plants.turbofan_runs import (
     START_NS,
     Run,
     _advance,
+    lever_moves,
     make_run,
     pulses,
     simulate,
@@ -214,6 +215,43 @@ def test_at_rest_nothing_moves_by_a_single_bit():
     signals = turbofan_signals()
     assert run.x[0].tolist() == [s.steady for s in signals.states]
     assert run.u[0].tolist() == [s.steady for s in signals.controls]
+
+
+def test_pulses_start_from_the_steady_state_of_the_lever():
+    run, point = simulate(Run(140, 0.1, ((0.0, 62.0),))), operating_point()
+    begin = trim(62.0)
+    assert run.x[:75] == pytest.approx(np.tile(begin.x, (75, 1)), rel=1e-8)  # at rest until the first pulse
+    assert (run.u[0] == begin.u).all()
+    assert run.u[75:] - begin.u == pytest.approx(0.1 * point.U * [1, 0, 0, 0] * np.ones((65, 1)), abs=1e-12)
+
+
+def test_the_lever_ramps_between_its_corners_and_jumps_where_two_are_at_one_instant(monkeypatch):
+    asked = []
+    step = Controller.step
+    monkeypatch.setattr(Controller, "step", lambda self, pla, x: asked.append(pla) or step(self, pla, x))
+    simulate(Run(81, lever=((0.0, 66.0), (0.5, 66.0), (1.0, 62.0), (1.5, 62.0), (1.5, 68.0)), ramps=True))
+    corners = [[0.0, 0.5, 1.0, 1.5 - 1e-6, 1.5], [66.0, 66.0, 62.0, 62.0, 68.0]]
+    assert asked == pytest.approx(np.interp(np.arange(81) * DT, *corners), abs=1e-9)
+
+
+def test_moves_of_the_lever_at_random_reach_the_ends_and_keep_the_rates():
+    seeds = [lever_moves(60.0, seed, rate=(2.0, 3.0)) for seed in range(40)]
+    assert seeds[0] == lever_moves(60.0, 0, rate=(2.0, 3.0)) != seeds[1]
+    angles = np.array([pla for corners in seeds for _, pla in corners])
+    assert angles.min() == 60.0 and angles.max() == 68.0
+    assert 0.1 < (angles == 60.0).mean() < 0.3 and 0.1 < (angles == 68.0).mean() < 0.3
+    jumps = 0
+    for corners in seeds:
+        t, pla = np.array(corners).T
+        assert t[0] == 0.0 and (np.diff(t) >= 0.0).all() and t[-1] < 66.0
+        moves, taken = np.diff(pla)[1::2], np.diff(t)[1::2]
+        assert not np.diff(pla)[::2].any()  # it rests between two moves
+        ramps = taken > 0
+        rate = np.abs(moves[ramps]) / taken[ramps]
+        assert ((rate > 1.999) & (rate < 3.001)).all()
+        jumps += np.count_nonzero(~ramps & (moves != 0))
+    assert jumps / sum(len(corners) // 2 for corners in seeds) == pytest.approx(0.5, abs=0.15)
+    assert all(not np.diff([t for t, _ in lever_moves(60.0, s, jumps=1.0)])[1::2].any() for s in range(5))
 
 
 def test_a_run_is_the_same_every_time_and_noise_is_what_was_asked_for():

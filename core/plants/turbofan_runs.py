@@ -90,16 +90,18 @@ class Run:
     samples : int
         Number of samples, at least 2.
     amplitude : float or None, optional
-        Height of the pulses of an open-loop run, see `pulses`, negative downwards; None for a closed-loop run along
-        `lever`.
+        Height of the pulses of an open-loop run, see `pulses`, negative downwards, around the steady state at the
+        first angle of `lever`; None for a closed-loop run along `lever`.
     lever : tuple of (float, float), default ((0.0, MAXIMUM),)
-        (instant s, angle deg) of each jump of the lever.
+        (instant s, angle deg) of each jump of the lever; with `ramps`, of each corner of its path.
     noise : float, default 0.0
         Standard deviation of every reading, over its scale.
     seed : int, default 0
         Seed of the noise.
     fault : Fault or None, optional
         What goes wrong; None for a healthy run.
+    ramps : bool, default False
+        The lever moves evenly from corner to corner; two corners at one instant are a jump.
 
     Raises
     ------
@@ -113,6 +115,7 @@ class Run:
     noise: float = 0.0
     seed: int = 0
     fault: Fault | None = None
+    ramps: bool = False
 
     def __post_init__(self) -> None:
         if self.samples < 2:
@@ -173,7 +176,7 @@ def simulate(run: Run, start_ns: int = START_NS, plant: Engine | None = None) ->
     """
     plant = plant or engine()
     point, rng = operating_point(), np.random.default_rng(run.seed)
-    begin = trim(run.lever[0][1], plant) if run.amplitude is None else trim(MAXIMUM, plant)
+    begin = trim(run.lever[0][1], plant)
     solver = GasPathSolver(plant)
     controller = Controller(plant, replace(begin, x=_rounded(begin.x, point.X)), DT)
     x, x_read, u_sent = begin.x.copy(), np.empty((run.samples, 5)), np.empty((run.samples, 4))
@@ -186,9 +189,9 @@ def simulate(run: Run, start_ns: int = START_NS, plant: Engine | None = None) ->
             reading = reading + run.noise * point.X * rng.standard_normal(5)
         x_read[k] = _rounded(reading, point.X)
         if run.amplitude is None:
-            u_sent[k] = controller.step(_lever(run.lever, t), x_read[k])
+            u_sent[k] = controller.step(_lever(run, t), x_read[k])
         else:
-            u_sent[k] = point.u_s + point.U * pulses(t, run.amplitude)
+            u_sent[k] = begin.u + point.U * pulses(t, run.amplitude)
         if k + 1 == run.samples:
             break
         stuck = fault.stuck(t)
@@ -225,8 +228,66 @@ def _rounded(x: Array, X: Array) -> Array:
     return step
 
 
-def _lever(profile: tuple[tuple[float, float], ...], t: float) -> float:
-    return [pla for since, pla in profile if since <= t + 1e-9][-1]
+def _lever(run: Run, t: float) -> float:
+    """Angle at one instant, deg."""
+    last = max(i for i, (since, _) in enumerate(run.lever) if since <= t + 1e-9)
+    since, pla = run.lever[last]
+    if not run.ramps or last + 1 == len(run.lever):
+        return pla
+    until, target = run.lever[last + 1]
+    low, high = sorted((pla, target))
+    return min(max(pla + (target - pla) * (t - since) / (until - since), low), high)
+
+
+def lever_moves(
+    seconds: float,
+    seed: int,
+    jumps: float = 0.5,
+    rate: tuple[float, float] = (1.0, 4.0),
+    hold: tuple[float, float] = (0.5, 5.0),
+    low: float = 60.0,
+) -> tuple[tuple[float, float], ...]:
+    """Moves of the lever at random, as corners for a `Run` with `ramps`: each move jumps or ramps, and then it rests.
+
+    Angles are uniform, but about one in five is the smallest and one in five the largest: what a machine does from end
+    to end has to be in recordings that shall represent it.
+
+    Parameters
+    ----------
+    seconds : float
+        Until when it moves, s.
+    seed : int
+        One seed, one profile.
+    jumps : float, default 0.5
+        Share of the moves that jump.
+    rate : tuple of (float, float), default (1.0, 4.0)
+        Slowest and fastest ramp, deg/s.
+    hold : tuple of (float, float), default (0.5, 5.0)
+        Shortest and longest rest after a move, s.
+    low : float, default 60.0
+        Smallest angle, deg; the largest is MAXIMUM.
+
+    Returns
+    -------
+    tuple of (float, float)
+        (instant s, angle deg) of each corner.
+    """
+    rng = np.random.default_rng(seed)
+    beyond = (MAXIMUM - low) / 3.0
+
+    def angle() -> float:
+        return min(max(float(rng.uniform(low - beyond, MAXIMUM + beyond)), low), MAXIMUM)
+
+    corners = [(0.0, angle())]
+    t = float(rng.uniform(*hold))
+    while t < seconds:
+        start, end = corners[-1][1], angle()
+        corners.append((t, start))
+        if rng.uniform() >= jumps:
+            t += abs(end - start) / float(rng.uniform(*rate))
+        corners.append((t, end))
+        t += float(rng.uniform(*hold))
+    return tuple(corners)
 
 
 def make_run(
