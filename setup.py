@@ -64,6 +64,8 @@ extras = {
     # Checksums of recordings ten times as fast as zlib's.
     "fast": ["isal"],
     "frames": ["pandas"],
+    # Parquet, Feather and .mat files; CSV and .npz take numpy alone.
+    "tables": ["pyarrow", "scipy"],
     "plots": ["matplotlib", "pillow"],
     # To and from python-control; MATLAB files take scipy alone.
     "control": ["control", "scipy"],

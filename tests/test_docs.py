@@ -9,7 +9,7 @@ A block is run by its language. Comments above it say more:
     <!-- output -->                 a text block: what the block before printed; `...` stands for what is left out
     <!-- said -->                   a text block: lines that the last background block says, by the end of the page
     <!-- measured -->               a text block from a benchmark, which is not run here
-    <!-- file: NAME -->             a Python block that is saved
+    <!-- file: NAME -->             a Python or YAML block that is saved
     <!-- loads: KIND -->            a YAML or JSON block that the loader of signals, model or parameters takes
     <!-- merges: NAME -->           a YAML block that belongs into the signals file config/signals/NAME
 """
@@ -163,6 +163,8 @@ class Reader:
         kind = block.marks.get("loads")
         path = self.folder / f".block.{block.language}"
         path.write_text(block.text)
+        if "file" in block.marks:
+            (self.folder / block.marks["file"]).write_text(block.text)
         if kind == "signals":
             signals = SignalMap.load(path)
         elif kind == "model":

@@ -23,7 +23,7 @@ TOPIC, SECOND = "/table", 10**9
 
 
 class Table:
-    """A CSV file whose first column is the time in s."""
+    """A log, comma-separated, whose first column is the time in s."""
 
     indexed = False
 
@@ -69,13 +69,13 @@ class Table:
 
 @pytest.fixture
 def tables(monkeypatch):
-    known = Format("CSV", lambda path: path.suffix == ".csv", Table, lambda paths, indexed: [Table(p) for p in paths])
+    known = Format("log", lambda path: path.suffix == ".log", Table, lambda paths, indexed: [Table(p) for p in paths])
     monkeypatch.setattr(formats, "FORMATS", [known, *formats.FORMATS])
 
 
 @pytest.fixture
 def run(tmp_path):
-    path = tmp_path / "run.csv"
+    path = tmp_path / "run.log"
     x, u = 0.0, 0.0
     with open(path, "w", newline="") as stream:
         writer = csv.writer(stream)
@@ -114,5 +114,5 @@ def test_recordings_of_several_formats_are_named_together(run):
 
 
 def test_without_an_entry_the_file_is_refused_in_a_sentence(run):
-    with pytest.raises(BagError, match=r"run\.csv: a text file, while a recording is wanted"):
+    with pytest.raises(BagError, match=r"run\.log: a text file, while a recording is wanted"):
         open_recording(run)

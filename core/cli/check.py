@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
-    parser.add_argument("bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag) and folders")
+    parser.add_argument("bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag, tables) and folders")
     parser.add_argument("--violations", type=int, help="alarm: number of violations (default: the model's)")
     parser.add_argument(
         "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
 
     model = load_model(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
-    bags = group_recordings(options.bags)
+    bags = group_recordings(options.bags, layout=model.signals.table)
     copies: Sequence[Path | None] = [None] * len(bags)
     if options.write is not None:
         from uncertain_lti.reports.annotate import annotate, targets

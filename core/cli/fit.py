@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "bags",
         metavar="BAG",
         nargs="+",
-        help="recordings (MCAP, .db3, .bag) and folders; parts of a split bag are one recording",
+        help="recordings (MCAP, .db3, .bag, tables) and folders; parts of a split bag are one recording",
     )
     parser.add_argument(
         "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
@@ -106,7 +106,8 @@ def run(options: argparse.Namespace) -> int:
             seek_carriers=True,
             progress=step,
         )
-    sources = [{"file": name, "sha256": sha256(name)} for t in transients for name in t.sources]
+    files = dict.fromkeys(name for t in transients for name in t.sources)  # a table may hold several
+    sources = [{"file": name, "sha256": sha256(name)} for name in files]
     model = model.replace(fit_summary={**model.fit_summary, "sources": sources})
     if options.group is not None:
         model = model.replace(fit_summary={**model.fit_summary, "group": options.group})

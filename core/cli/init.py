@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     parser.add_argument(
-        "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag) and folders of the same machine"
+        "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag, tables) and folders of the same machine"
     )
     parser.add_argument(
         "--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)"

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     parser.add_argument(
-        "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag) and folders to check against it"
+        "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag, tables) and folders to check against it"
     )
     parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
     parser.add_argument("--json", action="store_true", help="print the same facts as JSON")
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti.sampling.reading import read_as_fitted
 
     model = load_model(options.model)
-    bags = group_recordings(options.bags)
+    bags = group_recordings(options.bags, layout=model.signals.table)
     output = page_target(options.output or (None if options.json else "report.html"), options.model, bags)
     monitor = EnvelopeMonitor(model)
     checked = []

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument("bag", metavar="BAG", help="recording (MCAP, .db3, .bag), or folder of one")
+    parser.add_argument("bag", metavar="BAG", help="recording (MCAP, .db3, .bag, table), or folder of one")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "bags",
         metavar="BAG",
         nargs="*",
-        help="recordings (MCAP, .db3, .bag) and folders (default: those the model was fitted to)",
+        help="recordings (MCAP, .db3, .bag, tables) and folders (default: those the model was fitted to)",
     )
     parser.add_argument("--blocks", type=int, help="leave out blocks: their number per recording (a single one: 10)")
     parser.add_argument(
@@ -70,13 +70,15 @@ def run(options: argparse.Namespace) -> int:
 
     model = UncertainLTI.load(options.model)
     sources = model.fit_summary.get("sources", [])
-    bags = options.bags or [s["file"] for s in sources]
+    bags = options.bags or list(dict.fromkeys(s["file"] for s in sources))
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
     if options.output is not None:
         model_target(options.output)
     reading = options.progress.iterate("reading")
-    transients = [read_as_fitted(bag, model.signals, reading) for bag in group_recordings(bags)]
+    transients = [
+        read_as_fitted(bag, model.signals, reading) for bag in group_recordings(bags, layout=model.signals.table)
+    ]
     for transient in transients:
         print_notes(options, transient.notes)
     with options.progress.stage("validating") as step:

@@ -115,10 +115,11 @@ def fit_archive(
             )
     say = progress or (lambda text: None)
     recordings: list[Recording] = [
-        (os.fspath(bag.path), tuple(map(str, bag.parts))) for bag in group_recordings(list(paths), indexed=True)
+        (os.fspath(bag.path), tuple(map(str, bag.parts)))
+        for bag in group_recordings(list(paths), indexed=True, layout=signals.table)
     ]
     if not recordings:
-        raise BagError("no recording is named; give at least one MCAP file or folder")
+        raise BagError("no recording is named; give at least one file or folder")
 
     def counting(what: str) -> Callable[[int], None]:
         total = len(recordings)
@@ -182,7 +183,7 @@ def fit_archive(
         "additive": additive,
         "weights": "ones",
         "transients": len(recordings),
-        "sources": [{"file": file} for _, files in recordings for file in files],
+        "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
     return model.replace(fit_summary=facts)
 
@@ -207,7 +208,7 @@ def survey(recording: Recording, signals: SignalMap) -> Survey:
     BagError
         The recording cannot be read, or a topic has no message.
     """
-    stream = read_stream(open_recording(recording[0], recording[1], indexed=True), signals)
+    stream = read_stream(open_recording(recording[0], recording[1], indexed=True, layout=signals.table), signals)
     states = {s.topic for s in signals.states}
     types, stamped, counted = {}, {}, {}
     header, log = {}, {}
@@ -261,7 +262,9 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     Problem
         Weights are ones; empty where no transition is usable.
     """
-    transient = sample(read_stream(open_recording(recording[0], recording[1], indexed=True), signals), signals)
+    transient = sample(
+        read_stream(open_recording(recording[0], recording[1], indexed=True, layout=signals.table), signals), signals
+    )
     point = OperatingPoint.of(signals.states, signals.controls)
     return replace(assemble([transient], point, None, "none", empty=True), columns=columns)
 

@@ -21,6 +21,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, checked
 from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.table_layout import TableLayout
 
 FORMATS = ("uncertain-lti/1", "uncertain-lti/2")
 """Formats of model files, oldest first; the oldest that holds a model is written."""
@@ -55,7 +56,7 @@ def structure(model: Any) -> dict[str, Any]:
     ]
     s = model.sampling
     return {
-        "format": FORMATS[model.domain.measure is not None],
+        "format": FORMATS[model.domain.measure is not None or model.signals.table is not None],
         "states": states,
         "controls": controls,
         "sampling": {
@@ -68,7 +69,8 @@ def structure(model: Any) -> dict[str, Any]:
             "max_gap": s.max_gap,
             "min_step": s.min_step,
             "max_skew": s.max_skew,
-        },
+        }
+        | ({} if model.signals.table is None else {"table": model.signals.table.to_dict()}),
         **{name: getattr(model, name).tolist() for name in ARRAYS},
         "domain": {
             name: [v if math.isfinite(v) else None for v in getattr(model.domain, name).tolist()]
@@ -121,7 +123,8 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     for name in data:
         if name not in known:
             raise ModelError(f"unknown field {reprlib.repr(name)}; known are {', '.join(sorted(known))}")
-    said = _object(data["sampling"], "sampling", {f.name for f in fields(Sampling)})
+    newer = {"table"} if data["format"] != FORMATS[0] else set()
+    said = _object(data["sampling"], "sampling", {f.name for f in fields(Sampling)} | newer)
     sampling = Sampling(
         clock=_text(said.get("clock", ""), "sampling.clock"),
         clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
@@ -145,6 +148,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         min_step=sampling.min_step,
         max_skew=sampling.max_skew,
         time={t: "log" if k == "log" else "header" for t, k in sampling.time.items()},
+        table=TableLayout.from_dict(said["table"], "sampling.table") if "table" in said else None,
     )
     for signal in signals.signals:
         for key in ("steady", "scale"):

@@ -66,7 +66,7 @@ def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = 
     """
     bags = group_recordings(list(paths))
     if not bags:
-        raise BagError("no recording is named; give at least one MCAP file or folder")
+        raise BagError("no recording is named; give at least one file or folder")
     sources = read_sources(bags, progress)
     controls, states = assign_roles(sources)
     if not states:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 
 from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate
+from uncertain_lti.recordings.table import TOPIC
 from uncertain_lti.signals.functions import FUNCTIONS
 
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
@@ -62,7 +63,8 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|\)+$", "", inner)
     words = [w for w in _split(inner) if w not in _DULL]
     if not words or all(len(w) == 1 or w.isdigit() for w in words):
-        words = [*_split(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
+        if candidate.topic != TOPIC:  # that of every table says nothing
+            words = [*_split(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
     return words or ["signal"]
 
 

@@ -14,9 +14,10 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.proposal.candidates import FEWEST, OF_QUATERNION, WRAPPING, Candidate, Source
 from uncertain_lti.proposal.effects import residual
-from uncertain_lti.proposal.roles import role_by_name
+from uncertain_lti.proposal.roles import role_by_name, role_of_column
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.recording import Recording, TopicFacts
+from uncertain_lti.recordings.table import TYPE
 from uncertain_lti.signals.field_path import FieldPath
 
 Iterate = Callable[[Iterable[object], int], Iterable[object]]
@@ -57,6 +58,9 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
     sources = []
     for topic, fact in facts.items():
         stamped = fact.stamps in ("usable", "mixed")
+        if fact.info.type == TYPE:
+            sources += _of_table(fact, sum(bag.topics[topic].count for bag in bags if topic in bag.topics))
+            continue
         source = Source(topic, fact.info.type, role_by_name(topic, fact.info.type), stamped, fact.stamp_offset)
         sources.append(source)
         total = sum(bag.topics[topic].count for bag in bags if topic in bag.topics)
@@ -83,6 +87,22 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
         if source.candidates and not source.rate > 0:
             source.reason, source.candidates = "no time passes between its messages", []
         _sift(source)
+    return sources
+
+
+def _of_table(fact: TopicFacts, rows: int) -> list[Source]:
+    """The columns of a table, those that are commands by their names apart from the others."""
+    by_role: dict[str, list[str]] = {}
+    for field in fact.fields:
+        by_role.setdefault(role_of_column(field), []).append(field)
+    sources = []
+    for role, fields in by_role.items():
+        source = Source(fact.info.topic, TYPE, role, False, None)
+        if rows < FEWEST:
+            source.reason = f"{plural(rows, 'row')} only"
+        else:
+            source.candidates = _candidates(fact.info.topic, fields)
+        sources.append(source)
     return sources
 
 

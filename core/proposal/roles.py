@@ -12,6 +12,9 @@ from uncertain_lti.proposal.effects import SHOWS, explained
 _COMMAND = re.compile(r"(cmd|command|contr|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory)")
 
 
+_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in a table
+
+
 _REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$)")
 
 
@@ -75,6 +78,27 @@ def role_by_name(topic: str, type_name: str) -> str:
         if _STATE.search(text):
             return "state"
     return ""
+
+
+def role_of_column(name: str) -> str:
+    """What a column of a table seems to be by its name.
+
+    Parameters
+    ----------
+    name : str
+        As a field path takes it.
+
+    Returns
+    -------
+    str
+        `control`, `reference`, or `state` for every other.
+    """
+    low = name.lower()
+    if _ANSWER.search(low):
+        return "state"
+    if _REFERENCE.search(low):
+        return "reference"
+    return "control" if _COMMAND.search(low) or _COLUMN.search(low) else "state"
 
 
 def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:

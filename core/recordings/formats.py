@@ -8,10 +8,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_groups import group_bags
 from uncertain_lti.recordings.recording import Recording
+from uncertain_lti.recordings.table import Table, is_table
+from uncertain_lti.signals.table_layout import TableLayout
 
 
 @dataclass(frozen=True)
@@ -29,16 +32,23 @@ class Format:
         be believed until messages are read; returns the `Recording`.
     group : callable
         Takes paths that a user named together, and the same flag; returns the recordings they are, in order.
+    laid_out : callable, optional
+        Takes a path, and what a signals file says of the columns of tables; returns the recordings in the file. None
+        for a format in which a file says that itself.
     """
 
     name: str
     recognises: Callable[[Path], bool]
     open: Callable[[Path, Sequence[Path], bool], Recording]
     group: Callable[[Sequence[Path], bool], Sequence[Recording]]
+    laid_out: Callable[[Path, TableLayout], Sequence[Recording]] | None = None
 
 
-FORMATS: list[Format] = [Format("MCAP", lambda path: True, Bag, group_bags)]
-"""Every format; the first that recognises a path reads it. MCAP is last: its errors say what another file is."""
+FORMATS: list[Format] = [
+    Format("table", is_table, Table, lambda paths, indexed: [Table(path) for path in paths], Table.every_run),
+    Format("ROS recording", lambda path: True, Bag, group_bags),
+]
+"""Every format; the first that recognises a path reads it. Bags are last: their errors say what another file is."""
 
 
 def format_of(path: Path) -> Format:
@@ -58,7 +68,10 @@ def format_of(path: Path) -> Format:
 
 
 def open_recording(
-    path: str | os.PathLike[str], parts: Sequence[str | os.PathLike[str]] = (), indexed: bool = False
+    path: str | os.PathLike[str],
+    parts: Sequence[str | os.PathLike[str]] = (),
+    indexed: bool = False,
+    layout: TableLayout | None = None,
 ) -> Recording:
     """Open one recording.
 
@@ -70,6 +83,8 @@ def open_recording(
         Its files in order, where they are known.
     indexed : bool, default False
         Believe an index until messages are read, as `Bag` does.
+    layout : TableLayout, optional
+        What a signals file says of the columns of tables.
 
     Returns
     -------
@@ -79,15 +94,25 @@ def open_recording(
     Raises
     ------
     BagError
-        There is no recording, or no message of it can be read.
+        There is no recording, or no message of it can be read; or there are several.
     """
-    return format_of(Path(path)).open(Path(path), [Path(part) for part in parts], indexed)
+    format = format_of(Path(path))
+    if layout is not None and format.laid_out is not None:
+        recordings = format.laid_out(Path(path), layout)
+        if len(recordings) != 1:
+            names = shortlist([recording.path.name for recording in recordings], 6)
+            raise BagError(f"{path}: holds {len(recordings)} recordings; name one of them, {names}")
+        return recordings[0]
+    return format.open(Path(path), [Path(part) for part in parts], indexed)
 
 
-def group_recordings(paths: Iterable[str | os.PathLike[str]], indexed: bool = False) -> list[Recording]:
+def group_recordings(
+    paths: Iterable[str | os.PathLike[str]], indexed: bool = False, layout: TableLayout | None = None
+) -> list[Recording]:
     """Recordings that some paths name, in the order of their first mention.
 
-    A folder is one recording. Files are one recording each, except the parts of a split bag (`group_bags`).
+    A folder is one recording. Files are one recording each, except the parts of a split bag (`group_bags`), and a table
+    with a column that tells the runs in it apart.
 
     Parameters
     ----------
@@ -95,6 +120,8 @@ def group_recordings(paths: Iterable[str | os.PathLike[str]], indexed: bool = Fa
         Files and folders.
     indexed : bool, default False
         As in `open_recording`.
+    layout : TableLayout, optional
+        Likewise.
 
     Returns
     -------
@@ -108,9 +135,13 @@ def group_recordings(paths: Iterable[str | os.PathLike[str]], indexed: bool = Fa
     """
     recordings: list[Recording] = []
     for format, run in itertools.groupby(map(Path, paths), format_of):
-        recordings += format.group(list(run), indexed)
+        if layout is not None and format.laid_out is not None:
+            recordings += itertools.chain.from_iterable(format.laid_out(path, layout) for path in run)
+        else:
+            recordings += format.group(list(run), indexed)
     seen: set[Path] = set()
-    for part in itertools.chain.from_iterable(recording.parts for recording in recordings):
+    named = (r.parts if r.path.exists() else (r.path,) for r in recordings)  # a run of a table is no file
+    for part in itertools.chain.from_iterable(named):
         if part.resolve() in seen:
             raise BagError(f"{part}: named twice; name each recording once")
         seen.add(part.resolve())

@@ -46,6 +46,8 @@ def not_mcap(path: Path, head: bytes) -> BagError:
         return BagError(f"{path}: MCAP of another version ({head[5:6]!r}) or damaged in its first bytes; copy it again")
     if not head.strip(b"\0"):
         return BagError(f"{path}: begins with zeros only, as after a power cut; there is no recording in it")
+    if path.suffix.lower() in TABLES:
+        return BagError(f"{path}: a table, and a recording of ROS messages is wanted here; check the path")
     if known := kind_of(path):
         return BagError(f"{path}: this is {known}, and a recording is wanted here; are the arguments swapped?")
     kind = (

@@ -195,7 +195,7 @@ def read_transients(
     Parameters
     ----------
     paths : Paths
-        MCAP files and folders; parts of one split bag are one recording (see `formats.group_recordings`).
+        Recordings and folders; parts of one split bag are one recording (see `formats.group_recordings`).
     signals : SignalMap or path
         A map, or the signals file.
     progress : callable, optional
@@ -220,9 +220,9 @@ def read_transients(
     of = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     if not isinstance(signals, SignalMap):
         signals = load_signals(signals, of)
-    bags = group_recordings(of, indexed=True)
+    bags = group_recordings(of, indexed=True, layout=signals.table)
     if not bags:
-        raise BagError("no recording is named; give at least one MCAP file or folder")
+        raise BagError("no recording is named; give at least one file or folder")
     signals = signals.with_types(_types(bags, signals))
     streams = _streams(bags, signals, progress, processes)
     for stream in streams:
@@ -236,7 +236,7 @@ def read_transients(
         for s in streams:
             chosen = s.topic == position
             times = s.stamp[chosen] if sources[topic] == "header" else s.arrival[chosen]
-            instants[topic].append(times[times >= 0])
+            instants[topic].append(times[times >= 0] if sources[topic] == "header" else times)
     resolved = resolve(signals, instants, sources)
     transients = [sample(stream, resolved, progress) for stream in streams]
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
@@ -270,7 +270,7 @@ def read_as_fitted(
     Parameters
     ----------
     recording : Recording or path
-        MCAP file or folder.
+        File or folder.
     signals : SignalMap
         Of the model.
     progress : Progress, optional
@@ -301,7 +301,7 @@ def read_as_fitted_with_decisions(
     Parameters
     ----------
     recording : Recording or path
-        MCAP file or folder.
+        File or folder.
     signals : SignalMap
         Of the model.
     progress : Progress, optional
@@ -333,7 +333,11 @@ def _stream_for_model(
         raise SignalError(
             "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
         )
-    bag = open_recording(recording, indexed=True) if isinstance(recording, (str, os.PathLike)) else recording
+    bag = (
+        open_recording(recording, indexed=True, layout=signals.table)
+        if isinstance(recording, (str, os.PathLike))
+        else recording
+    )
     for topic, found in _types([bag], signals).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
@@ -369,7 +373,7 @@ def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.Pat
     path : path
         The signals file.
     recordings : sequence of path
-        MCAP files and folders.
+        Recordings and folders.
 
     Returns
     -------

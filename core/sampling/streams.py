@@ -159,7 +159,10 @@ def _fits(bag: Recording, signals: SignalMap) -> bool:
     """Whether every topic can be read; raises SignalError where a path of one that can be does not fit its type."""
     readable = [name for name in signals.topics if name in bag.topics and bag.topics[name].readable]
     for name in readable:
-        signals.check(name, bag.topics[name].type, bag.type_fields(name))
+        try:
+            signals.check(name, bag.topics[name].type, bag.type_fields(name))
+        except SignalError as error:
+            raise SignalError(f"{bag.path}: {error}") from None
     return len(readable) == len(signals.topics)
 
 

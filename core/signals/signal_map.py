@@ -14,6 +14,7 @@ from uncertain_lti.signals.additive import CHOICES, CHOICES_TEXT, Additive
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti.signals.file_values import checked_mapping, checked_number, kind_in_yaml, load_yaml
+from uncertain_lti.signals.table_layout import TableLayout
 
 LONGEST_DELAY = 1_000_000
 """Samples by which a control may be delayed at most."""
@@ -103,6 +104,8 @@ class SignalMap:
         The additive term of a fit that is given none.
     structure : object, optional
         The rules on single elements that a fit keeps (`identification.structure`); None for no rule.
+    table : TableLayout or None, optional
+        Which columns of tables are time and run; None to look for them.
     source : str, default "signals"
         What errors call the map: the path of its file.
 
@@ -121,6 +124,7 @@ class SignalMap:
     time: Mapping[str, TimeSource] = field(default_factory=dict)
     additive: Additive | None = None
     structure: Any = None
+    table: TableLayout | None = None
     source: str = "signals"
 
     def __post_init__(self) -> None:
@@ -305,7 +309,18 @@ class SignalMap:
         top = checked_mapping(
             data,
             source,
-            {"clock", "max_gap", "min_step", "max_skew", "additive", "structure", "topics", "states", "controls"},
+            {
+                "clock",
+                "max_gap",
+                "min_step",
+                "max_skew",
+                "additive",
+                "structure",
+                "table",
+                "topics",
+                "states",
+                "controls",
+            },
         )
         time: dict[str, TimeSource] = {}
         for topic, options in checked_mapping(top.get("topics") or {}, f"{source}: topics", None).items():
@@ -331,6 +346,7 @@ class SignalMap:
             time=time,
             additive=additive,
             structure=top.get("structure"),
+            table=TableLayout.from_dict(top["table"], f"{source}: table") if top.get("table") is not None else None,
             source=source,
         )
 

@@ -117,6 +117,8 @@ def _folders(transients: Sequence[Transient]) -> list[str]:
 
 def _folder(transient: Transient) -> str:
     path = Path(transient.name).resolve()
+    if not path.exists() and transient.sources:
+        path = Path(transient.sources[0]).resolve()  # a run of a table
     if not path.exists():
         raise FitError(f"{transient.name}: is no file, so it has no folder; name the groups one by one")
     parent = path.parent

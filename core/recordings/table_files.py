@@ -1,0 +1,423 @@
+"""Tables in files: CSV, Parquet, Feather, .mat and .npz as named columns of numbers, instants or text."""
+
+from __future__ import annotations
+
+import csv
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import BagError
+from uncertain_lti.recordings.mcap_scan import most_inflated
+from uncertain_lti.recordings.unreadable import os_error
+
+_DELIMITERS = ",;\t|"
+_LOOK = 1 << 16  # bytes in which the shape of a CSV file is looked for
+_LOOK_LINES = 60
+_MISSING = {"", "na", "n/a", "nan", "null", "none", "-", "--", "nil", "#n/a", "?"}
+_TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?inf(inity)?$|nan$", re.IGNORECASE)
+_WITH_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?$")
+_INSTANT = re.compile(r"\d{4}-\d\d-\d\d([T ]|$)|\d{1,2}:\d\d(:\d\d|$)|\d{1,2}[./]\d{1,2}[./]\d{2,4}")
+_MOST_COLUMNS = 20_000
+_ODD_SHARE = 0.1  # of lines with another number of cells, above which the file is no table
+
+Column = NDArray[Any]
+"""Numbers, (rows,) or (rows, parts); text, (rows,) of object; or instants, (rows,) of datetime64[ns]."""
+
+
+@dataclass
+class RawTable:
+    """What a file holds.
+
+    Parameters
+    ----------
+    columns : mapping of str to array
+        By the names in the file, in their order.
+    notes : list of str, optional
+        What was left out or changed, each a part of a sentence.
+    exact : callable, optional
+        Takes the name of a column of numbers, and returns the text of its cells; None where there is no text.
+    """
+
+    columns: Mapping[str, Column]
+    notes: list[str] = field(default_factory=list)
+    exact: Callable[[str], Sequence[str]] | None = None
+
+
+def read_table(path: Path) -> RawTable:
+    """Read a file by its suffix.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    RawTable
+        Its columns, of one length.
+
+    Raises
+    ------
+    BagError
+        It is not what its suffix says, holds no table, or takes a package that is not installed.
+    """
+    try:
+        if not path.stat().st_size:
+            raise BagError(f"{path}: the file is empty; record or copy it again")
+        return _READERS[path.suffix.lower()](path)
+    except OSError as error:
+        raise os_error(path, error) from None
+
+
+# --- CSV -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """How a CSV file is laid out: its delimiter, the lines before the data, and the names of its columns."""
+
+    delimiter: str
+    skip: int
+    names: tuple[str, ...]
+
+
+def _read_csv(path: Path) -> RawTable:
+    with open(path, "rb") as stream:
+        head = stream.read(_LOOK)
+    encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    if encoding != "utf-16" and b"\0" in head:
+        raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; check the path and its suffix")
+    lines = head.decode(encoding, errors="replace").splitlines()[:_LOOK_LINES]
+    shape = _shape(path, lines if len(head) < _LOOK else lines[:-1] or lines)
+    names = _unique(shape.names)
+    exact = _Texts(path, encoding, shape, names)
+    try:
+        with open(path, encoding=encoding, errors="replace", newline="") as text:
+            values = np.loadtxt(
+                text, delimiter=shape.delimiter, skiprows=shape.skip, comments=None, quotechar='"', ndmin=2
+            )
+    except (ValueError, OverflowError):
+        return _read_cells(path, encoding, shape, names)
+    if values.shape[1] != len(names) or not len(values):
+        return _read_cells(path, encoding, shape, names)
+    return RawTable(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), [], exact)
+
+
+class _Texts:
+    """The cells of one column as they stand, read when they are asked for."""
+
+    def __init__(self, path: Path, encoding: str, shape: _Shape, names: Sequence[str]) -> None:
+        self.path, self.encoding, self.shape, self.names = path, encoding, shape, tuple(names)
+
+    def __call__(self, name: str) -> Sequence[str]:
+        where = self.names.index(name)
+        return [cells[where].strip() for _, cells in _rows(self.path, self.encoding, self.shape) if len(cells) > where]
+
+
+def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[str]]]:
+    """Number of the line, and cells; empty lines are passed over."""
+    with open(path, encoding=encoding, errors="replace", newline="") as text:
+        for _ in range(shape.skip):
+            text.readline()
+        reader = csv.reader(text, delimiter=shape.delimiter, skipinitialspace=True)
+        try:
+            for cells in reader:
+                if cells and any(cells):
+                    yield shape.skip + reader.line_num, cells
+        except csv.Error as error:
+            raise BagError(f"{path}: line {shape.skip + reader.line_num} cannot be read ({error}); mend it") from None
+
+
+def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) -> RawTable:
+    """Cell by cell: text, instants, missing numbers, decimal commas, lines with too few cells."""
+    columns: list[list[str]] = [[] for _ in names]
+    wide = len(names)
+    first_odd = odd = 0
+    last_line = 0
+    for line, cells in _rows(path, encoding, shape):
+        last_line = line
+        if len(cells) != wide and not (len(cells) == wide + 1 and not cells[-1].strip()):
+            odd += 1
+            first_odd = first_odd or line
+            continue
+        for column, cell in zip(columns, cells, strict=False):
+            column.append(cell)
+    rows = len(columns[0])
+    if odd > max(1, _ODD_SHARE * (odd + rows)) or (odd and not rows):
+        raise BagError(
+            f"{path}: {plural(odd, 'line')} with another number of cells than the {wide} of its header, the first is "
+            f"line {first_odd}; mend the file, or its header"
+        )
+    if not rows:
+        raise BagError(f"{path}: has a header and no line of data; record or copy it again")
+    notes = []
+    if odd:
+        cut = " (the file ends in it)" if odd == 1 and first_odd == last_line else ""
+        notes.append(f"{plural(odd, 'line')} with another number of cells left out, the first is line {first_odd}{cut}")
+    found: dict[str, Column] = {}
+    for name, texts_of in zip(names, columns, strict=True):
+        if name.startswith("column ") and not any(texts_of):
+            continue  # a delimiter at the end of each line
+        found[name], note = _column(texts_of, shape.delimiter)
+        if note:
+            notes.append(f"column '{name}': {note}")
+    table = RawTable(found, notes)
+    texts = dict(zip(names, columns, strict=True))
+    table.exact = lambda name: [cell.strip() for cell in texts[name]]
+    return table
+
+
+def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
+    """Numbers where most cells are some, else text; and what was done."""
+    try:
+        return np.array([float(cell) for cell in cells]), ""
+    except ValueError:
+        pass
+    plain = [cell.strip() for cell in cells]
+    try:
+        return np.array([np.nan if cell.lower() in _MISSING else float(cell) for cell in plain]), ""
+    except ValueError:
+        pass
+    numbers = np.full(len(plain), np.nan)
+    comma = missing = odd = 0
+    first = ""
+    for i, cell in enumerate(plain):
+        low = cell.lower()
+        if low in _MISSING:
+            missing += 1
+        elif _NUMBER.match(cell):
+            numbers[i] = float(cell)
+        elif delimiter != "," and _WITH_COMMA.match(cell):
+            numbers[i] = float(cell.replace(",", "."))
+            comma += 1
+        elif low in _TRUTH:
+            numbers[i] = _TRUTH[low]
+        else:
+            odd += 1
+            first = first or cell
+    if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
+        return np.array(plain, dtype=object), ""
+    notes = [f"{plural(odd, 'cell')} that {'is' if odd == 1 else 'are'} no number (such as '{first[:40]}') left out"]
+    return numbers, (notes[0] if odd else "") or ("decimal commas read as points" if comma else "")
+
+
+def _unique(names: Iterable[str]) -> list[str]:
+    """Names of which none is there twice; the second gets a number."""
+    found: list[str] = []
+    for number, name in enumerate(names, start=1):
+        text = " ".join(name.replace("\ufffd", "").split()) or f"column {number}"
+        repeat = 2
+        chosen = text
+        while chosen in found:
+            chosen = f"{text} {repeat}"
+            repeat += 1
+        found.append(chosen)
+    return found
+
+
+def _shape(path: Path, lines: Sequence[str]) -> _Shape:
+    """Find the delimiter with which most lines have as many values as each other, and the first line of data."""
+    best: tuple[float, int, int, str] | None = None  # how well it fits, cells, - first line, delimiter
+    for delimiter in _DELIMITERS if any(d in line for line in lines for d in _DELIMITERS) else " ":
+        split = [_split(line, delimiter) for line in lines]
+        fits: dict[int, float] = {}  # lines of each number of cells, as far as they hold values
+        for cells in split:
+            if len(cells) > 1 and any(map(_is_value, cells)):
+                share = sum(_is_value(c) or c.lower() in _MISSING for c in cells) / len(cells)
+                fits[len(cells)] = fits.get(len(cells), 0.0) + share
+        for wide, fit in fits.items():
+            begin = next(i for i, c in enumerate(split) if len(c) == wide and any(map(_is_value, c)))
+            candidate = (fit, wide, -begin, delimiter)
+            best = max(best, candidate) if best else candidate
+    if best is None:
+        kind = "one column only" if any(map(_is_value, lines)) else "no line of numbers"
+        raise BagError(f"{path}: there is {kind} in it, and a table has a column of time and others; check the file")
+    _, wide, begin, delimiter = best
+    if wide > _MOST_COLUMNS:
+        raise BagError(f"{path}: has {wide} columns, more than {_MOST_COLUMNS}; write those that are needed")
+    if delimiter == " ":
+        raise BagError(f"{path}: its cells are apart by spaces alone; write commas, semicolons or tabs between them")
+    names: tuple[str, ...] = tuple(f"column {i + 1}" for i in range(wide))
+    for line in lines[:-begin]:
+        cells = _split(line.lstrip("#% "), delimiter)
+        trimmed = cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells
+        if len(trimmed) == wide and len({c for c in trimmed if c}) > 1:
+            names = tuple(trimmed)
+            break  # what follows it are units
+    return _Shape(delimiter, -begin, names)
+
+
+def _split(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.split()
+    try:
+        cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    except csv.Error:
+        return []
+    return [cell.strip() for cell in cells]
+
+
+def _is_value(text: str) -> bool:
+    """Whether a cell is a number or an instant, as names and units are not."""
+    return bool(_NUMBER.match(text) or _WITH_COMMA.match(text) or _INSTANT.match(text)) and text.lower() != "nan"
+
+
+# --- others --------------------------------------------------------------------------------------------------
+
+
+def _read_arrow(path: Path) -> RawTable:
+    try:
+        import pyarrow as pa  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        import pyarrow.feather  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
+    except ImportError:
+        raise BagError(_wants(path, "pyarrow")) from None
+    try:
+        if path.suffix.lower() == ".parquet":
+            table = pa.parquet.read_table(path, memory_map=False)
+        else:
+            table = pa.feather.read_table(path, memory_map=False)
+    except (pa.ArrowException, ValueError, OSError) as error:
+        raise BagError(f"{path}: is damaged or no {path.suffix} file ({_one_line(error)}); copy it again") from None
+    found: dict[str, Any] = {}
+    notes = []
+    for name, column in zip(_unique(map(str, table.column_names)), table.columns, strict=True):
+        kind = column.type
+        if pa.types.is_dictionary(kind):
+            column, kind = column.cast(kind.value_type), kind.value_type
+        if pa.types.is_timestamp(kind) or pa.types.is_date(kind):
+            found[name] = np.asarray(column.cast(pa.timestamp("ns"), safe=False), dtype="datetime64[ns]")
+        elif pa.types.is_boolean(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
+            found[name] = np.asarray(column.cast(pa.float64(), safe=False), dtype=np.float64)
+        elif pa.types.is_integer(kind):
+            found[name] = np.asarray(column)
+        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
+            found[name] = np.array([text or "" for text in column.to_pylist()], dtype=object)
+        else:
+            notes.append(f"column '{name}' left out, it is of type {kind}")
+    return _of_one_length(path, found, notes)
+
+
+def _read_mat(path: Path) -> RawTable:
+    with open(path, "rb") as stream:
+        head = stream.read(128)
+    if head.startswith(b"MATLAB 7.3") or head.startswith(b"\x89HDF"):
+        raise BagError(f"{path}: a .mat file of version 7.3; write it again with save('{path.name}', '-v7')")
+    try:
+        from scipy.io import loadmat
+    except ImportError:
+        raise BagError(_wants(path, "scipy")) from None
+    try:
+        variables = loadmat(path, simplify_cells=True, verify_compressed_data_integrity=True)
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever the bytes lead its reader to
+        raise BagError(f"{path}: is damaged or no .mat file ({_one_line(error)}); copy it again") from None
+    return _of_arrays(path, {name: value for name, value in variables.items() if not name.startswith("__")})
+
+
+def _read_npz(path: Path) -> RawTable:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > most_inflated(path.stat().st_size):
+                raise BagError(f"{path}: would take more memory than a recording of its size; check where it is from")
+        with np.load(path, allow_pickle=False) as arrays:
+            found: dict[str, Any] = {}
+            for name in arrays.files:
+                try:
+                    found[name] = arrays[name]
+                except ValueError as error:
+                    if "allow_pickle" not in str(error):
+                        raise
+                    found[name] = None  # objects, which may run a program when they are read
+    except (BagError, OSError, MemoryError):
+        raise
+    except Exception as error:  # whatever the bytes lead its reader to
+        raise BagError(f"{path}: is damaged or no .npz file ({_one_line(error)}); copy it again") from None
+    return _of_arrays(path, found)
+
+
+def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
+    """Columns among variables: vectors, and matrices whose lines are samples; records and structures field by field."""
+    found: dict[str, Any] = {}
+    notes: list[str] = []
+    waiting = list(variables.items())[::-1]
+    while waiting:
+        name, value = waiting.pop()
+        if isinstance(value, Mapping):
+            waiting += [(f"{name}_{key}", inner) for key, inner in list(value.items())[::-1]]
+            continue
+        array = np.asarray(value) if value is not None else np.empty(0, dtype=object)
+        if array.dtype.names:
+            waiting += [(f"{name}_{key}", array[key]) for key in reversed(array.dtype.names)]
+            continue
+        if array.ndim == 2 and 1 in array.shape:
+            array = array.ravel()
+        if array.dtype.kind == "M":
+            array = array.astype("datetime64[ns]")
+        elif array.dtype.kind in "US":
+            array = array.astype(str).astype(object)
+        elif array.dtype.kind == "O" and array.ndim == 1 and len(array) and all(isinstance(v, str) for v in array):
+            pass
+        elif array.dtype.kind in "bf":
+            array = array.astype(np.float64)
+        elif array.dtype.kind not in "iu":
+            notes.append(f"'{name}' left out, it is no array of numbers")
+            continue
+        if array.ndim in (1, 2) and array.shape[0] > 1:
+            found[name] = array
+        elif array.ndim:
+            notes.append(f"'{name}' left out, it is no vector")
+    return _of_one_length(path, found, notes)
+
+
+def _of_one_length(path: Path, found: Mapping[str, Column], notes: list[str]) -> RawTable:
+    """The columns of the length that most have; lines of a matrix count as samples, else its columns do."""
+    lengths = Counter(len(column) for column in found.values() if column.ndim == 1)
+    if not lengths:
+        lengths = Counter(len(column) for column in found.values())
+    if not lengths:
+        there = "; ".join(notes[:3]) or "nothing"
+        raise BagError(f"{path}: holds no column of numbers ({there}); save time and signals as vectors of one length")
+    length = max(lengths, key=lambda number: (lengths[number], number))
+    kept: dict[str, Column] = {}
+    for name, column in found.items():
+        if len(column) == length:
+            kept[name] = column
+        elif column.ndim == 2 and column.shape[1] == length:
+            kept[name] = column.T
+        else:
+            notes.append(f"'{name}' left out, it has {len(column)} entries and the others {length}")
+    return RawTable(kept, notes)
+
+
+def _wants(path: Path, package: str) -> str:
+    return (
+        f"{path}: reading it takes the Python package {package}, which is not installed; "
+        f"pip install 'uncertain-lti-ros[tables]'"
+    )
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 120 else text[:120] + " ..."
+
+
+_READERS: Mapping[str, Callable[[Path], RawTable]] = {
+    ".csv": _read_csv,
+    ".tsv": _read_csv,
+    ".parquet": _read_arrow,
+    ".feather": _read_arrow,
+    ".mat": _read_mat,
+    ".npz": _read_npz,
+}

@@ -1,0 +1,79 @@
+"""TableLayout: which columns of a table are its time and the run that a row is of."""
+
+from __future__ import annotations
+
+import reprlib
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from uncertain_lti.base.english import meant
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.signals.file_values import checked_mapping
+
+UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+"""Units of time that a column of numbers can have, with their nanoseconds."""
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+
+@dataclass(frozen=True, slots=True)
+class TableLayout:
+    """Which columns of a table (CSV, Parquet, .mat, .npz) say when and in which run a row was recorded.
+
+    Parameters
+    ----------
+    time : str or None, optional
+        Column of the time; None to look for one.
+    unit : {"s", "ms", "us", "ns"} or None, optional
+        Unit of a time column of numbers; None to take it from the column's name and size.
+    runs : str or None, optional
+        Column whose values tell the recordings in one file apart; None where a file is one recording.
+    """
+
+    time: str | None = None
+    unit: TimeUnit | None = None
+    runs: str | None = None
+
+    @classmethod
+    def from_dict(cls, data: Any, where: str) -> TableLayout:
+        """Build from the structure of a signals file or a model file.
+
+        Parameters
+        ----------
+        data : object
+            Mapping with any of the parameters.
+        where : str
+            File and key, for the error.
+
+        Returns
+        -------
+        TableLayout
+            The layout.
+
+        Raises
+        ------
+        SignalError
+            A key is unknown, or a value is wrong.
+        """
+        given = checked_mapping(data, where, {"time", "unit", "runs"})
+        for key in ("time", "runs"):
+            value = given.get(key)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, (str, int, float)) or not value):
+                raise SignalError(f"{where}: {key} is {reprlib.repr(value)}; write the name of a column, in quotes")
+        unit = given.get("unit")
+        if unit is not None and unit not in UNITS:
+            raise SignalError(
+                f"{where}: unit is {reprlib.repr(unit)}{meant(unit, UNITS)}; write one of {', '.join(UNITS)}"
+            )
+        names = {key: None if given.get(key) is None else str(given[key]) for key in ("time", "runs")}
+        return cls(names["time"], unit, names["runs"])
+
+    def to_dict(self) -> dict[str, str]:
+        """Return what `from_dict` takes, without what is left open.
+
+        Returns
+        -------
+        dict of str to str
+            Plain data.
+        """
+        return {key: value for key, value in asdict(self).items() if value is not None}

@@ -1,0 +1,416 @@
+"""Tables as recordings: the bits that the same data gives in MCAP, headers and times of every kind, and bad files."""
+
+import random
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uncertain_lti import SignalMap, UncertainLTI, read_transients
+from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.cli.main import main
+from uncertain_lti.recordings.formats import group_recordings, open_recording
+from uncertain_lti.recordings.table import Table
+from uncertain_lti.signals.table_layout import TableLayout
+
+ROOT = Path(__file__).resolve().parents[1]
+SHIPPED = ROOT / "bags/turbofan_pulses_up_large_noise.mcap"
+SIGNALS = ROOT / "config/signals/turbofan.yaml"
+
+
+def exact_seconds(t_ns):
+    return format(Decimal(int(t_ns)) / 10**9, "f")
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    (transient,) = read_transients(SHIPPED, SIGNALS)
+    return transient
+
+
+@pytest.fixture(scope="module")
+def names(shipped):
+    return [s.name for s in shipped.signals]
+
+
+def signals_of(names, states, table=""):
+    lines = ["additive: noise", *([f"table: {table}"] if table else []), "states:"]
+    for i, name in enumerate(names):
+        lines += ["controls:"] if i == states else []
+        lines.append(f"  - {{name: {name}, topic: /table, field: {name}, steady: auto, scale: auto}}")
+    return "\n".join(lines) + "\n"
+
+
+def rows_of(transient):
+    return np.hstack([transient.x, transient.u])
+
+
+def write_csv(path, transient, names, time=exact_seconds, head="time", delimiter=",", **options):
+    lines = [delimiter.join([head, *names])]
+    for t, row in zip(transient.t_ns, rows_of(transient), strict=True):
+        lines.append(delimiter.join([time(t), *map(repr, row.tolist())]))
+    path.write_text("\n".join(lines) + "\n", **options)
+    return path
+
+
+@pytest.fixture(scope="module")
+def tables(shipped, names, tmp_path_factory):
+    """The shipped bag's samples in every kind of file."""
+    folder = tmp_path_factory.mktemp("tables")
+    z, t = rows_of(shipped), shipped.t_ns
+    made = {".csv": write_csv(folder / "run.csv", shipped, names)}
+    made[".tsv"] = write_csv(folder / "run.tsv", shipped, names, str, "stamp_ns", "\t")
+    made[".npz"] = folder / "run.npz"
+    np.savez(made[".npz"], time_ns=t, **dict(zip(names, z.T, strict=True)))
+    made[".mat"] = folder / "run.mat"
+    from scipy.io import savemat
+
+    savemat(
+        made[".mat"], {"time_ns": t, "data": dict(zip(names, z.T, strict=True)), "rate": 40.0}, long_field_names=True
+    )
+    return made
+
+
+def expected_of(shipped):
+    return shipped.t_ns.tobytes(), shipped.x.tobytes(), shipped.u[:-1].tobytes()
+
+
+def given_by(transient):
+    return transient.t_ns.tobytes(), transient.x.tobytes(), transient.u[:-1].tobytes()
+
+
+@pytest.mark.parametrize("kind", [".csv", ".tsv", ".npz", ".mat"])
+def test_the_same_bits_as_in_mcap(tables, shipped, names, kind, tmp_path):
+    text = signals_of(names, len(shipped.signals.states))
+    if kind == ".mat":
+        text = "\n".join(line.replace("field: ", "field: data_") for line in text.split("\n"))
+    (tmp_path / "s.yaml").write_text(text)
+    (read,) = read_transients(tables[kind], tmp_path / "s.yaml")
+    assert len(read) > 1000 and given_by(read) == expected_of(shipped)
+
+
+def test_parquet_and_feather(shipped, names, tmp_path):
+    pa = pytest.importorskip("pyarrow", reason="pyarrow, of the extra tables, is not installed")
+    from pyarrow import feather, parquet
+
+    columns = {"when": shipped.t_ns.astype("datetime64[ns]"), **dict(zip(names, rows_of(shipped).T, strict=True))}
+    table = pa.table({name: pa.array(column) for name, column in columns.items()})
+    parquet.write_table(table, tmp_path / "run.parquet")
+    feather.write_feather(table, tmp_path / "run.feather")
+    (tmp_path / "s.yaml").write_text(signals_of(names, len(shipped.signals.states)))
+    for suffix in (".parquet", ".feather"):
+        (read,) = read_transients(tmp_path / f"run{suffix}", tmp_path / "s.yaml")
+        assert given_by(read) == expected_of(shipped)
+        (tmp_path / f"run{suffix}").write_bytes((tmp_path / f"run{suffix}").read_bytes()[:5000])
+        with pytest.raises(BagError, match=f"run{suffix}: is damaged or no {suffix} file"):
+            open_recording(tmp_path / f"run{suffix}")
+
+
+def test_without_pyarrow_the_sentence_names_the_command(tmp_path, monkeypatch):
+    import sys
+
+    for name in list(sys.modules):
+        if name.partition(".")[0] == "pyarrow":
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (tmp_path / "a.parquet").write_bytes(b"PAR1")
+    with pytest.raises(
+        BagError, match=r"package pyarrow, which is not installed; pip install 'uncertain-lti-ros\[tables\]"
+    ):
+        open_recording(tmp_path / "a.parquet")
+
+
+@pytest.mark.parametrize("kind", [".csv", ".npz"])
+def test_every_command_takes_them(tables, shipped, names, kind, tmp_path, capsys):
+    path, model, signals = str(tables[kind]), str(tmp_path / "m.model.json"), tmp_path / "s.yaml"
+    assert main(["topics", path]) == 0
+    assert f"/table: {', '.join(names)}" in capsys.readouterr().out
+    assert main(["init", path, "--output", str(tmp_path / "init.yaml")]) == 0
+    SignalMap.load(tmp_path / "init.yaml")
+    signals.write_text(signals_of(names, len(shipped.signals.states)))
+    assert main(["fit", path, "--signals", str(signals), "--output", model]) == 0
+    assert main(["check", model, path]) == 0
+    assert "100.000% inside all bounds" in capsys.readouterr().out
+    assert main(["validate", model]) == 0
+    assert main(["report", model, path, "--output", str(tmp_path / "r.html"), "-q"]) == 0
+    assert main(["check", model, path, "--write", str(tmp_path / "out.mcap")]) == 2
+    assert "a table, and only ROS recordings are copied; leave out --write" in capsys.readouterr().err
+    (expected,) = UncertainLTI.load(model).fit_summary["sources"]
+    assert expected["file"] == path and len(expected["sha256"]) == 64
+
+
+def test_the_model_of_a_table_is_that_of_the_bag(tables, shipped, names, tmp_path):
+    signals = tmp_path / "s.yaml"
+    text = signals_of(names, len(shipped.signals.states))
+    for s in shipped.signals:
+        points = f"steady: {s.steady!r}, scale: {s.scale!r}"
+        text = text.replace(f"field: {s.name}, steady: auto, scale: auto", f"field: {s.name}, {points}")
+    signals.write_text(text)
+    ours, theirs = tmp_path / "a.model.json", tmp_path / "b.model.json"
+    assert main(["fit", str(tables[".csv"]), "--signals", str(signals), "--output", str(ours), "-q"]) == 0
+    of_bag = ["fit", str(SHIPPED), "--signals", str(SIGNALS), "--additive", "noise", "--output", str(theirs), "-q"]
+    assert main(of_bag) == 0
+    one, two = UncertainLTI.load(ours), UncertainLTI.load(theirs)
+    for name in ("A", "dA", "B", "dB", "v"):
+        assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
+
+
+# --- what CSV files look like ---------------------------------------------------------------------------------
+
+DATA = [(0.0, 1.5, -2.0), (0.1, 1.25, 3.0), (0.2, 1e-3, 4.5), (0.3, 7.0, 5.0)]
+
+
+def lines(delimiter=",", point=".", time=lambda t: f"{t:.1f}"):
+    rows = [[time(t), repr(a), repr(b)] for t, a, b in DATA]
+    return "\n".join(delimiter.join(c.replace(".", point) for c in row) for row in rows) + "\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time,speed,cmd\n" + lines(),
+        "Time [s],speed,cmd\n" + lines(),
+        "time,speed,cmd\r\n" + lines().replace("\n", "\r\n"),
+        "\ufefftime,speed,cmd\n" + lines(),
+        '"time","speed","cmd"\n' + lines(),
+        "# made by a logger\n# 2026-11-22\ntime,speed,cmd\n" + lines(),
+        "# time,speed,cmd\n" + lines(),
+        "time,speed,cmd\ns,rpm,V\n" + lines(),
+        "Bench 3, run 7\n\ntime,speed,cmd\n[s],[rpm],[V]\n" + lines(),
+        "time;speed;cmd\n" + lines(";"),
+        "time;speed;cmd\n" + lines(";", ","),
+        "time\tspeed\tcmd\n" + lines("\t"),
+        "time, speed, cmd\n" + lines(", "),
+        "time,speed,cmd,\n" + lines().replace("\n", ",\n"),
+        "time_ms,speed,cmd\n" + lines(time=lambda t: f"{t * 1000:.0f}"),
+        "t (us),speed,cmd\n" + lines(time=lambda t: f"{t * 1e6:.0f}"),
+        "elapsed_time,speed,cmd\n" + lines(time=lambda t: f"0:00:{t:04.1f}"),
+        "index,time,speed,cmd\n" + "".join(f"{i},{line}\n" for i, line in enumerate(lines().split())),
+        "speed,cmd,time\n" + "".join(f"{a},{b},{t}\n" for t, a, b in DATA),
+        "x,speed,cmd\n" + lines(),  # nothing is called time: the first column, which grows
+    ],
+)  # fmt: skip
+def test_headers_delimiters_and_units(text, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(text, newline="")
+    table = Table(path)
+    assert (table.times - table.times[0]).tolist() == [0, 10**8, 2 * 10**8, 3 * 10**8]
+    assert list(table.columns_by_field)[-2:] == ["speed", "cmd"]
+    assert table.columns_by_field["speed"].tolist() == [a for _, a, _ in DATA]
+    assert table.columns_by_field["cmd"].tolist() == [b for _, _, b in DATA]
+
+
+@pytest.mark.parametrize(
+    ("cells", "first"),
+    [
+        (["2026-11-22T06:28:01.25Z", "2026-11-22T06:28:01.35Z"], 1795328881250000000),
+        (["2026-11-22 06:28:01.25", "2026-11-22 06:28:01.350"], 1795328881250000000),
+        (["2026-11-22T08:28:01,250+02:00", "2026-11-22T08:28:01,350+0200"], 1795328881250000000),
+        (["1795328881.250000001", "1795328881.350000001"], 1795328881250000001),
+        (["1795328881250000001", "1795328881350000001"], 1795328881250000001),
+        (["1795328881250", "1795328881350"], 1795328881250000000),
+        (["-0.5", "-0.4"], -500000000),
+    ],
+)
+def test_times_are_exact(cells, first, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,x\n" + "".join(f'"{cell}",1.0\n' for cell in cells))
+    assert Table(path).times.tolist() == [first, first + 10**8]
+
+
+def test_columns_that_are_no_field_paths_get_names(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,Speed [rpm],/odom/twist/x,2nd,x,x,ok\n0,1,2,3,4,5,true\n1,1,2,3,4,6,false\n")
+    table = Table(path)
+    assert list(table.columns_by_field) == ["Speed_rpm", "odom_twist_x", "c_2nd", "x", "x_2", "ok"]
+    assert table.columns_by_field["ok"].tolist() == [1.0, 0.0]
+
+
+def test_what_is_missing_is_nan_and_what_is_odd_is_reported(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,x,y,label\n0,1,,a\n0.1,NA,2,b\n,3,3,c\n0.3,ERR,4,d\n0.4,5,5,e\n0.5,6")
+    table = Table(path)
+    np.testing.assert_array_equal(table.columns_by_field["x"], [1, np.nan, np.nan, 5])
+    np.testing.assert_array_equal(table.columns_by_field["y"], [np.nan, 2, 4, 5])
+    assert table.type_fields("/table")("table")["label"].kind == "string"
+    assert [w.removeprefix(f"{path}: ") for w in table.warnings] == [
+        "1 line with another number of cells left out, the first is line 7 (the file ends in it)",
+        "column 'x': 1 cell that is no number (such as 'ERR') left out",
+        "1 row without a time left out",
+    ]
+
+
+def test_a_matrix_is_an_array(tmp_path):
+    np.savez(tmp_path / "a.npz", t=np.arange(5.0), q=np.arange(10.0).reshape(5, 2), name=np.array("bench"))
+    table = open_recording(tmp_path / "a.npz")
+    assert [f.fields for f in table.facts()] == [("q[0..1]",)]
+    signals = SignalMap.from_dict({"states": [{"name": "q1", "topic": "/table", "field": "q[1]"}]})
+    (read,) = read_transients(tmp_path / "a.npz", signals)
+    assert read.x[:, 0].tolist() == [1.0, 3.0, 5.0, 7.0, 9.0]
+
+
+# --- what the signals file says -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def many(tmp_path):
+    """Three runs in one file, each from time 0, row by row."""
+    rng = np.random.default_rng(1)
+    rows = ["trial,clock,v,u"]
+    for trial in (3, 1, 2):
+        x = 0.0
+        for k in range(200):
+            u = float(rng.integers(-1, 2)) if k % 7 == 0 else u  # noqa: F821
+            rows.append(f"{trial},{k * 20},{x!r},{u!r}")
+            x += 0.02 * (-2 * x + 3 * u) + float(rng.normal(0, 1e-3))
+    (tmp_path / "many.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "s.yaml").write_text(
+        "additive: noise\ntable: {time: clock, unit: ms, runs: trial}\n"
+        "states:\n  - {name: v, topic: /table, field: v}\ncontrols:\n  - {name: u, topic: /table, field: u}\n"
+    )
+    return tmp_path / "many.csv"
+
+
+def test_runs_in_one_file_are_recordings(many, tmp_path, capsys):
+    runs = read_transients(many, tmp_path / "s.yaml")
+    assert [Path(r.name).name for r in runs] == ["many.csv[3]", "many.csv[1]", "many.csv[2]"]
+    assert [len(r) for r in runs] == [200] * 3 and not any(r.counters["equal stamp"] for r in runs)
+    model = tmp_path / "m.model.json"
+    assert main(["fit", str(many), "--signals", str(tmp_path / "s.yaml"), "--output", str(model)]) == 0
+    assert "left out one recording of 3 at a time" in capsys.readouterr().out
+    loaded = UncertainLTI.load(model)
+    assert loaded.signals.table == TableLayout("clock", "ms", "trial")
+    assert len(loaded.fit_summary["sources"]) == 1 and loaded.fit_summary["transients"] == 3
+    assert main(["check", str(model), str(many)]) == 0
+    assert capsys.readouterr().out.count("199 verdicts") == 3
+    assert main(["check", str(model), f"{many}[1]"]) == 0
+    assert capsys.readouterr().out.count("199 verdicts") == 1
+    assert main(["validate", str(model)]) == 0
+    assert "(3 recordings)" in capsys.readouterr().out
+    assert main(["validate", str(model), "--group", r"name=\[(\d)\]"]) == 0
+    cached = tmp_path / "c.model.json"
+    assert (
+        main(
+            [
+                "fit",
+                str(many),
+                "--signals",
+                str(tmp_path / "s.yaml"),
+                "--output",
+                str(cached),
+                "--cache",
+                str(tmp_path / "cache"),
+            ]
+        )
+        == 0
+    )
+    np.testing.assert_allclose(UncertainLTI.load(cached).A, loaded.A, rtol=1e-6)
+    with pytest.raises(BagError, match=r"there is no run '9' in .*; there are 3, 1, 2"):
+        open_recording(f"{many}[9]", layout=TableLayout("clock", "ms", "trial"))
+    with pytest.raises(BagError, match="holds 3 recordings; name one of them"):
+        open_recording(many, layout=TableLayout("clock", "ms", "trial"))
+
+
+def test_without_a_column_of_runs_a_step_back_begins_a_segment(many):
+    signals = SignalMap.from_dict({
+        "table": {"time": "clock", "unit": "ms"},
+        "states": [{"name": "v", "topic": "/table", "field": "v"}],
+    })  # fmt: skip
+    (run,) = read_transients(many, signals)
+    assert len(run) == 600 and len(np.unique(run.segment)) == 3
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("{time: clok}", r"there is no column 'clok', which the signals file names for the time \(is clock meant\?\)"),
+        ("{time: clock, runs: run}", "there is no column 'run', which the signals file names for the runs"),
+        ("{when: clock}", r"s.yaml: table: unknown key 'when'"),
+        ("{unit: min}", r"s.yaml: table: unit is 'min'.*; write one of s, ms, us, ns"),
+        ("{time: []}", r"s.yaml: table: time is \[\]; write the name of a column"),
+        ("5", r"s.yaml: table: a mapping is wanted here, not a number"),
+    ],
+)
+def test_what_is_wrong_with_the_layout_is_said(many, tmp_path, table, words):
+    text = (tmp_path / "s.yaml").read_text().split("\n")
+    (tmp_path / "s.yaml").write_text("\n".join([f"table: {table}", *text[2:]]))
+    with pytest.raises((BagError, SignalError), match=words):
+        read_transients(many, tmp_path / "s.yaml")
+
+
+def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
+    signals = SignalMap.from_dict({"states": [{"name": "v", "topic": "/table", "field": "fan_sped"}]})
+    with pytest.raises(
+        SignalError, match=r"run\.csv: field 'fan_sped' of /table .*\(is fan_speed meant\?\).*fields there:"
+    ):
+        read_transients(tables[".csv"], signals)
+    with pytest.raises(BagError, match=r"run\.csv: there is no topic /engine/state; topics there: /table"):
+        read_transients(tables[".csv"], SIGNALS)
+
+
+# --- bad and hostile files --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("a.csv", b"", "the file is empty"),
+        ("a.csv", b"time,x\n", "there is no line of numbers in it"),
+        ("a.csv", b"time\n1\n2\n", "there is one column only in it"),
+        ("a.csv", b"hello\nworld\n", "there is no line of numbers in it"),
+        ("a.csv", b"\x00\x01\x02" * 100, "holds bytes that are no text"),
+        ("a.csv", b"time x y\n1 2 3\n2 3 4\n", "apart by spaces alone"),
+        ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
+        ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
+        ("a.csv", b"time,y\n22/11/2026 06:28,2\n22/11/2026 06:29,3\n", "neither a number nor an ISO time"),
+        ("a.csv", b"time,y\n2026-13-22T06:28:00,2\n2026-11-22T06:28:01,3\n", "is no day or time that there is"),
+        ("a.csv", b"time,y\n1e300,2\n2e300,3\n", "is past the year 2262"),
+        ("a.npz", b"PK\x03\x04nothing", "is damaged or no .npz file"),
+        ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "is damaged or no .mat file|holds no column"),
+        ("a.mat", b"MATLAB 7.3 MAT-file" + bytes(200), r"save\('a.mat', '-v7'\)"),
+    ],
+)
+def test_a_file_that_is_no_table_is_a_sentence(tmp_path, name, data, words):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(BagError, match=words) as caught:
+        open_recording(tmp_path / name)
+    assert str(caught.value).startswith(str(tmp_path / name)) and "\n" not in str(caught.value)
+
+
+def test_objects_in_a_file_are_not_loaded(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "exploded",))
+
+    np.savez(tmp_path / "a.npz", t=np.arange(3.0), x=np.ones(3), bomb=np.array([Bomb()], dtype=object))
+    assert list(open_recording(tmp_path / "a.npz").columns_by_field) == ["x"]
+    assert not (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("kind", [".csv", ".npz", ".mat"])
+def test_damage_anywhere_is_read_or_a_sentence(tables, kind, tmp_path):
+    data = tables[kind].read_bytes()
+    path = tmp_path / f"hurt{kind}"
+    rng = random.Random(3)
+    for _ in range(25):
+        hurt = bytearray(data)
+        where = rng.randrange(len(hurt)) if rng.random() < 0.5 else rng.randrange(2000)
+        hurt[where : where + rng.choice([1, 4, 100])] = rng.randbytes(rng.choice([1, 4, 100]))
+        path.write_bytes(hurt[: rng.randrange(1, len(hurt))] if rng.random() < 0.3 else hurt)
+        try:
+            list(open_recording(path).facts())
+        except BagError as error:
+            assert str(error).startswith(str(path)) and "\n" not in str(error)
+
+
+def test_a_folder_of_tables_is_not_one_recording(tables):
+    with pytest.raises(
+        BagError, match=r"a folder of tables, each of which is a recording; name them one by one: run.csv"
+    ):
+        group_recordings([tables[".csv"].parent])
+
+
+def test_a_run_named_without_a_column_for_it(tables):
+    with pytest.raises(BagError, match=r"names a run; say in the signals file which column does"):
+        open_recording(f"{tables['.csv']}[2]")
