@@ -192,7 +192,12 @@ def test_what_pip_installs_covers_what_is_imported(distribution):
 def test_package_xml_covers_what_is_imported(package):
     keys = {element.text for element in package.iter("exec_depend")}
     outside = imported("core", "uncertain_lti_ros", "launch")
-    optional = WITHOUT_ROSDEP_KEY | {"isal", "pandas", "cython"}  # data frames are handed in by who has pandas
+    optional = WITHOUT_ROSDEP_KEY | {
+        "isal",
+        "pandas",
+        "pyarrow",
+        "cython",
+    }  # data frames are handed in by who has pandas
     missing = {n: p for n, p in outside.items() if n not in optional and ROSDEP_KEY.get(n, n) not in keys}
     assert not missing
 
