@@ -34,7 +34,7 @@ def known_words(path: Path) -> set[str]:
 
 def wanting(command: str) -> list[str]:
     """What of a command does not exist."""
-    program, *words = shlex.split(command)
+    program, *words = itertools.dropwhile(lambda word: re.match(r"[A-Z_]+=", word), shlex.split(command))
     if program == "uncertain-lti":
         try:
             build_parser(words[0]).parse_args(words)

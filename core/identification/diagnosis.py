@@ -186,7 +186,7 @@ def describe(
     def place(some: Sequence[int]) -> str:
         return _where(problem, some, transients)
 
-    broken = [*sensors.coded(problem, signals), *sensors.flipped(problem, signals, place)]
+    broken = [*sensors.coded(problem, sums, signals), *sensors.flipped(problem, signals, place)]
     messages = [*broken, *messages]
     messages += [*([] if broken else _carried(few, discarded, problem, names, place)), *alike]
     known = memory(part)
@@ -221,7 +221,7 @@ def describe(
     columns = problem.columns
     if not columns.noise and not columns.disturbance:
         messages += _near_rest(problem, part, sums, mean_width, states)
-    messages += _wide(problem, mean_width, states, known, few, bool(slow) and SLOW in slow[0], follow)
+    messages += _wide(sums, mean_width, states, known, few, bool(slow) and SLOW in slow[0], follow)
     if columns.drift and columns.noise and not columns.disturbance:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return found, messages
@@ -383,7 +383,7 @@ def _slow(model: UncertainLTI, known: Memory, apart: bool, hidden: bool) -> list
 
 
 def _wide(
-    problem: Problem,
+    sums: Moments,
     mean_width: Array,
     states: Sequence[str],
     known: Memory,
@@ -392,7 +392,7 @@ def _wide(
     follow: Collection[int],
 ) -> list[str]:
     """States whose envelope is as wide as what they do, and why where something is known."""
-    span = np.ptp(problem.z[:, : problem.n], axis=0)
+    span = (sums.high - sums.low)[: len(mean_width)]
     wide = np.flatnonzero((span > 0) & (mean_width > WIDE * span)).tolist()
     groups: dict[str, list[int]] = {}
     for i in wide:
@@ -460,7 +460,7 @@ def _near_rest(problem: Problem, part: Problem, sums: Moments, mean_width: Array
     floor = 1e-9 * np.abs(part.z_columns[: part.n]).max(axis=1)  # below it both are rounding
     box = _least_squares_box(part, sums)
     if part is not problem and (mean_width > 0.7 * box).any():  # the band of all samples is no narrower: a screen
-        box = _least_squares_box(problem, sums)
+        box = _least_squares_box(problem, sums, enough=mean_width / 0.7)
     suspect = [i for i in range(problem.n) if mean_width[i] > 0.7 * box[i] > floor[i]]
     if not suspect:
         return []
@@ -506,8 +506,11 @@ def _gain(problem: Problem, size: Array) -> Array:
     return np.asarray(widths[0] / np.maximum(widths[1], 1e-300))
 
 
-def _least_squares_box(problem: Problem, sums: Moments) -> Array:
-    """Width of a constant band around least squares that contains every sample, (n,), per step."""
+def _least_squares_box(problem: Problem, sums: Moments, enough: Array | None = None) -> Array:
+    """Width of a constant band around least squares that contains every sample, (n,), per step.
+
+    Where it is known to reach `enough` in every state, what it reaches beyond is not sought.
+    """
     free = sums.phi_scale > 0
     theta = np.zeros(sums.target.shape)
     theta[free] = np.linalg.lstsq(sums.centre[np.ix_(free, free)], sums.target[free], rcond=None)[0]
@@ -515,4 +518,6 @@ def _least_squares_box(problem: Problem, sums: Moments) -> Array:
     for block in problem.blocks():
         residual = np.abs(block.rate() - theta.T @ block.phi(problem.columns)) * block.dt
         largest = np.maximum(largest, residual.max(axis=1))
+        if enough is not None and (2.0 * largest >= enough).all():
+            break
     return 2.0 * largest

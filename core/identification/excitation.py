@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
 
@@ -170,7 +170,7 @@ def lost(problem: Problem, moments: Moments, known: Collection[int] = ()) -> dic
     certainty = _certainty(centre, target, moments.rate_square, moments.count)
     found = {}
     for row, j in enumerate(free.tolist()):
-        if not problem.n <= j < problem.p or j in known or np.ptp(problem.z[:, j]) == 0:
+        if not problem.n <= j < problem.p or j in known or moments.low[j] == moments.high[j]:
             continue
         best = int(np.argmax(certainty[row]))
         if certainty[row, best] < DETERMINED:
@@ -205,7 +205,7 @@ def _certainty(gram: Array, cross: Array, total: Array, count: int) -> Array:
     inverse = np.linalg.pinv(gram, hermitian=True)
     theta = inverse @ cross
     residual = np.maximum(total - np.einsum("ji,ji->i", theta, cross), 1e-14 * total)
-    error = np.sqrt(np.outer(np.diagonal(inverse), residual / (count - len(gram))))
+    error = np.sqrt(np.maximum(np.outer(np.diagonal(inverse), residual / (count - len(gram))), 0.0))
     return np.asarray(np.abs(theta) / np.maximum(error, 1e-300))
 
 
@@ -260,24 +260,74 @@ def unexplained(gram: Array, cross: Array, total: Array) -> Array:
 
     Parameters
     ----------
-    gram : array (b, b)
-        Products of the regressors with one another.
-    cross : array (b, t)
+    gram : array (..., b, b)
+        Products of the regressors with one another; leading axes are other choices of regressors.
+    cross : array (..., b, t)
         Products of the regressors with the targets.
     total : array (t,)
         Sums of squares of the targets.
 
     Returns
     -------
-    array (t,)
+    array (..., t)
         At least 1e-11 of `total`.
     """
-    size = np.sqrt(np.diagonal(gram))
+    size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
-    values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
-    keep = values > 1e-11 * values[-1]
-    turned = (vectors[:, keep] / np.sqrt(values[keep])).T @ (cross * unit[:, None])
-    return np.asarray(np.maximum(total - np.einsum("bt,bt->t", turned, turned), 1e-11 * total))
+    values, vectors = np.linalg.eigh(gram * unit[..., :, None] * unit[..., None, :])
+    keep = values > 1e-11 * values[..., -1:]
+    root = np.divide(1.0, np.sqrt(values, where=keep, out=np.ones_like(values)), where=keep, out=np.zeros_like(values))
+    turned = np.swapaxes(vectors * root[..., None, :], -1, -2) @ (cross * unit[..., :, None])
+    return np.asarray(np.maximum(total - np.einsum("...bt,...bt->...t", turned, turned), 1e-11 * total))
+
+
+def triangle(columns: Array) -> Array:
+    """A small matrix on which least squares is what it is on long columns, to the same digits.
+
+    Parameters
+    ----------
+    columns : array (c, N)
+        Regressors and targets.
+
+    Returns
+    -------
+    array (at most c, c)
+        R of the QR decomposition of `columns`ᵀ, so that any sum of products of two columns is that of R's columns.
+    """
+    c, N = columns.shape
+    width = max(500, 4 * c)  # stretches that stay in the cache
+    whole = N - N % width
+    parts = [columns[:, whole:].T]
+    if whole:
+        reduced = np.asarray(np.linalg.qr(columns[:, :whole].T.reshape(-1, width, c), mode="r"))
+        parts.append(reduced.reshape(-1, c))
+    return np.asarray(np.linalg.qr(np.vstack(parts), mode="r"))
+
+
+def least_squares(triangular: Array, regressors: Index, targets: Index, count: int) -> tuple[Array, int]:
+    """Least squares on some columns, from the `triangle` of all.
+
+    Parameters
+    ----------
+    triangular : array (..., c)
+        Of `triangle`.
+    regressors : array (b,) of int
+        Columns.
+    targets : array (t,) of int
+        Columns.
+    count : int
+        Length of the columns, N: rounding grows with it.
+
+    Returns
+    -------
+    array (b, t)
+        Elements; the least ones where the regressors are dependent.
+    int
+        Rank of the regressors.
+    """
+    limit = float(np.finfo(np.float64).eps) * max(count, len(regressors))
+    found, _, rank, _ = np.linalg.lstsq(triangular[:, regressors], triangular[:, targets], rcond=limit)
+    return np.asarray(found), int(rank)
 
 
 def successive(problem: Problem) -> NDArray[np.intp]:

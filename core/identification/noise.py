@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.identification.excitation import successive
+from uncertain_lti.identification.excitation import least_squares, successive, triangle
 from uncertain_lti.identification.problem import Problem
 
 NOISE = 0.5
@@ -65,11 +65,14 @@ def predicted(X: Array, U: Array, after: Array) -> Array:
     array (k,)
         At most 1; without the share that any regressor explains by chance, so that it can be negative.
     """
-    design = np.column_stack([X, U, np.ones(len(X))])
-    design = design / np.maximum(np.abs(design).max(axis=0), 1e-300)
-    rest = after - design @ np.linalg.lstsq(design, after, rcond=None)[0]
+    design = np.vstack([X.T, U.T, np.ones(len(X))])
+    design /= np.maximum(np.abs(design).max(axis=1), 1e-300)[:, None]
+    reduced = triangle(np.vstack([design, after.T]))
+    regressors, targets = np.split(np.arange(reduced.shape[1]), [len(design)])
+    answer, rank = least_squares(reduced, regressors, targets, len(X))
+    rest = reduced[:, targets] - reduced[:, regressors] @ answer
     total = ((after - after.mean(axis=0)) ** 2).sum(axis=0)
-    freedom = max(len(X) - np.linalg.matrix_rank(design), 1)
+    freedom = max(len(X) - rank, 1)
     left = (rest**2).sum(axis=0) * (len(X) - 1) / freedom  # without the share that any regressor explains by chance
     return np.asarray(1.0 - left / np.maximum(total, 1e-300))
 
@@ -96,14 +99,18 @@ def memory(problem: Problem) -> Memory:
     follows = successive(problem)
     if len(follows) < 20 * p:
         return Memory(share, np.inf)
-    before, now, after = problem.z[follows, :n], problem.z[follows + 1], problem.x_next[follows + 1]
-    one = np.ones((len(now), 1))
-    regressors = np.hstack([now, one])
-    instruments = np.hstack([before, problem.z[follows, n:], now[:, n:], one])
-    projected = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
+    count, z = len(follows), problem.z_columns
+    reduced = triangle(
+        np.vstack([z[:, follows], z[:, follows + 1], np.ones(count), problem.next_columns[:, follows + 1]])
+    )
+    before, now, after = np.arange(p), np.arange(p, 2 * p + 1), np.arange(2 * p + 1, 2 * p + 1 + n)
+    instruments = np.concatenate([before, now[n:]])
+    projected = reduced[:, instruments] @ least_squares(reduced, instruments, now, count)[0]
     speeds = []
-    for design in (regressors, projected):
-        values, vectors = np.linalg.eig(np.linalg.lstsq(design, after, rcond=None)[0][:n].T)
+    for design in (reduced[:, now], projected):
+        both = np.hstack([design, reduced[:, after]])
+        found, _ = least_squares(both, np.arange(p + 1), np.arange(p + 1, p + 1 + n), count)
+        values, vectors = np.linalg.eig(found[:n].T)
         parts = np.abs(vectors)
         seen = [(share[parts[:, j] >= _OWN * parts[:, j].max()] >= NOISE).all() for j in range(n)]
         speeds.append(float(np.max(np.abs(1.0 - values[seen]), initial=0.0)))

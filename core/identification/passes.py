@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
-from uncertain_lti.identification.problem import Block, Partition
+from uncertain_lti.identification.problem import Block, Columns, Partition
 from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
@@ -173,10 +173,11 @@ def occupied(partition: Partition, least: Array, greatest: Array, cells: int, st
     first, second = pairs_of(partition.p)
     found = np.zeros((len(first), cells, cells), dtype=bool)
     per_unit = cells_per_unit(least, greatest, cells)
-    for block in partition.blocks():
-        place = cell_of(block.z[:, ::stride].T, least, per_unit, cells - 1).T
-        for pair, (i, j) in enumerate(zip(first, second, strict=True)):
-            found[pair, place[i], place[j]] = True
+    begin, per_unit = least[:, None], per_unit[:, None]
+    place = np.hstack([cell_of(block.z[:, ::stride], begin, per_unit, cells - 1) for block in partition.blocks()])
+    row = place * cells
+    for cell, i, j in zip(found.reshape(len(first), -1), first, second, strict=True):
+        cell[row[i] + place[j]] = True
     return found
 
 
@@ -214,11 +215,14 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
             first = -(block.start + offset) % stride
             sampled.append(block.every(first, stride))
             index.append(np.arange(first, len(block), stride) + (block.start + offset))
-        phi = block.phi(columns) * block.dt
+        # a constant step goes into the sums
+        constant = bool((block.dt == block.dt[0]).all())
+        unit = float(block.dt[0]) if constant else 1.0
+        phi = block.phi(columns) if constant else block.phi(columns) * block.dt
         psi = np.empty((q, len(block)))
         np.abs(phi[:p], out=psi[:p])  # Δt > 0
         for row, term in zip(psi[p:], columns.half, strict=True):
-            row[:] = block.dt if term.times_dt else 1.0
+            row[:] = (block.dt if term.times_dt else 1.0) / unit
         step = block.x_next - block.z[:n]
         weights = block.weights
         gram = np.stack([_gram(psi * weights[:, i], psi) for i in range(n)]) if weights.ndim == 2 else None
@@ -231,13 +235,13 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
                     parts[j, :, i] = parts[i, :, j].T
             coupled = parts.reshape(n * q, n * q)
         found = Moments(
-            _gram(psi, psi),
-            gram,
-            coupled,
-            _gram(phi, phi),
-            _gram(phi, step),
+            _gram(psi, psi) * unit**2,
+            None if gram is None else gram * unit**2,
+            None if coupled is None else coupled * unit**2,
+            _gram(phi, phi) * unit**2,
+            _gram(phi, step) * unit,
             np.einsum("ik,ik->i", step, step),
-            psi.sum(axis=1),
+            psi.sum(axis=1) * unit,
             block.z.min(axis=1),
             block.z.max(axis=1),
             float(block.dt.min()),
@@ -325,18 +329,6 @@ class Samples:
         )
 
 
-def _take(block: Block, i: int, chosen: Index, offset: int) -> Samples:
-    z, dt = block.z[:, chosen], block.dt[chosen]
-    root = block.root_weights()[i]
-    return Samples(
-        chosen + (block.start + offset),
-        z,
-        (block.x_next[i, chosen] - z[i]) / dt,
-        dt,
-        root[chosen] if len(root) > 1 else np.broadcast_to(root, len(dt)),
-    )
-
-
 @dataclass(frozen=True)
 class Candidate:
     """A solution to check on all samples, and the units in which its slack is measured.
@@ -399,20 +391,20 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     theta, d = np.ascontiguousarray(candidate.theta.T), np.ascontiguousarray(candidate.d.T)
     n = len(theta)
     rows = slice(part.n) if n == part.n else candidate.rows  # a slice is no copy
-    found: list[list[Samples]] = [[] for _ in range(n)]
-    slacks: list[list[Array]] = [[] for _ in range(n)]
-    kept = [0] * n
+    found: list[_Near] = []
+    kept = np.zeros(n, dtype=np.intp)
     reach = np.minimum(candidate.reach, 1e100)  # inf asks for all, and inf x 0 is nothing
 
     # slack < reach is a comparison with half-widths that are smaller, for the width of (11) larger, by the reach
-    def shifted() -> tuple[Array, Array]:
-        unit = candidate.size_unit
-        return (
-            d - np.outer(reach * candidate.scale, unit),
-            d + np.outer(np.minimum(reach, candidate.room) * candidate.scale, unit),
+    def shifted() -> Array:
+        inner = d - np.outer(reach * candidate.scale, candidate.size_unit)
+        if candidate.limit is None:
+            return inner
+        return np.vstack(
+            [inner, d + np.outer(np.minimum(reach, candidate.room) * candidate.scale, candidate.size_unit)]
         )
 
-    inner, outer = shifted()
+    halves = shifted()
     for block in _pieces(part):
         psi = block.psi(columns)
         # a constant step goes into the elements, unless the transitions are too few for it to save time
@@ -425,56 +417,97 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
             rate /= block.dt
         residual -= rate
         np.abs(residual, out=residual)
-        below = residual > _product(inner * (step or 1.0), psi)
+        half = _product(halves * (step or 1.0), psi)
+        below = residual > half[:n]
         if candidate.limit is not None:
-            width = _product(outer * (step or 1.0), psi)
+            width = half[n:]
             if not step:
                 width *= block.dt
             root = block.root_weights()
             below |= width > candidate.limit[:, None] / (2.0 * (root if len(root) == 1 else root[rows]))
-        changed = False
-        for i, row in enumerate(below):
-            chosen = np.flatnonzero(row)
-            if not len(chosen):
-                continue
-            found[i].append(_take(block, int(candidate.rows[i]), chosen, offset))
-            slacks[i].append(_slack(candidate, i, psi[:, chosen], residual[i, chosen] / (step or 1.0), found[i][-1]))
-            kept[i] += len(chosen)
-            if kept[i] > 2 * candidate.most:
-                found[i], slacks[i], reach[i] = _least(found[i], slacks[i], candidate.most, part.p, reach[i])
-                kept[i] = len(found[i][0])
-                changed = True
-        if changed:
-            inner, outer = shifted()
-    pairs = []
-    for i in range(n):
-        samples, _, held = _least(found[i], slacks[i], candidate.most, part.p, reach[i])
-        pairs.append((samples[0], held if candidate.limit is None else min(held, float(candidate.room[i]))))
-    return pairs
+        chosen = np.flatnonzero(below)
+        if not len(chosen):
+            continue
+        found.append(_near(candidate, block, columns, chosen, residual.ravel()[chosen] / (step or 1.0), offset))
+        kept += np.bincount(found[-1].row, minlength=n)
+        if (kept > 2 * candidate.most).any():
+            near = _Near.join(found)
+            each, reach = _least(near, n, candidate.most, reach)
+            found, kept = [near[np.sort(np.concatenate(each))]], np.array([len(some) for some in each])
+            halves = shifted()
+    samples = [Samples.join([], p)] * n
+    if found:
+        near = _Near.join(found)
+        each, reach = _least(near, n, candidate.most, reach)
+        samples = [near.samples[some] for some in each]
+    held = reach if candidate.limit is None else np.minimum(reach, candidate.room)
+    return list(zip(samples, held.tolist(), strict=True))
 
 
-def _slack(candidate: Candidate, i: int, psi: Array, residual: Array, samples: Samples) -> Array:
-    """Slack of some samples of row i, in scaled units; see `scan`."""
-    half = candidate.d[:, i] @ psi
+@dataclass(frozen=True)
+class _Near:
+    """Samples of several rows with their slack; those of a row are in order of index."""
+
+    row: Index
+    samples: Samples
+    slack: Array
+
+    def __getitem__(self, chosen: Index) -> _Near:
+        return _Near(self.row[chosen], self.samples[chosen], self.slack[chosen])
+
+    @classmethod
+    def join(cls, parts: Sequence[_Near]) -> _Near:
+        """One after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        samples = [part.samples for part in parts]
+        return cls(
+            np.concatenate([part.row for part in parts]),
+            Samples(
+                np.concatenate([s.index for s in samples]),
+                np.hstack([s.z for s in samples]),
+                np.concatenate([s.rate for s in samples]),
+                np.concatenate([s.dt for s in samples]),
+                np.concatenate([s.root_weight for s in samples]),
+            ),
+            np.concatenate([part.slack for part in parts]),
+        )
+
+
+def _near(candidate: Candidate, block: Block, columns: Columns, chosen: Index, residual: Array, offset: int) -> _Near:
+    """Samples of a piece; chosen (K,): row of the candidate x length of the piece + transition; residual (K,)."""
+    row, k = np.divmod(chosen, len(block))
+    which = candidate.rows[row]
+    z, dt = block.z[:, k], block.dt[k]
+    root = block.root_weights()
+    psi = Block(block.start, z, z, dt, block.weights).psi(columns)
+    samples = Samples(
+        k + (block.start + offset),
+        z,
+        (block.x_next[which, k] - z[which, np.arange(len(k))]) / dt,
+        dt,
+        root[which, k if root.shape[1] > 1 else 0],
+    )
+    half = np.einsum("qk,qk->k", candidate.d[:, row], psi)
     slack = half - residual
     if candidate.limit is not None:
-        slack = np.minimum(slack, candidate.limit[i] / (2.0 * samples.root_weight * samples.dt) - half)
+        slack = np.minimum(slack, candidate.limit[row] / (2.0 * samples.root_weight * dt) - half)
     size = candidate.size_unit @ psi
     size[size == 0.0] = 1.0  # at rest without an additive term nothing but rest is contained
-    return np.asarray(slack / (size * candidate.scale[i]))
+    return _Near(row, samples, slack / (size * candidate.scale[row]))
 
 
-def _least(
-    found: list[Samples], slacks: list[Array], most: int, p: int, reach: float
-) -> tuple[list[Samples], list[Array], float]:
-    if not found:
-        return [Samples.join([], p)], [np.empty(0)], reach
-    samples, slack = Samples.join(found, p), np.concatenate(slacks)  # both in order of index
-    if len(slack) > most:
-        order = np.argpartition(slack, most)
-        chosen, reach = np.sort(order[:most]), float(slack[order[most]])
-        samples, slack = samples[chosen], slack[chosen]
-    return [samples], [slack], reach
+def _least(near: _Near, rows: int, most: int, reach: Array) -> tuple[list[Index], Array]:
+    """Positions of the samples of least slack, at most so many per row, and below which slack none is missing."""
+    each, reach = [], reach.copy()
+    for i in range(rows):
+        own = np.flatnonzero(near.row == i)
+        if len(own) > most:
+            order = np.argpartition(near.slack[own], most)
+            reach[i] = near.slack[own[order[most]]]
+            own = np.sort(own[order[:most]])
+        each.append(own)
+    return each, reach
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -442,9 +442,12 @@ class Problem:
             With the same columns.
         """
         weights = self.weights if self.weights.ndim == 1 else self.weights[index]
+        z, x_next = self.z_columns[:, index], self.next_columns[:, index]
+        if not isinstance(index, slice):  # numpy would lay the copy out in rows
+            z, x_next = np.ascontiguousarray(z), np.ascontiguousarray(x_next)
         return Problem(
-            self.z_columns[:, index],
-            self.next_columns[:, index],
+            z,
+            x_next,
             self.dt[index],
             self.source[index],
             self.k[index],
@@ -546,31 +549,37 @@ def assemble(
     """
     n = len(point.x_s)
     steps = [t.transitions() for t in transients]
-    k = np.concatenate([s.k for s in steps])
-    source = np.repeat(np.arange(len(steps)), [len(s.k) for s in steps])
+    k = _joined([s.k for s in steps])
+    source = np.zeros(len(k), dtype=np.intp)
+    for number, stop in enumerate(np.cumsum([len(s.k) for s in steps])[:-1], start=1):
+        source[stop:] = number
     if not len(k) and not empty:
         names = ", ".join(t.name for t in transients)
         raise FitError(
             f"{names}: no usable transition among {plural(sum(len(t) for t in transients), 'sample')}; "
             f"{_without_values(transients)}"
         )
-    dt = np.concatenate([s.dt for s in steps])
+    dt = _joined([s.dt for s in steps])
     p = n + len(point.u_s)
-    z = np.empty((p, len(dt)))
-    x_next = np.empty((n, len(dt)))
-    start = 0
+    samples = np.empty((p, len(dt) + 1))
+    z = samples[:, :-1]
+    shared = len(steps) == 1 and steps[0].consecutive  # the next sample is the next column
+    x_next = samples[:n, 1:] if shared else np.empty((n, len(dt)))
+    start, square = 0, 0.0
     for s in steps:
         stop = start + len(s.dt)
         part = slice(start, stop)
         start = stop
-        _normalise(s.x, point.x_s, point.X, z[:n, part])
-        _normalise(s.u, point.u_s, point.U, z[n:, part])
-        if s.consecutive:  # the next sample is the next column: computed once
-            x_next[:, part][:, :-1] = z[:n, part][:, 1:]
-            _normalise(s.x_next[-1:], point.x_s, point.X, x_next[:, stop - 1 : stop])
+        square += _normalise(s.x, point.x_s, point.X, z[:n, part])
+        square += _normalise(s.u, point.u_s, point.U, z[n:, part])
+        if s.consecutive:  # computed once
+            if not shared:
+                x_next[:, part][:, :-1] = z[:n, part][:, 1:]
+            square += _normalise(s.x_next[-1:], point.x_s, point.X, x_next[:, stop - 1 : stop])
         else:
-            _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
-    _refuse_overflow(transients, z, x_next)
+            square += _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
+    if not square <= LARGEST**2:
+        raise _too_large(transients)
     columns = Columns.of(additive, is_constant(dt))
     chosen = _weights(weights, transients, k, source, n)
     factors = _factors(transient_weights, count, source, len(transients))
@@ -580,18 +589,20 @@ def assemble(
     return Problem(z, x_next, dt, source, k, chosen, columns)
 
 
-def _refuse_overflow(transients: Sequence[Transient], z: Array, x_next: Array) -> None:
-    """Refuse values whose squares overflow; raises FitError naming signal and recording."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        if np.vdot(z, z) <= LARGEST**2 and np.vdot(x_next, x_next) <= LARGEST**2:
-            return
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """One after the other; a single one as it is."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _too_large(transients: Sequence[Transient]) -> FitError:
+    """The error for values whose squares overflow, naming signal and recording."""
     largest, name, recording = 0.0, "", ""
     for t in transients:
         for signal, values in zip((*t.state_names, *t.control_names), (*t.x.T, *t.u.T), strict=True):
             here = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
             if here > largest:
                 largest, name, recording = here, signal, t.name
-    raise FitError(
+    return FitError(
         f"{recording}: '{name}' reaches {largest:.3g}, over its scale more than the arithmetic can carry; leave out "
         f"the recording, or mend the sensor or the scale"
     )
@@ -635,14 +646,18 @@ def _factors(
     return None if (factors == 1.0).all() else factors
 
 
-def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> None:
-    """(recorded - steady) / scale as `OperatingPoint` does it, into columns; (K, n) to (n, K)."""
-    for start in range(0, len(recorded), BLOCK):  # a piece of the rows stays in the cache while they become columns
-        part = slice(start, start + BLOCK)
-        for row, values, a, b in zip(out[:, part], recorded[part].T, steady, scale, strict=True):
-            np.subtract(values, a, out=row)
-            if b != 1.0:
-                row /= b
+def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> float:
+    """(recorded - steady) / scale as `OperatingPoint` does it, into columns; (K, n) to (n, K). The sum of squares."""
+    square = 0.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start in range(0, len(recorded), BLOCK):  # a piece of the rows stays in the cache while they become columns
+            part = slice(start, start + BLOCK)
+            for row, values, a, b in zip(out[:, part], recorded[part].T, steady, scale, strict=True):
+                np.subtract(values, a, out=row)
+                if b != 1.0:
+                    row /= b
+                square += float(row @ row)
+    return square
 
 
 def _weights(

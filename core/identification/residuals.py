@@ -42,9 +42,9 @@ class Residuals:
     correlation : array (n, 2)
         Autocorrelation at one and at two samples.
     gain : array (n,)
-        Root mean square over that with the state's own value one sample earlier as well.
+        Root mean square over that with the state's own value one sample earlier as well; ones if none is correlated.
     curved : array (n,)
-        Root mean square over that with squares, products and magnitudes of the same sample as well.
+        Root mean square over that with squares, products and magnitudes of the same sample as well; likewise.
     """
 
     correlation: Array
@@ -64,14 +64,17 @@ class Residuals:
         bool
             True if the residual is autocorrelated, one sample more reduces it, and no curve does as well.
         """
-        one, two = self.correlation[state]
-        correlated = _correlated(float(one)) or abs(two) >= FOLLOW
+        correlated = _autocorrelated(*self.correlation[state].tolist())
         gain = float(self.gain[state])
         return bool(correlated and gain >= GAIN and self.curved[state] - 1.0 < CURVED * (gain - 1.0))
 
 
 def _correlated(one: float) -> bool:
     return one >= FOLLOW or one <= ALTERNATE
+
+
+def _autocorrelated(one: float, two: float) -> bool:
+    return _correlated(one) or abs(two) >= FOLLOW
 
 
 def residuals(problem: Problem) -> Residuals | None:
@@ -92,6 +95,9 @@ def residuals(problem: Problem) -> Residuals | None:
     if len(before) < 40 * p:
         return None
     now = before + 1
+    correlation = _correlation(problem, now)
+    if not any(_autocorrelated(*of) for of in correlation.tolist()):  # nothing follows: what would explain it is idle
+        return Residuals(correlation, np.ones(n), np.ones(n))
     dt = problem.dt[now, None]
     z = problem.z[now]
     step = problem.x_next[now] - z[:, :n]
@@ -108,7 +114,7 @@ def residuals(problem: Problem) -> Residuals | None:
     plain = left(own, slice(None))
     past = np.array([left(np.append(own, p + 1 + i), slice(i, i + 1))[0] for i in range(n)])
     curved = left(np.append(own, np.arange(p + 1 + n, basis.shape[1])), slice(None))
-    return Residuals(_correlation(problem, now), np.sqrt(plain / past), np.sqrt(plain / curved))
+    return Residuals(correlation, np.sqrt(plain / past), np.sqrt(plain / curved))
 
 
 def _curves(z: Array) -> Array:

@@ -10,8 +10,9 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.identification.excitation import quoted, successive, unexplained
+from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.sampling.codes import codes
+from uncertain_lti.sampling.codes import codes, too_small
 from uncertain_lti.sampling.counters import TOO_OLD
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal
@@ -34,13 +35,15 @@ STALE = 0.01
 """Share of the samples from which on stale controls are worth a word."""
 
 
-def coded(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+def coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[str]:
     """Signals in which a number stands for no value.
 
     Parameters
     ----------
     problem : Problem
         The data.
+    sums : Moments
+        Of all data.
     signals : sequence of Signal
         States, then controls.
 
@@ -51,6 +54,8 @@ def coded(problem: Problem, signals: Sequence[Signal]) -> list[str]:
     """
     messages = []
     for j, signal in enumerate(signals):
+        if too_small(float(sums.low[j]), float(sums.high[j])):
+            continue
         z = problem.z[:, j]
         found = codes(z)
         for code, count in found.items():
@@ -272,6 +277,7 @@ def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Tra
         Messages.
     """
     messages = []
+    spread = np.ptp(problem.z_columns, axis=1)
     for i, signal in enumerate(signals[: problem.n]):
         still = problem.x_next[:, i] == problem.z[:, i]
         if still.all() or still.mean() > 0.5:  # held, quantised, or at rest most of the time: said elsewhere
@@ -282,7 +288,6 @@ def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Tra
         runs = edges.reshape(-1, 2)
         runs = runs[runs[:, 1] - runs[:, 0] >= FROZEN]
         others = [j for j in range(problem.p) if j != i]
-        spread = np.ptp(problem.z, axis=0)
         for start, stop in runs:
             moving = np.ptp(problem.z[start:stop], axis=0) > 0.2 * spread
             if not any(moving[j] and spread[j] > 0 for j in others):
@@ -418,26 +423,29 @@ def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int
     longest, m = len(u) - 1, u.shape[1]
     movers = [j for j in range(m) if np.ptp(u[0, j]) > 0]
     late = [u[lag, j] for j in movers for lag in range(1, longest + 1)]
-    regressors = np.vstack([x, u[0], np.ones(N), *late]) * dt  # all at once: one product of all with all
+    regressors = np.empty((n + m + 1 + len(late), N))  # all at once: one product of all with all
+    for row, values in zip(regressors, [*x, *u[0], np.ones(N), *late], strict=True):
+        np.multiply(values, dt, out=row)
     gram, cross = regressors @ regressors.T, regressors @ increment.T
     total = np.einsum("nk,nk->n", increment, increment)
 
-    def score(chosen: list[int]) -> float:
-        left = unexplained(gram[np.ix_(chosen, chosen)], cross[chosen], total)
-        return float(np.log(np.maximum(left, 1e-300)).sum())
+    def score(chosen: list[list[int]]) -> Array:
+        which = np.array(chosen)
+        left = unexplained(gram[which[:, :, None], which[:, None, :]], cross[which], total)
+        return np.asarray(np.log(np.maximum(left, 1e-300)).sum(axis=-1))
 
     found = {}
     undelayed = [*range(n + m), n + m]
     for position, j in enumerate(movers):
         first = n + m + 1 + position * longest
-        scores = [score(undelayed)]
-        scores += [score([first + lag if c == n + j else c for c in undelayed]) for lag in range(longest)]
+        later = [[first + lag if c == n + j else c for c in undelayed] for lag in range(longest)]
+        scores = score([undelayed, *later])
         best = int(np.argmin(scores))
-        gain = scores[0] - scores[best]
+        gain = float(scores[0] - scores[best])
         # 5 % less unexplained, and far more than chance: N log-likelihood units per row
         if not (0 < best < longest and gain > 0.05 and gain * N > 50):  # at the end of what is tried it is no optimum
             continue
         # beside a late control the present one says nothing; where it does, the late one stands for past states
-        if scores[best] - score([*undelayed, first + best - 1]) < 0.3 * gain:
+        if scores[best] - score([[*undelayed, first + best - 1]])[0] < 0.3 * gain:
             found[j] = (best, float(1 - np.exp(-gain / n / 2)))
     return found

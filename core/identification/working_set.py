@@ -16,7 +16,7 @@ from uncertain_lti.identification.row import JOIN, LEAST, ROUGH, TIE_BREAK, WIDT
 from uncertain_lti.identification.solvers import dual_bound, solve_qp
 from uncertain_lti.identification.structure import Structure
 
-_FURTHER = 1.5
+_FURTHER = 2.5
 """After the first pass, samples are held whose slack is up to this many times as large: few are left there."""
 SUBSAMPLE = 10_000
 """Transitions of the first solve; up to twice as many are held as a whole."""
@@ -365,15 +365,14 @@ class WorkingSet:
         if self.whole:
             return
         most = 2 * SUBSAMPLE + self.fleet.N // 500
-        share = 0.3 * most / self.fleet.N
+        share = 0.2 * most / self.fleet.N
         rows, scanned = self.rows, False
         for _ in range(MAX_ROUNDS):
-            wanted = np.array([row.reach(share) for row in self.rows]).T
-            # the samples held after a pass are those of least slack, so the next reach would shrink: keep the first
             scales = np.array([row.scale for row in self.rows])
-            if self._reach is not None and np.array_equal(scales, self._reach_scales):
-                wanted = np.maximum(wanted, self._reach)
-            self._reach, self._reach_scales = wanted, scales
+            # the samples held after a pass are those of least slack, so the next reach would shrink: keep the first
+            if self._reach is None or not np.array_equal(scales, self._reach_scales):
+                self._reach, self._reach_scales = np.array([row.reach(share) for row in self.rows]).T, scales
+            wanted = self._reach
             if scanned:  # few are left near the bounds, and what is held further off need not be looked for again
                 wanted = _FURTHER * wanted
             found = self.fleet.scan(self._candidate(wanted[0], wanted[1], most, rows))

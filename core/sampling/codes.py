@@ -11,6 +11,24 @@ CODE_APART, CODE_OTHERS, CODE_LEAST, CODE_SIZE, MOST_CODES = 300.0, 10, 900.0, 1
 and its least size; or its size alone. At most so many are told apart."""
 
 
+def too_small(low: float, high: float) -> bool:
+    """Whether no number of a range can stand for no value.
+
+    Parameters
+    ----------
+    low : float
+        Least of the values.
+    high : float
+        Greatest of them.
+
+    Returns
+    -------
+    bool
+        False as well if either is NaN.
+    """
+    return -CODE_LEAST < low and high < CODE_LEAST
+
+
 def codes(values: Array) -> dict[float, int]:
     """Numbers that stand for no value, such as 2.146e9 as a position.
 
@@ -28,7 +46,7 @@ def codes(values: Array) -> dict[float, int]:
     dict of float to int
         The number -> how often it occurs.
     """
-    if len(values) and -CODE_LEAST < values.min() and values.max() < CODE_LEAST:  # NaN is neither
+    if len(values) and too_small(float(values.min()), float(values.max())):
         return {}  # the usual case, in a fraction of the time
     rest = values[np.isfinite(values)]
     found: dict[float, int] = {}
