@@ -24,6 +24,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from lifecycle_msgs.msg import TransitionEvent
 from rcl_interfaces.srv import DescribeParameters
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_processes import Diagnostics, World, open_world, until
 from rosgraph_msgs.msg import Clock
@@ -46,6 +47,7 @@ from test_live import (
 
 from uncertain_lti_ros.parameters import PARAMETERS
 from uncertain_lti_ros.process import spare_the_middleware
+from uncertain_lti_ros.subscriptions import MatchedSubscription
 
 NODE = "/envelope_monitor"
 
@@ -199,6 +201,27 @@ sys.exit(main())
 
 
 # --- publishers that come and go ----------------------------------------------------------------------------
+
+
+def test_what_may_be_destroyed_has_no_handlers_in_the_executor(world: World) -> None:
+    """An event for a handler that the events executor is removing would end the process."""
+    node = Node("listener", context=world.node.context)
+    before = set(node.waitables)
+    try:
+        subscription = MatchedSubscription(node, STATE, "sensor_msgs/msg/JointState", JointState, lambda _: None)
+        assert set(node.waitables) == before
+        publisher = world.publisher(JointState, STATE, 10)
+        until(lambda: subscription.poll() or subscription.look_soon, "the poll to see the publisher come")
+        subscription.look()
+        subscription.poll()
+        assert subscription.publishers == 1 and not subscription.look_soon
+        world.node.destroy_publisher(publisher)
+        until(lambda: subscription.poll() or subscription.look_soon, "the poll to see the publisher leave")
+        subscription.destroy()
+        subscription.poll()
+        assert STATE not in [s.topic_name for s in node.subscriptions]
+    finally:
+        node.destroy_node()
 
 
 def test_publishers_that_return_under_another_quality_of_service_are_followed(world: World, tmp_path: Path) -> None:

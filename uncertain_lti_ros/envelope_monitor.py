@@ -37,6 +37,7 @@ from uncertain_lti_ros.diagnostics import Diagnostics, input_values
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
+from uncertain_lti_ros.polled_events import PolledEvents
 from uncertain_lti_ros.process import living, spare_the_middleware
 from uncertain_lti_ros.sessions import make_session
 from uncertain_lti_ros.settings import Settings
@@ -49,6 +50,7 @@ _SUMMARY = (
     "~/violation is the alarm. Needs the parameter model. Services: ~/status, ~/reset, ~/reload, ~/snapshot "
     "(std_srvs/srv/Trigger) and those of a managed node."
 )
+_POLL = 0.05  # s between two polls of the middleware: who listens, publishers that changed
 _TICK = 0.2  # s between two looks at what goes by time
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
 _NOTE = 0.05  # s between two looks for what the log should say
@@ -66,17 +68,21 @@ class _Publisher:
 
     def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
         events = PublisherEventCallbacks(matched=self._matched)
-        self.publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
+        self._node = node
+        self._publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
+        self._events = PolledEvents(node, self._publisher)
+        self.poll = self._events.poll
         self.listeners = 0
         # Past the check of the lifecycle state: the node publishes only while it is active.
-        self.send = self.publisher.handle.publish_raw
+        self.send = self._publisher.handle.publish_raw
 
     def _matched(self, event: Any) -> None:
         self.listeners = event.current_count
 
-    def look(self) -> None:
-        """Ask how many listen; events tell as well, and sooner."""
-        self.listeners = self.publisher.get_subscription_count()
+    def destroy(self) -> None:
+        """Stop publishing."""
+        self._events.destroy()
+        self._node.destroy_lifecycle_publisher(self._publisher)
 
 
 _Vector = tuple[_Publisher, Callable[[AnyVerdict], bytes]]
@@ -130,6 +136,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.add_post_set_parameters_callback(self._on_have_set)
         tick = min(_TICK, self.settings.real("heartbeat") / 4, self.settings.real("diagnostics_period") / 2)
         self.create_timer(tick, self._on_tick, clock=self._steady)
+        self.create_timer(_POLL, self._on_poll, clock=self._steady)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
 
@@ -294,7 +301,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.get_logger().info(f"active: listening to {', '.join(topics)}")
         self.active = True
         for output in self._outputs.values():
-            output.look()
+            output.poll()
         self._beat()
         return result
 
@@ -374,7 +381,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._unsubscribe()
         self.snapshots.close(self.session)
         for output in self._outputs.values():
-            self.destroy_lifecycle_publisher(output.publisher)
+            output.destroy()
         self._outputs.clear()
         self.session = None
 
@@ -495,6 +502,14 @@ class EnvelopeMonitorNode(LifecycleNode):
             except Exception as error:
                 self.note_failure("between messages", error)
 
+    def _on_poll(self) -> None:
+        for subscription in self._inputs.values():
+            subscription.poll()
+        for output in self._outputs.values():
+            output.poll()
+        if any(s.look_soon for s in self._inputs.values()):
+            self._look_around()
+
     def _look_at_clock(self) -> None:
         if self._simulated != self._clock.ros_time_is_active:
             self._simulated = self._clock.ros_time_is_active
@@ -510,8 +525,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._looked = now
         for subscription in self._inputs.values():
             subscription.look()
-        for output in self._outputs.values():
-            output.look()
         self._find_enable_type()
 
     def _find_enable_type(self) -> None:

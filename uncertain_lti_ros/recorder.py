@@ -20,6 +20,7 @@ from uncertain_lti_ros.subscriptions import MatchedSubscription
 from uncertain_lti_ros.terminal import Progress, hush, say, seconds, tell
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
+_POLL = 0.05  # s between two polls of the middleware
 _LOOK = 0.5  # s between two looks at the graph
 _CHUNK = 1 << 20  # bytes
 
@@ -118,9 +119,13 @@ def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSu
 
 def _record(life: Life, subscriptions: list[MatchedSubscription], file: _File, duration: float | None) -> None:
     progress = Progress()
-    looked = flushed = time.monotonic()
+    looked = flushed = polled = time.monotonic()
     while life.alive:
         now = time.monotonic()
+        if now - polled > _POLL:
+            polled = now
+            for subscription in subscriptions:
+                subscription.poll()
         if now - looked > _LOOK or any(s.look_soon for s in subscriptions):
             looked = now
             for subscription in subscriptions:

@@ -13,6 +13,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 
 from uncertain_lti_ros.messages import full_name
+from uncertain_lti_ros.polled_events import PolledEvents
 
 DEPTH = 1000
 """Messages kept until they are taken: the graph does not tell how deep the publishers' queues are."""
@@ -151,6 +152,7 @@ class MatchedSubscription:
         self.problems: list[str] = []
         self.look_soon = False
         self._subscription: Subscription | None = None
+        self._events: PolledEvents | None = None
         self.look()
 
     @property
@@ -170,7 +172,7 @@ class MatchedSubscription:
             lasting = self._qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
             qos = choose_qos(offers, self._wish, history=lasting or not self.received)
             if _policies(qos) != _policies(self._qos):
-                self._node.destroy_subscription(self._subscription)
+                self.destroy()
                 self._subscribe(qos)
         self.problems = sorted(
             {f"{self.topic}: a publisher cannot be heard, {p}" for o in offers for p in incompatible(self._qos, o)}
@@ -183,9 +185,15 @@ class MatchedSubscription:
 
     def destroy(self) -> None:
         """Stop receiving."""
-        if self._subscription is not None:
+        if self._subscription is not None and self._events is not None:
+            self._events.destroy()
             self._node.destroy_subscription(self._subscription)
-            self._subscription = None
+            self._subscription = self._events = None
+
+    def poll(self) -> None:
+        """See what the middleware has to say: publishers that came or left, messages lost, deadlines missed."""
+        if self._events is not None:
+            self._events.poll()
 
     def _subscribe(self, qos: QoSProfile) -> None:
         self._qos = qos
@@ -198,13 +206,14 @@ class MatchedSubscription:
         self._subscription = self._node.create_subscription(
             self._class, self._asked_topic, self._take, qos, event_callbacks=events, raw=self._raw
         )
+        self._events = PolledEvents(self._node, self._subscription)
 
     def _take(self, message: Any) -> None:
         self.received += 1
         self._callback(message)
 
     def _changed(self, _: Any) -> None:
-        self.look_soon = True  # the owner looks from a timer: a subscription is not destroyed in its own callback
+        self.look_soon = True
 
     def _missed(self, event: Any) -> None:
         self.late += event.total_count_change
