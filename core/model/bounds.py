@@ -265,6 +265,33 @@ def cell_of(z: cython.double, least: cython.double, per_unit: cython.double, las
     return np.clip(place, 0, last).astype(np.intp)
 
 
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
+@cython.cdivision(True)
+def weight_between(s: cython.double, low: cython.double, high: cython.double) -> cython.double:
+    """Weight of the upper of two knots by linear interpolation; that of the lower one is 1 less it.
+
+    Parameters
+    ----------
+    s : float or array
+        Scheduling signal, normalised.
+    low : float or array
+        Lower knot.
+    high : float or array
+        Upper knot, above the lower one.
+
+    Returns
+    -------
+    float or array
+        0 to 1: beyond the two knots that of the nearer one.
+    """
+    weight = (s - low) / (high - low)
+    if cython.compiled:
+        return 0.0 if weight < 0.0 else 1.0 if weight > 1.0 else weight
+    return np.clip(weight, 0.0, 1.0)
+
+
 def pairs_of(size: int) -> tuple[Any, Any]:
     """Pairs of signals whose combinations a domain knows; of one signal alone, itself.
 

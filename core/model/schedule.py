@@ -1,0 +1,309 @@
+"""Schedule: which block of a piecewise-linear uncertain model holds where, and with what weight.
+
+With a scheduling vector s known at each sample, weights w_r(s) >= 0 that sum to 1, and one block of elements per r,
+
+    x_{k+1} = x_k + dt Σ_r w_r(s_k) [(A_r ± ΔA_r) x_k + (B_r ± ΔB_r) u_k + c_r ± Δc_r] ± Σ_r w_r(s_k) v_r
+
+Between two knots the weights are those of linear interpolation; a mode has weight 1 where s is that mode. Of two
+scheduling signals the weights are multiplied. One block is the uncertain linear model of Leibov (2006).
+"""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.model.bounds import weight_between
+
+MOST_AXES = 2
+"""Scheduling signals at most."""
+MOST_BLOCKS = 1024
+"""Blocks at most."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One scheduling signal with its knots or its modes.
+
+    Parameters
+    ----------
+    signal : str
+        Name of a state, a control or a further scheduling signal.
+    knots : tuple of float, optional
+        Knots, normalised, increasing; at least two. Between two of them the blocks are interpolated.
+    modes : tuple of float, optional
+        Values of a discrete signal, normalised, each with a block of its own; at least one.
+
+    Raises
+    ------
+    ModelError
+        There are both or neither, or they are not such numbers.
+    """
+
+    signal: str
+    knots: tuple[float, ...] = ()
+    modes: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        name = f"schedule: '{self.signal}'"
+        for which in ("knots", "modes"):
+            try:
+                values = tuple(float(v) for v in getattr(self, which))
+            except (TypeError, ValueError, OverflowError):
+                raise ModelError(f"{name}: {which} are not numbers; list them") from None
+            if not all(math.isfinite(v) and abs(v) <= LARGEST for v in values):
+                raise ModelError(f"{name}: {which} hold a number that is not finite, or above {LARGEST:g}")
+            object.__setattr__(self, which, values)
+        if bool(self.knots) == bool(self.modes):
+            raise ModelError(f"{name}: give knots or modes, one of the two")
+        if len(self.knots) == 1:
+            raise ModelError(f"{name} has one knot; give at least two, or leave the schedule out")
+        if any(b <= a for a, b in zip(self.knots, self.knots[1:], strict=False)):
+            raise ModelError(f"{name}: knots must increase, and are {reprlib.repr(list(self.knots))}")
+        if len(set(self.modes)) < len(self.modes):
+            raise ModelError(f"{name}: a mode is listed twice in {reprlib.repr(list(self.modes))}")
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Its knots or modes, normalised."""
+        return self.knots or self.modes
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def corners(self, s: Array) -> tuple[NDArray[np.intp], Array]:
+        """The knots or modes that hold at s, and their weights.
+
+        Parameters
+        ----------
+        s : array (K,)
+            Values of the signal, normalised.
+
+        Returns
+        -------
+        array of int (C, K)
+            Positions among `values`, C = 2 for knots and 1 for modes; -1 for a mode that is not listed, and for NaN.
+        array (C, K)
+            Weights, 0 to 1; NaN where the position is -1. Beyond the end knots those of the end.
+        """
+        s = np.asarray(s, dtype=np.float64)
+        if self.modes:
+            place = np.full(len(s), -1, dtype=np.intp)
+            for r, mode in enumerate(self.modes):
+                place[s == mode] = r
+            return place[None], np.where(place < 0, np.nan, 1.0)[None]
+        knots = np.array(self.knots)
+        low = np.clip(np.searchsorted(knots, s, side="right") - 1, 0, len(knots) - 2)
+        high = np.asarray(weight_between(s, knots[low], knots[low + 1]))
+        places, weights = np.stack([low, low + 1]), np.stack([1.0 - high, high])
+        unknown = np.isnan(s)
+        if unknown.any():
+            places[:, unknown], weights[:, unknown] = -1, np.nan
+        return places, weights
+
+
+@dataclass(frozen=True)
+class BlockData:
+    """What the fit knows of one block.
+
+    Parameters
+    ----------
+    transitions : int or None, optional
+        Fitted transitions of which this block has the largest weight; None where it is not known.
+    tied_to : int or None, optional
+        Block whose elements it shares, because it has too few of its own.
+    """
+
+    transitions: int | None = None
+    tied_to: int | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether a recording visited it."""
+        return self.transitions is None or self.transitions > 0
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The axes of a scheduled model; blocks are numbered with the first axis slowest.
+
+    Parameters
+    ----------
+    axes : tuple of Axis
+        One or two.
+
+    Raises
+    ------
+    ModelError
+        There are more, none, two for one signal, or too many blocks.
+    """
+
+    axes: tuple[Axis, ...]
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.axes) <= MOST_AXES:
+            raise ModelError(f"schedule: {plural(len(self.axes), 'scheduling signal')}; give one or two")
+        names = [axis.signal for axis in self.axes]
+        if len(set(names)) < len(names):
+            raise ModelError(f"schedule: '{names[0]}' is there twice; give each scheduling signal once")
+        if self.blocks > MOST_BLOCKS:
+            raise ModelError(f"schedule: {self.blocks} blocks; at most {MOST_BLOCKS} are possible")
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return math.prod(len(axis) for axis in self.axes)
+
+    @cached_property
+    def indices(self) -> tuple[tuple[int, ...], ...]:
+        """Of each block the position of its knot or mode on each axis."""
+        return tuple(product(*(range(len(axis)) for axis in self.axes)))
+
+    def positions(self, names: Sequence[str]) -> tuple[int, ...]:
+        """Where the scheduling signals are among all signals.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of [x; u; further scheduling signals].
+
+        Returns
+        -------
+        tuple of int
+            One per axis.
+
+        Raises
+        ------
+        ModelError
+            A signal is not among them; names it.
+        """
+        for axis in self.axes:
+            if axis.signal not in names:
+                raise ModelError(
+                    f"schedule: '{axis.signal}' is no state, control or scheduling signal; there are {', '.join(names)}"
+                )
+        return tuple(list(names).index(axis.signal) for axis in self.axes)
+
+    def corners(self, s: ArrayLike) -> tuple[NDArray[np.intp], Array]:
+        """The blocks that hold at s, and their weights.
+
+        Parameters
+        ----------
+        s : array (axes, K)
+            Scheduling vectors, normalised.
+
+        Returns
+        -------
+        array of int (C, K)
+            Blocks, C = 1, 2 or 4, the first axis slowest; -1 where a mode is not listed or a value is NaN.
+        array (C, K)
+            Their weights, which sum to 1; NaN where the block is -1.
+        """
+        s = np.asarray(s, dtype=np.float64)
+        places, weights = self.axes[0].corners(s[0])
+        for axis, values in zip(self.axes[1:], s[1:], strict=True):
+            more, their = axis.corners(values)
+            unknown = (places[0] < 0) | (more[0] < 0)
+            places = (places[:, None] * len(axis) + more[None]).reshape(-1, s.shape[1])
+            weights = (weights[:, None] * their[None]).reshape(-1, s.shape[1])
+            if unknown.any():
+                places[:, unknown], weights[:, unknown] = -1, np.nan
+        return places, weights
+
+    def weights(self, s: ArrayLike) -> Array:
+        """Weights of every block, w(s).
+
+        Parameters
+        ----------
+        s : array (axes, K)
+            Scheduling vectors, normalised.
+
+        Returns
+        -------
+        array (blocks, K)
+            Weights, which sum to 1; NaN where a mode is not listed or a value is NaN.
+        """
+        places, corner_weights = self.corners(s)
+        dense = np.zeros((self.blocks, places.shape[1]))
+        column = np.arange(places.shape[1])
+        for place, weight in zip(places, corner_weights, strict=True):
+            dense[np.maximum(place, 0), column] += weight
+        dense[:, places[0] < 0] = np.nan
+        return dense
+
+    def beyond(self, s: ArrayLike) -> NDArray[np.bool_]:
+        """Whether s lies beyond the end knots of some axis, where the blocks of the end are used.
+
+        Parameters
+        ----------
+        s : array (axes, K)
+            Scheduling vectors, normalised.
+
+        Returns
+        -------
+        array of bool (K,)
+            False for modes and for NaN.
+        """
+        s = np.asarray(s, dtype=np.float64)
+        left = np.zeros(s.shape[1], dtype=bool)
+        for axis, values in zip(self.axes, s, strict=True):
+            if axis.knots:
+                left |= (values < axis.knots[0]) | (values > axis.knots[-1])
+        return left
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """As it is in a model file.
+
+        Returns
+        -------
+        list of dict
+            One per axis: its signal, and its knots or modes.
+        """
+        return [{"signal": axis.signal, ("knots" if axis.knots else "modes"): list(axis.values)} for axis in self.axes]
+
+    @classmethod
+    def from_list(cls, data: Any) -> Schedule:
+        """From a model file.
+
+        Parameters
+        ----------
+        data : Any
+            What `to_list` wrote.
+
+        Returns
+        -------
+        Schedule
+            The schedule.
+
+        Raises
+        ------
+        ModelError
+            It is not that; names the field.
+        """
+        if not isinstance(data, list):
+            raise ModelError("field 'schedule' is not a list of scheduling signals")
+        axes = []
+        for i, entry in enumerate(data):
+            here = f"schedule[{i}]"
+            if not isinstance(entry, dict) or not isinstance(entry.get("signal"), str):
+                raise ModelError(f"field '{here}' must be an object with 'signal' and 'knots' or 'modes'")
+            if unknown := set(entry) - {"signal", "knots", "modes"}:
+                raise ModelError(f"unknown field '{here}.{min(unknown)}'; known are knots, modes, signal")
+            values = {k: entry[k] for k in ("knots", "modes") if k in entry}
+            for key, value in values.items():
+                if not isinstance(value, list) or any(isinstance(v, (bool, str)) or v is None for v in value):
+                    raise ModelError(f"field '{here}.{key}' must be a list of numbers")
+            axes.append(Axis(entry["signal"], **{k: tuple(v) for k, v in values.items()}))
+        return cls(tuple(axes))
