@@ -35,6 +35,7 @@ from uncertain_lti.base.limits import LONGEST_S
 from uncertain_lti.model import bounds
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.monitor.envelope_monitor import NUMBERS
 from uncertain_lti.monitor.verdict_messages import AnyVerdict
 from uncertain_lti.sampling import sampler as sampler_module
@@ -67,6 +68,9 @@ class Input:
     def destroy(self) -> None:
         pass
 
+    def poll(self) -> None:
+        pass
+
 
 class Clock:
     """The node's clock, as the test sets it."""
@@ -94,7 +98,7 @@ class Node(node_module.EnvelopeMonitorNode):
         for name, output in self._outputs.items():
             output.send = self._keeps(name)
             output.listeners = int(name not in silent)
-            output.look = lambda: None
+            output.poll = lambda: None
         self._on_tick()
 
     def _keeps(self, name: str) -> Callable[[bytes], None]:
@@ -119,7 +123,7 @@ class Node(node_module.EnvelopeMonitorNode):
             "window": session.monitor.alarm_statistic.recent,
             "latest": repr(session.sampler.latest()),
             "enable": (session.arming.on, session.arming.value),
-            "last": last and (last.t_ns, last.outside_domain, last.alarm),
+            "last": last and (last.t_ns, last.outside_domain, last.unknown_regime, last.alarm),
             "last numbers": last and [last.packed(name) for name in NUMBERS],
             "remembered": [
                 (e.arrival_ns, e.topic, e.data, e.alarm, [told(v) for v in e.verdicts])
@@ -158,8 +162,18 @@ def end(nodes: list[Node]) -> None:
         node.destroy_node()
 
 
-def saved(path: Path, n: int, rng: np.random.Generator, margin: float = 1.0, clock: str = "header") -> UncertainLTI:
-    """n states; two controls by stamps, one by arrival; bounds that the signals of `stream` seldom leave."""
+def saved(
+    path: Path,
+    n: int,
+    rng: np.random.Generator,
+    margin: float = 1.0,
+    clock: str = "header",
+    schedule: Schedule | None = None,
+) -> UncertainLTI:
+    """n states; two controls by stamps, one by arrival; bounds that the signals of `stream` seldom leave.
+
+    Where the schedule names `w`, the one by arrival is no control but a further scheduling signal.
+    """
     steady, scale = rng.normal(size=n + 3), rng.uniform(0.5, 2.0, n + 3)
     kinds = [(f"x{i}", STATE, VECTOR, f"position[x{i}]", None) for i in range(n)]
     kinds += [("u0", CONTROL, VECTOR, "position[u0]", 0.08), ("u1", CONTROL, VECTOR, "position[u1]", None)]
@@ -168,23 +182,29 @@ def saved(path: Path, n: int, rng: np.random.Generator, margin: float = 1.0, clo
         Signal(name, topic, path, float(steady[k]), float(scale[k]), type=kind, max_hold=hold)
         for k, (name, topic, kind, path, hold) in enumerate(kinds)
     )
+    further = schedule is not None and "w" in [axis.signal for axis in schedule.axes]
+    m = 2 if further else 3
+    lead = () if schedule is None else (schedule.blocks,)
     signals = SignalMap(
         every[:n],
-        every[n:],
+        every[n : n + m],
+        every[n + m :],
         clock=STATE,
         max_gap=0.055,
         min_step=0.002,
         time={STATE: clock, CONTROL: "header", SETPOINT: "log"},
     )
     model = UncertainLTI(
-        rng.normal(size=(n, n)),
-        rng.normal(size=(n, 3)),
-        rng.uniform(0, 0.3, (n, n)),
-        rng.uniform(0, 0.3, (n, 3)),
-        c=rng.normal(size=n),
-        dc=rng.uniform(0, 0.1, n),
-        v=rng.uniform(0.3, 0.5, n),
-        domain=Domain(np.full(n, -0.2), np.full(n, 0.2), np.full(3, -0.2), np.full(3, np.inf)),
+        rng.normal(size=(*lead, n, n)),
+        rng.normal(size=(*lead, n, m)),
+        rng.uniform(0, 0.3, (*lead, n, n)),
+        rng.uniform(0, 0.3, (*lead, n, m)),
+        c=rng.normal(size=(*lead, n)),
+        dc=rng.uniform(0, 0.1, (*lead, n)),
+        v=rng.uniform(0.3, 0.5, (*lead, n)),
+        schedule=schedule,
+        block_data=schedule and [BlockData(int(r != 1)) for r in range(schedule.blocks)],
+        domain=Domain(np.full(n, -0.2), np.full(n, 0.2), np.full(m, -0.2), np.full(m, np.inf)),
         signals=signals,
         sampling=Sampling(STATE, VECTOR, dict(signals.time), dt_median=0.01, max_gap=0.055),
         alarm_rule=AlarmRule(3, 20, margin),
@@ -233,7 +253,7 @@ def stream(model: UncertainLTI, rng: np.random.Generator, count: int, rate: floa
         control_t += {"late control": -3 * STEP_NS, "ahead control": 2 * 10**6, "back control": -(10**9)}.get(fault, 0)
         control_t = 0 if fault == "unstamped control" else control_t
         if rng.random() < 0.2:
-            yield t - 500_000, SETPOINT, array(0.0, point.u_s[2] + rng.normal(0, 0.1), 1.0)
+            yield t - 500_000, SETPOINT, array(0.0, point.steady[n + 2] + rng.normal(0, 0.1), 1.0)
         if fault not in ("no control", "stale"):
             for k in range(int(rng.integers(2, 400)) if fault == "many" else 1):
                 yield t - 200_000 + k, CONTROL, vector(control_t + k, {"u0": u[0], "u1": u[1]})
@@ -257,7 +277,7 @@ def played(path: Path, messages: Sequence[Any], pure: bool, silent: tuple[str, .
     """What a node is left with, and what it sent, after messages; None among them is a tick, "reset" a reset."""
     with pytest.MonkeyPatch.context() as patch:
         if pure:
-            patch.setattr("uncertain_lti.monitor.envelope_monitor.Judge", PURE_BOUNDS.Judge)
+            patch.setattr("uncertain_lti.model.uncertain_lti.Judge", PURE_BOUNDS.Judge)
             patch.setattr("uncertain_lti.monitor.session.Sampler", PURE_SAMPLER.Sampler)
         node = Node(path, silent)
         if given:
@@ -295,35 +315,94 @@ def with_ticks(messages: Iterable[Any], rng: np.random.Generator, share: float) 
     return found
 
 
+KNOTS, OF_FURTHER = Axis("x0", knots=(-1.0, -0.1, 0.0, 0.2, 1.0)), Axis("w", knots=(-0.1, 0.1))
+MODES = Axis("gear", modes=(1.0, 2.0, 5.0))
+SCHEDULES = {
+    "one block": None,
+    "knots": Schedule((KNOTS,)),
+    "modes": Schedule((MODES,)),
+    "two": Schedule((KNOTS, OF_FURTHER)),
+    "knots and modes": Schedule((MODES, OF_FURTHER)),
+}
+
+
 @needs_compiled
 @pytest.mark.parametrize("n, m", [(1, 0), (1, 9), (5, 4), (50, 10)])
 @pytest.mark.parametrize("margin", [1.0, 0.3])
-def test_one_transition_is_judged_alike_to_the_last_bit(n: int, m: int, margin: float) -> None:
+@pytest.mark.parametrize("schedule", SCHEDULES.values(), ids=SCHEDULES)
+def test_one_transition_is_judged_alike_to_the_last_bit(
+    n: int, m: int, margin: float, schedule: Schedule | None
+) -> None:
+    """Compiled, uncompiled and many at once."""
     rng = np.random.default_rng([n, m])
-    terms = rng.normal(size=(n, n + m + 1)), np.abs(rng.normal(size=(n, n + m + 1))), rng.uniform(0, 6, n)
+    further = [axis.signal for axis in schedule.axes if axis.signal != "x0"] if schedule else []
+    lead, total = ((schedule.blocks,) if schedule else ()), n + m + len(further)
+    terms = [rng.normal(size=(*lead, n, n + m + 1)) for _ in range(2)]
     terms[1][rng.random(terms[1].shape) < 0.3] = 0.0
-    point = rng.normal(size=n + m), rng.uniform(0.1, 2.0, n + m), np.full(n + m, -9.0), np.full(n + m, 9.0)
+    steady, scale = rng.normal(size=total), rng.uniform(0.1, 2.0, total)
+    if "gear" in further:
+        steady[n + m + further.index("gear")], scale[n + m + further.index("gear")] = 0.0, 1.0
+    signals = SignalMap(
+        *(
+            tuple(
+                Signal(name, "", "a", steady=float(steady[first + i]), scale=float(scale[first + i]))
+                for i, name in enumerate(names)
+            )
+            for first, names in (
+                (0, [f"x{i}" for i in range(n)]),
+                (n, [f"u{j}" for j in range(m)]),
+                (n + m, further),
+            )
+        )
+    )
+    model = UncertainLTI(
+        terms[0][..., :n], terms[0][..., n : n + m], np.abs(terms[1][..., :n]), np.abs(terms[1][..., n : n + m]),
+        terms[0][..., n + m], np.abs(terms[1][..., n + m]), rng.uniform(0, 6, (*lead, n)),
+        schedule=schedule, block_data=schedule and [BlockData(int(r != 1)) for r in range(schedule.blocks)],
+        signals=signals, domain=Domain(np.full(n, -9.0), np.full(n, 9.0), np.full(m, -9.0), np.full(m, 9.0)),
+    )  # fmt: skip
     counted = rng.random(n) < 0.7
-    judges = [module.Judge(*terms, *point, margin, counted) for module in (bounds, PURE_BOUNDS)]
+    judges = [model.judge_of(margin, counted)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uncertain_lti.model.uncertain_lti.Judge", PURE_BOUNDS.Judge)
+        judges.append(model.judge_of(margin, counted))
+    point = model.operating_point
+    unlisted = unknown = 0
     assert type(judges[0]).__module__ != type(judges[1]).__module__
     odd = [0.0, -0.0, math.nan, math.inf, -math.inf, 1e308, 5e-324]
     seen: set[float] = set()
     for k in range(400):
-        before, after = rng.normal(size=n + m) * 2, rng.normal(size=n) * 2
+        before, after = rng.normal(size=total) * 2, rng.normal(size=n) * 2
+        if "gear" in further:
+            before[n + m + further.index("gear")] = rng.integers(1, 7)
         if k % 4 == 0:
-            before[rng.integers(n + m)] = rng.choice(odd)
+            before[rng.integers(total)] = rng.choice(odd)
         if k % 5 == 0:
             after[rng.integers(n)] = rng.choice(odd)
         dt = float(rng.choice([1e-3, 0.1, 0.0]))
         one, other = (judge.judge(before.tolist(), tuple(after.tolist()), dt) for judge in judges)
-        verdict = one.contained, one.violation, one.outside_domain
-        assert verdict == (other.contained, other.violation, other.outside_domain)
+        z = (before - point.steady) / point.scale
+        listed, strange = model.regime(z[:, None])
+        unlisted += not listed[0]
+        if one is None:
+            assert other is None and not listed[0]
+            continue
+        unknown += one.unknown_regime
+        assert one.unknown_regime == strange[0]
+        verdict = one.contained, one.violation, one.outside_domain, one.unknown_regime
+        assert verdict == (other.contained, other.violation, other.outside_domain, other.unknown_regime)
+        lower, upper = model.bounds(z[:n], z[n : n + m], dt, margin, z[n + m :])
+        for which, bound in ((bounds.LOWER, lower), (bounds.UPPER, upper)):
+            expected = point.recorded_x(bound)
+            known = ~np.isnan(expected)
+            assert np.array(one.numbers(which))[known].tobytes() == expected[known].tobytes()
         for which in range(4):
             mine, theirs = np.array(one.numbers(which)), np.array(other.numbers(which))
             known = ~np.isnan(theirs)
             seen |= set(theirs[known]) if which == bounds.FLAGS else set()
             assert mine[known].tobytes() == theirs[known].tobytes() and np.isnan(mine[~known]).all()
     assert seen == {0.0, 1.0}
+    assert (unlisted > 0 or "gear" not in further) and (unknown > 0) == (schedule is not None)
 
 
 @pytest.mark.parametrize("module", [bounds, PURE_BOUNDS], ids=["in use", "uncompiled"])
@@ -361,13 +440,16 @@ def test_streams_are_sampled_alike(case: tuple[SignalMap, list[Sent]]) -> None:
 
 @needs_compiled
 @pytest.mark.parametrize("clock", ["header", "log"])
-@pytest.mark.parametrize("n, rate, margin", [(1, 0.01, 1.0), (3, 0.3, 1.3), (40, 0.02, 1.0)])
+@pytest.mark.parametrize(
+    "n, rate, margin, schedule",
+    [(1, 0.01, 1.0, None), (3, 0.3, 1.3, None), (40, 0.02, 1.0, None), (3, 0.1, 1.0, "knots"), (3, 0.1, 1.0, "two")],
+)
 def test_a_node_publishes_and_counts_alike(
-    ros: None, tmp_path: Path, n: int, rate: float, margin: float, clock: str
+    ros: None, tmp_path: Path, n: int, rate: float, margin: float, clock: str, schedule: str | None
 ) -> None:
     for seed in range(2):
         rng = np.random.default_rng([seed, n])
-        model = saved(tmp_path / "model.json", n, rng, margin, clock)
+        model = saved(tmp_path / "model.json", n, rng, margin, clock, SCHEDULES[schedule or "one block"])
         silent = (("flags", "state"), ("predicted_lower", "lower"))[seed]
         messages = with_ticks(stream(model, rng, 400, rate), rng, 0.1)
         same(tmp_path / "model.json", messages, silent=silent)

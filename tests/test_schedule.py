@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
-from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.schedule import Axis, Schedule
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
+from uncertain_lti.base.errors import ModelError, SignalError
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.model.terms import ARRAYS
+from uncertain_lti.sampling.sampler import Step
+from uncertain_lti.sampling.status import Status
+from uncertain_lti.signals.signal_map import ScheduleRule, Signal
 
 pytestmark = pytest.mark.numpy
 
@@ -77,3 +86,133 @@ def test_a_schedule_comes_back_from_its_list() -> None:
 def test_what_is_no_schedule_is_refused_by_name(make: object, words: str) -> None:
     with pytest.raises(ModelError, match=words):
         make()  # type: ignore[operator]
+
+
+def scheduled(rng: np.random.Generator, schedule: Schedule, further: tuple[str, ...] = ()) -> UncertainLTI:
+    """Two states, one control."""
+    R = schedule.blocks
+    signals = SignalMap(
+        (Signal("speed", "", "a", steady=3.0, scale=2.0), Signal("b", "", "b")),
+        (Signal("c", "", "c"),),
+        tuple(Signal(name, "", name) for name in further),
+    )
+    half = [np.abs(rng.normal(size=s)) for s in ((R, 2, 2), (R, 2, 1), (R, 2), (R, 2))]
+    nominal = [rng.normal(size=s) for s in ((R, 2, 2), (R, 2, 1), (R, 2))]
+    return UncertainLTI(
+        nominal[0], nominal[1], half[0], half[1], nominal[2], half[2], half[3], schedule=schedule, signals=signals,
+        block_data=[BlockData(r, None if r else 1) for r in range(R)],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("axes", [(SPEED,), (GEAR,), (SPEED, GEAR)])
+def test_a_scheduled_model_comes_back_from_its_file(axes: tuple[Axis, ...], tmp_path: Path) -> None:
+    schedule = Schedule(axes)
+    further = ("gear",) * (GEAR in axes)
+    model = scheduled(np.random.default_rng(2), schedule, further)
+    model.save(tmp_path / "model.json")
+    again = UncertainLTI.load(tmp_path / "model.json")
+    assert again.to_dict() == model.to_dict() and model.to_dict()["format"] == "uncertain-lti/2"
+    assert again.schedule == schedule and again.block_data == model.block_data
+    x, u, s = np.ones((4, 2)) * 0.1, np.ones((4, 1)), np.ones((4, len(further)))
+    for mine, theirs in zip(model.bounds(x, u, 0.1, 1.0, s), again.bounds(x, u, 0.1, 1.0, s), strict=True):
+        assert mine.tobytes() == theirs.tobytes() and np.isfinite(mine).all()
+
+
+def test_at_a_knot_the_model_is_that_block_and_between_two_their_mean() -> None:
+    model = scheduled(np.random.default_rng(3), Schedule((SPEED,)))
+    for r, knot in enumerate(SPEED.knots):
+        at = model.at(speed=3.0 + 2.0 * knot)
+        np.testing.assert_allclose(at.A, model.A[r], atol=1e-15)
+        np.testing.assert_array_equal(model.blocks[r].dB, model.dB[r])
+    np.testing.assert_allclose(model.at(speed=3.0 + 2.0 * 0.5).A, (model.A[1] + model.A[2]) / 2, atol=1e-15)
+    x = np.array([0.5, 0.3])
+    lower, upper = model.bounds(x, [0.2], 0.1)
+    theirs = model.at(speed=4.0).bounds(x, [0.2], 0.1)
+    np.testing.assert_allclose([lower, upper], theirs, atol=1e-14)
+
+
+def test_the_same_block_at_every_knot_is_the_model_without_a_schedule() -> None:
+    model = scheduled(np.random.default_rng(4), Schedule((SPEED,)))
+    one = model.blocks[1]
+    tied = model.replace(**{name: np.stack([getattr(one, name)] * 3) for name in ARRAYS})
+    rng = np.random.default_rng(5)
+    x, u = rng.normal(size=(50, 2)), rng.normal(size=(50, 1))
+    np.testing.assert_allclose(tied.bounds(x, u, 0.1), one.bounds(x, u, 0.1), rtol=1e-13, atol=1e-13)
+
+
+def test_the_monitor_says_where_the_regime_is_unknown_and_gives_no_verdict_on_a_strange_mode() -> None:
+    model = scheduled(np.random.default_rng(6), Schedule((SPEED, GEAR)), ("gear",))  # block 0 has no transition
+    monitor = EnvelopeMonitor(model)
+    t, x = np.arange(6) * 0.1, np.full((6, 2), 3.0)
+    x[:, 0] = [2.0, 4.0, 4.0, 9.0, 4.0, 4.0]
+    s = np.array([[1.0], [2.0], [3.0], [4.0], [math.nan], [1.0]])
+    transient = Transient(t, x, np.zeros((6, 1)), s=s, signals=model.signals)
+    verdicts = monitor.check(transient)
+    kinds = [Status.FIRST, Status.OK, Status.OK, Status.MODE, Status.OK, Status.MISSING]
+    assert verdicts.statuses() == kinds
+    assert verdicts.unknown_regime.tolist() == [False, True, False, False, True, False]
+    assert verdicts.outside_domain.tolist() == verdicts.unknown_regime.tolist()
+    assert "no recording visited speed = 2, gear = 1" in model.why_unknown([2.0, 3.0, 0.0, 1.0])
+    assert "speed = 9 is beyond its knots 2 to 5" in model.why_unknown([9.0, 3.0, 0.0, 4.0])
+    sampler_like = [
+        monitor.judge(Step(kind, 0, 0, 0.1, [*x[k - 1], 0.0, *s[k - 1]], x[k].tolist()))
+        for k, kind in enumerate(transient.statuses())
+        if k
+    ]
+    for k, verdict in enumerate(sampler_like, start=1):
+        assert verdict.status is kinds[k]
+        assert verdict.unknown_regime == verdicts.unknown_regime[k]
+        assert verdict.flags.tobytes() == verdicts.flags[k].tobytes()
+
+
+def test_a_free_run_follows_the_schedule() -> None:
+    model = scheduled(np.random.default_rng(7), Schedule((SPEED,)))
+    model = model.replace(A=model.A * 0.1, c=model.c * 0.1)
+    run = model.simulate([0.2, 0.0], np.zeros((5, 1)), 0.1)
+    x = np.array([0.2, 0.0])
+    for k in range(5):
+        at = model.at(speed=3.0 + 2.0 * float(x[0]))
+        x = x + 0.1 * (at.A @ x + at.c)
+        np.testing.assert_allclose(run[k + 1], x, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d["blocks"].pop(), "blocks"),
+        (lambda d: d["blocks"][1].pop("A"), r"blocks\[1\].A"),
+        (lambda d: d["blocks"][1].update(v=[-1.0, 0.0]), r"blocks\[1\].v"),
+        (lambda d: d["blocks"][1].update(tied_to=7), "tied_to"),
+        (lambda d: d["blocks"][1].update(odd=7), "odd"),
+        (lambda d: d.update(A=[[1.0]]), "unknown field 'A'"),
+        (lambda d: d["schedule"][0].update(signal="torque"), "torque"),
+        (lambda d: d.update(format="uncertain-lti/1"), "'A' is missing"),
+        (lambda d: d.update(scheduling=[{"name": "w", "topic": "", "field": "w"}]), "schedules nothing"),
+    ],
+)
+def test_a_damaged_file_is_refused_by_its_field(change: Any, words: str) -> None:
+    data = scheduled(np.random.default_rng(8), Schedule((SPEED,))).to_dict()
+    change(data)
+    with pytest.raises(ModelError, match=words):
+        UncertainLTI.from_dict(data)
+
+
+def test_a_signals_file_says_how_to_schedule() -> None:
+    data = {
+        "states": [{"name": "speed", "topic": "/s", "field": "a"}],
+        "scheduling": [{"name": "gear", "topic": "/g", "field": "data", "max_hold": 0.5}],
+        "schedule": [{"signal": "speed", "knots": "auto"}, {"signal": "gear", "modes": [1, 2]}],
+    }
+    signals = SignalMap.from_dict(data)
+    assert signals.schedule == (ScheduleRule("speed", "auto"), ScheduleRule("gear", None, (1.0, 2.0)))
+    assert [s.name for s in signals.signals] == ["speed", "gear"] and signals.topics == ("/s", "/g")
+    for key, value, words in (
+        ("schedule", [{"signal": "torque", "knots": 3}], "torque"),
+        ("schedule", [{"signal": "speed", "knots": 0}], "knots"),
+        ("schedule", [{"signal": "speed"}], "knots"),
+        ("schedule", [{"signal": "speed", "knots": [1, "a"]}], r"knots\[1\]"),
+        ("schedule", {"signal": "speed"}, "list"),
+        ("scheduling", [{"name": "gear", "topic": "/g", "field": "data", "delay": 2}], "delay"),
+    ):
+        with pytest.raises(SignalError, match=words):
+            SignalMap.from_dict(data | {key: value})

@@ -6,8 +6,10 @@ With phi = [x; u; 1], psi = |phi| and the terms of the model side by side (`term
     half   = dt * (Delta psi) + v
     lower  = centre - half * margin,   upper = centre + half * margin
 
-and a sample is contained if lower <= x_next <= upper. Every sum goes from the first column to the last, whether one
-sample is judged or a million, compiled or not, so all of them give the same bits.
+and a sample is contained if lower <= x_next <= upper. Where the model is scheduled, Theta, Delta and v are first
+blended from its blocks with the weights of the scheduling vector, element by element (`schedule`). Every sum
+goes from the first column to the last, whether one sample is judged or a million, compiled or not, so all of them give
+the same bits.
 """
 
 from __future__ import annotations
@@ -406,19 +408,54 @@ def _accumulated(rows: Any) -> Any:
     return np.add.accumulate(rows, axis=0)[-1]
 
 
-def centre_and_half(theta: Any, delta: Any, v: Any, phi: Any, dt: Any) -> tuple[Any, Any]:
+def blended(blocks: Any, places: Any, weights: Any) -> Any:
+    """Elements of a scheduled model at K samples: Σ_r w_r θ_r over the blocks that hold, in their order.
+
+    Compiled code has the same sum in `Judge._blend`.
+
+    Parameters
+    ----------
+    blocks : array (R, ...)
+        Elements of each block.
+    places : array of int (C, K)
+        Blocks that hold at each sample (`Schedule.corners`).
+    weights : array (C, K)
+        Their weights.
+
+    Returns
+    -------
+    array (..., K)
+        Elements at each sample.
+    """
+    last = np.ascontiguousarray(np.moveaxis(blocks, 0, -1))
+    total = np.take(last, places[0], axis=-1)
+    total *= weights[0]
+    for place, weight in zip(places[1:], weights[1:], strict=True):
+        part = np.take(last, place, axis=-1)
+        part *= weight
+        total += part
+    return total
+
+
+def centre_and_half(
+    theta: Any, delta: Any, v: Any, phi: Any, dt: Any, places: Any = None, weights: Any = None
+) -> tuple[Any, Any]:
     """Centre and half-width of the bounds of K samples at once.
 
     Parameters
     ----------
-    theta, delta : array (n, p)
+    theta, delta : array (n, p), or (R, n, p) with a schedule
         Nominal elements and half-widths of the rates, 1/s.
-    v : array (n,)
+    v : array (n,), or (R, n)
         Half-width that dt does not multiply.
     phi : array (p, K)
         Regressors, the states first.
     dt : array (K,)
         s.
+    places : array of int (C, K), optional
+        Blocks that hold at each sample, of a scheduled model.
+    weights : array (C, K), optional
+        Their weights.
 
     Returns
     -------
@@ -428,9 +465,15 @@ def centre_and_half(theta: Any, delta: Any, v: Any, phi: Any, dt: Any) -> tuple[
         Half-width, normalised.
     """
     columns = phi[:, None, :]
-    rate = ordered_sum(np.ascontiguousarray(theta.T)[:, :, None], columns)
-    spread = ordered_sum(np.ascontiguousarray(delta.T)[:, :, None], np.abs(columns))
-    return centre_of(phi[: len(v)], dt, rate), half_of(dt, spread, v[:, None])
+    theta, delta = theta.swapaxes(-1, -2), delta.swapaxes(-1, -2)  # (..., p, n)
+    if places is None:
+        theta, delta, v = np.ascontiguousarray(theta)[..., None], np.ascontiguousarray(delta)[..., None], v[:, None]
+    else:
+        theta, delta = blended(theta, places, weights), blended(delta, places, weights)
+        v = blended(v, places, weights)
+    rate = ordered_sum(theta, columns)
+    spread = ordered_sum(delta, np.abs(columns))
+    return centre_of(phi[: len(v)], dt, rate), half_of(dt, spread, v)
 
 
 LOWER, UPPER, UTILISATION, FLAGS = range(4)
@@ -451,16 +494,22 @@ class Judgement:
         As the attribute.
     outside_domain : bool
         As the attribute.
+    unknown_regime : bool
+        As the attribute.
     """
 
     contained = cython.declare(cython.bint, visibility="readonly")
     violation = cython.declare(cython.bint, visibility="readonly")
     outside_domain = cython.declare(cython.bint, visibility="readonly")
+    unknown_regime = cython.declare(cython.bint, visibility="readonly")
     _values = cython.declare(object)
 
-    def __init__(self, values: Any, contained: bool, violation: bool, outside_domain: bool) -> None:
+    def __init__(
+        self, values: Any, contained: bool, violation: bool, outside_domain: bool, unknown_regime: bool
+    ) -> None:
         self._values = values
-        self.contained, self.violation, self.outside_domain = contained, violation, outside_domain
+        self.contained, self.violation = contained, violation
+        self.outside_domain, self.unknown_regime = outside_domain, unknown_regime
 
     def numbers(self, which: int) -> Any:
         """Lower or upper bound (recorded units), utilisation, or flag (0 contained, 1 violated) of each state.
@@ -494,16 +543,16 @@ class Judge:
 
     Parameters
     ----------
-    theta : array (n, p)
+    theta : array (n, p), or (R, n, p) with a schedule
         Nominal elements of the rates, for φ = [x; u; 1] (`terms.tables`), 1/s.
-    delta : array (n, p)
+    delta : array (n, p), or (R, n, p)
         Their half-widths, for ψ = |φ|, 1/s.
-    v : array (n,)
+    v : array (n,), or (R, n)
         Half-width that dt does not multiply.
-    steady : array (n + m,)
-        Steady states of [x; u].
-    scale : array (n + m,)
-        Scales of [x; u].
+    steady : array (n + m + q,)
+        Steady states of [x; u; s], with s the q further scheduling signals.
+    scale : array (n + m + q,)
+        Scales of [x; u; s].
     least : array (n + m,)
         Least normalised [x; u] that the fit saw.
     greatest : array (n + m,)
@@ -514,6 +563,12 @@ class Judge:
         States whose violations count.
     occupied : array (pairs, cells, cells) of bool, optional
         Combinations of two signals that the fit saw (`domain.Occupancy`).
+    schedule : Schedule, optional
+        Weights of the blocks; None for one block.
+    positions : sequence of int, optional
+        Where its scheduling signals are in [x; u; s].
+    known : array of bool (R,), optional
+        Blocks that a recording visited; default all.
 
     Raises
     ------
@@ -523,7 +578,9 @@ class Judge:
 
     n: cython.Py_ssize_t
     size: cython.Py_ssize_t
+    total: cython.Py_ssize_t
     p: cython.Py_ssize_t
+    blocks: cython.Py_ssize_t
     margin: cython.double
     _theta: cython.double[::1]  # column after column, as the sums walk
     _delta: cython.double[::1]
@@ -541,6 +598,18 @@ class Judge:
     _per_unit: cython.double[::1]
     _occupied: cython.uchar[::1]
     _place: cython.int[::1]
+    _z: cython.double[::1]
+    _axes: cython.Py_ssize_t
+    _of_modes: cython.uchar[::1]
+    _positions: cython.int[::1]
+    _begin: cython.int[::1]  # of the knots or modes of each axis in the next
+    _values: cython.double[::1]
+    _known: cython.uchar[::1]
+    _places: cython.longlong[::1]
+    _weights: cython.double[::1]
+    _all_theta: cython.double[::1]  # block after block; the three above hold what is blended from them
+    _all_delta: cython.double[::1]
+    _all_v: cython.double[::1]
 
     def __init__(
         self,
@@ -554,21 +623,54 @@ class Judge:
         margin: float,
         counted: Any,
         occupied: Any = None,
+        schedule: Any = None,
+        positions: Sequence[int] = (),
+        known: Any = None,
     ) -> None:
-        self.n, self.p = theta.shape
-        self.size = len(steady)
+        self.n, self.p = theta.shape[-2:]
+        self.size, self.total = len(least), len(steady)
+        self.blocks = 1 if schedule is None else schedule.blocks
         self.margin = margin
-        if delta.shape != theta.shape or len(v) != self.n or len(counted) != self.n or self.p < self.size:
+        lead = () if schedule is None else (self.blocks,)
+        known = np.ones(self.blocks, dtype=bool) if known is None else np.asarray(known, dtype=bool)
+        if not theta.shape == delta.shape == (*lead, self.n, self.p) or v.shape != (*lead, self.n):
             raise ValueError("the terms do not fit one another")
-        if not len(scale) == len(least) == len(greatest) == self.size >= self.n:
+        if len(counted) != self.n or self.p < self.size or known.shape != (self.blocks,):
+            raise ValueError("the terms do not fit one another")
+        if not len(scale) == self.total >= self.size == len(greatest) >= self.n:
             raise ValueError("the operating point or the domain does not fit the terms")
+        inside = [0 <= i < self.total for i in positions]
+        if schedule is not None and not (len(inside) == len(schedule.axes) and all(inside)):
+            raise ValueError("the schedule does not fit the signals")
         self._cells = 0 if occupied is None else occupied.shape[1]
         if occupied is not None and occupied.shape != (len(pairs_of(self.size)[0]), self._cells, self._cells):
             raise ValueError("the occupied cells do not fit the signals")
         one = np.ones(self.p)  # beyond z the regressors are 1
         if cython.compiled:
-            self._theta, self._delta = array("d", theta.T.tobytes()), array("d", delta.T.tobytes())
-            self._v, self._steady, self._scale = _doubles(v), _doubles(steady), _doubles(scale)
+            self._all_theta, self._all_delta = (
+                _doubles(np.swapaxes(theta, -1, -2)),
+                _doubles(np.swapaxes(delta, -1, -2)),
+            )
+            self._all_v = _doubles(v)
+            first = self.n * self.p
+            self._theta, self._delta = self._all_theta[:first], self._all_delta[:first]
+            self._v = self._all_v[: self.n]
+            axes = () if schedule is None else schedule.axes
+            self._axes = len(axes)
+            if self._axes:  # blended into arrays of their own
+                self._theta, self._delta = _doubles(np.zeros(first)), _doubles(np.zeros(first))
+                self._v = _doubles(np.zeros(self.n))
+            self._of_modes = bytearray([int(bool(axis.modes)) for axis in axes] or [0])
+            self._positions = array("i", list(positions) or [0])
+            begins = [0]
+            for axis in axes:
+                begins.append(begins[-1] + len(axis))
+            self._begin = array("i", begins)
+            self._values = array("d", [v for axis in axes for v in axis.values] or [0.0])
+            self._known = bytearray(known.astype(np.uint8).tobytes())
+            self._z = _doubles(np.zeros(self.total))
+            self._places, self._weights = array("q", bytes(32)), array("d", bytes(32))
+            self._steady, self._scale = _doubles(steady), _doubles(scale)
             self._least, self._greatest = _doubles(least), _doubles(greatest)
             self._counted = bytearray(np.asarray(counted, dtype=np.uint8).tobytes())
             self._phi = _doubles(one)
@@ -579,7 +681,10 @@ class Judge:
             self._occupied = bytearray(np.ascontiguousarray(flat, dtype=np.uint8).tobytes())
             self._place = array("i", bytes(4 * self.size))
         else:
-            self._both = np.ascontiguousarray(np.stack([theta.T, delta.T], axis=1))  # (p, 2, n)
+            both = np.stack([np.swapaxes(theta, -1, -2), np.swapaxes(delta, -1, -2)], axis=-2)
+            self._both = np.ascontiguousarray(both)  # (p, 2, n), or (R, p, 2, n)
+            self._schedule, self._known = schedule, known
+            self._positions = list(positions)
             self._phi = np.stack([one, one])[:, :, None].transpose(1, 0, 2).copy()  # (p, 2, 1): phi and psi
             self._v, self._least, self._greatest, self._occupied = v, least, greatest, occupied
             # z_k and x_{k+1} side by side, as both are normalised alike
@@ -587,13 +692,13 @@ class Judge:
             self._scale = np.concatenate([scale, scale[: self.n]])
             self._uncounted = ~np.asarray(counted, dtype=bool)
 
-    def judge(self, before: Sequence[float], after: Sequence[float], dt: cython.double) -> Judgement:
+    def judge(self, before: Sequence[float], after: Sequence[float], dt: cython.double) -> Judgement | None:
         """Judge one transition.
 
         Parameters
         ----------
-        before : sequence of float (n + m,)
-            x_k and u_k, recorded units.
+        before : sequence of float (n + m + q,)
+            x_k, u_k and the further scheduling signals, recorded units.
         after : sequence of float (n,)
             x_{k+1}, recorded units.
         dt : float
@@ -601,49 +706,68 @@ class Judge:
 
         Returns
         -------
-        Judgement
-            Against the bounds of this model.
+        Judgement or None
+            Against the bounds of this model; None for a mode that it does not list.
 
         Raises
         ------
         ValueError
             The numbers of values are not those of the model's signals.
         """
-        if len(before) != self.size or len(after) != self.n:
-            raise ValueError(f"{len(before)} and {len(after)} values for {self.size} and {self.n} signals")
+        if len(before) != self.total or len(after) != self.n:
+            raise ValueError(f"{len(before)} and {len(after)} values for {self.total} and {self.n} signals")
         if cython.compiled:
             return self._one(before, after, dt)
         n = self.n
         z = normalised(np.array([*before, *after], dtype=np.float64), self._steady, self._scale)
-        z, x_next = z[:-n], z[-n:]
+        s, z, x_next = z[self._positions], z[: self.size], z[-n:]
         self._phi[: len(z), 0, 0] = z
         np.abs(z, out=self._phi[: len(z), 1, 0])
-        rate, spread = ordered_sum(self._both, self._phi)
-        centre, half = centre_of(z[:n], dt, rate), half_of(dt, spread, self._v)
+        both, v, unknown = self._both, self._v, False
+        if self._schedule is not None:
+            places, weights = self._schedule.corners(s[:, None])
+            if places[0, 0] < 0:
+                return None
+            both, v = blended(both, places, weights)[..., 0], blended(v, places, weights)[..., 0]
+            reliable = self._known[places[:, 0]] | ~(weights[:, 0] > 0.0)
+            unknown = bool(self._schedule.beyond(s[:, None])[0]) or not bool(reliable.all())
+        rate, spread = ordered_sum(both, self._phi)
+        centre, half = centre_of(z[:n], dt, rate), half_of(dt, spread, v)
         lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)
         inside = contained(lower, x_next, upper)
         values = centre, half, lower, upper, x_next, inside, self._steady[:n], self._scale[:n]
         every = bool(inside.all())
         violation = not every and not bool((inside | self._uncounted).all())
-        left = bool(outside(z, self._least, self._greatest).any())
+        left = unknown or bool(outside(z, self._least, self._greatest).any())
         if self._cells and not left:
             left = not visited(z, self._least, self._greatest, self._occupied)
-        return Judgement(values, every, violation, left)
+        return Judgement(values, every, violation, left, unknown)
 
     @cython.cfunc
     @cython.boundscheck(False)
     @cython.wraparound(False)
-    def _one(self, before: Any, after: Any, dt: cython.double) -> Judgement:
+    def _one(self, before: Any, after: Any, dt: cython.double) -> Judgement | None:
         n: cython.Py_ssize_t = self.n
         i: cython.Py_ssize_t
         z: cython.double
         left: cython.bint = False
         every: cython.bint = True
         violation: cython.bint = False
+        unknown: cython.bint = False
+        regime: cython.int = 0
         for i in range(self.size):
             z = before[i]
             self._phi[i] = z = normalised(z, self._steady[i], self._scale[i])
             left = left or outside(z, self._least[i], self._greatest[i])
+        if self._axes:
+            for i in range(self.size, self.total):
+                z = before[i]
+                self._z[i] = normalised(z, self._steady[i], self._scale[i])
+            regime = self._blend()
+            if regime < 0:
+                return None
+            unknown = regime > 0
+            left = left or unknown
         if self._cells and not left:
             left = self._unvisited()
         self._ordered_sums()
@@ -668,7 +792,87 @@ class Judge:
             values[n + i] = recorded(upper, self._steady[i], self._scale[i])
             values[2 * n + i] = utilisation_of(x_next - centre, half)
             values[3 * n + i] = not inside
-        return Judgement(blank, every, violation, left)
+        return Judgement(blank, every, violation, left, unknown)
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _blend(self) -> cython.int:
+        """`blended` for one sample, into `_theta`, `_delta` and `_v`: -1 for no mode that is listed, 1 if unknown."""
+        axis: cython.Py_ssize_t
+        corner: cython.Py_ssize_t
+        corners: cython.Py_ssize_t = 1
+        j: cython.Py_ssize_t
+        last: cython.Py_ssize_t
+        size: cython.Py_ssize_t
+        k: cython.Py_ssize_t
+        s: cython.double
+        high: cython.double
+        unknown: cython.int = 0
+        places: cython.longlong[::1] = self._places
+        weights: cython.double[::1] = self._weights
+        places[0] = 0
+        weights[0] = 1.0
+        for axis in range(self._axes):
+            k = self._positions[axis]
+            s = self._phi[k] if k < self.size else self._z[k]
+            if s != s:
+                return -1
+            size = self._begin[axis + 1] - self._begin[axis]
+            last = self._begin[axis]
+            if self._of_modes[axis]:
+                j = 0
+                while j < size and self._values[last + j] != s:
+                    j += 1
+                if j == size:
+                    return -1
+                for corner in range(corners):
+                    places[corner] = places[corner] * size + j
+                continue
+            if s < self._values[last] or s > self._values[last + size - 1]:
+                unknown = 1
+            j = 0
+            while j < size - 2 and self._values[last + j + 1] <= s:
+                j += 1
+            high = weight_between(s, self._values[last + j], self._values[last + j + 1])
+            for corner in range(corners - 1, -1, -1):  # from the back: two take the place of one
+                places[2 * corner + 1] = places[corner] * size + j + 1
+                weights[2 * corner + 1] = weights[corner] * high
+                places[2 * corner] = places[corner] * size + j
+                weights[2 * corner] = weights[corner] * (1.0 - high)
+            corners *= 2
+        for corner in range(corners):
+            if weights[corner] > 0.0 and not self._known[places[corner]]:
+                unknown = 1
+        size = self.n * self.p
+        for corner in range(corners):
+            self._add(self._theta, self._all_theta, size, corner, places[corner] * size, weights[corner])
+            self._add(self._delta, self._all_delta, size, corner, places[corner] * size, weights[corner])
+            self._add(self._v, self._all_v, self.n, corner, places[corner] * self.n, weights[corner])
+        return unknown
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _add(
+        self,
+        total: cython.double[::1],
+        blocks: cython.double[::1],
+        size: cython.Py_ssize_t,
+        corner: cython.Py_ssize_t,
+        begin: cython.Py_ssize_t,
+        weight: cython.double,
+    ) -> cython.void:
+        """Weighted elements of one block, to those of the corners before it."""
+        i: cython.Py_ssize_t
+        if corner == 0:
+            for i in range(size):
+                total[i] = blocks[begin + i] * weight
+        else:
+            for i in range(size):
+                total[i] += blocks[begin + i] * weight
 
     @cython.cfunc
     @cython.boundscheck(False)

@@ -19,13 +19,15 @@ from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
-from uncertain_lti.model.terms import ARRAYS, REQUIRED, checked
+from uncertain_lti.model.schedule import BlockData, Schedule
+from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked
 from uncertain_lti.signals.signal_map import SignalMap
 from uncertain_lti.signals.table_layout import TableLayout
 
 FORMATS = ("uncertain-lti/1", "uncertain-lti/2")
 """Formats of model files, oldest first; the oldest that holds a model is written."""
 MAX_FILE_BYTES = 64 * 2**20
+_SCHEDULING = ("name", "topic", "type", "field", "unit", "steady", "scale", "max_hold")
 _IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
 _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 
@@ -55,8 +57,19 @@ def structure(model: Any) -> dict[str, Any]:
         for s in model.signals.controls
     ]
     s = model.sampling
+    scheduled = model.schedule is not None
+    regimes: dict[str, Any] = {}
+    if scheduled:
+        regimes["schedule"] = model.schedule.to_list()
+        if model.signals.scheduling:
+            regimes["scheduling"] = [{key: getattr(s, key) for key in _SCHEDULING} for s in model.signals.scheduling]
+        regimes["blocks"] = [
+            {name: getattr(model, name)[r].tolist() for name in ARRAYS}
+            | {"transitions": facts.transitions, "tied_to": facts.tied_to}
+            for r, facts in enumerate(model.block_data)
+        ]
     return {
-        "format": FORMATS[model.domain.measure is not None or model.signals.table is not None],
+        "format": FORMATS[scheduled or model.domain.measure is not None or model.signals.table is not None],
         "states": states,
         "controls": controls,
         "sampling": {
@@ -71,7 +84,7 @@ def structure(model: Any) -> dict[str, Any]:
             "max_skew": s.max_skew,
         }
         | ({} if model.signals.table is None else {"table": model.signals.table.to_dict()}),
-        **{name: getattr(model, name).tolist() for name in ARRAYS},
+        **(regimes if scheduled else {name: getattr(model, name).tolist() for name in ARRAYS}),
         "domain": {
             name: [v if math.isfinite(v) else None for v in getattr(model.domain, name).tolist()]
             for name in ("x_min", "x_max", "u_min", "u_max")
@@ -114,10 +127,10 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
             f"format is {reprlib.repr(data['format'])}, and this version reads {', '.join(FORMATS)}; fit the model "
             f"again, or use the version that wrote it"
         )
-    known = {
-        "format", "states", "controls", "sampling", *ARRAYS, "domain", "alarm", "fit", "validation",
-    }  # fmt: skip
-    for name in ("states", "controls", "sampling", *REQUIRED):
+    scheduled = data["format"] != FORMATS[0] and "schedule" in data
+    known = {"format", "states", "controls", "sampling", "domain", "alarm", "fit", "validation"}
+    known |= {"schedule", "scheduling", "blocks"} if scheduled else set(ARRAYS)
+    for name in ("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)):
         if name not in data:
             raise ModelError(f"field '{name}' is missing; fit the model again")
     for name in data:
@@ -142,7 +155,9 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         if kind not in ("header", "log"):
             raise ModelError(f"sampling.time[{topic}] is {reprlib.repr(kind)}; it must be header or log")
     signals = replace(
-        SignalMap.from_dict({"states": data["states"], "controls": data["controls"]}, source=source, need_topics=False),
+        SignalMap.from_dict(
+            {key: data.get(key) for key in ("states", "controls", "scheduling")}, source=source, need_topics=False
+        ),
         clock=sampling.clock or None,
         max_gap=sampling.max_gap,
         min_step=sampling.min_step,
@@ -155,8 +170,10 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
             if getattr(signal, key) == "auto":
                 raise ModelError(f"{key} of '{signal.name}' is auto; a model file holds numbers")
     n, m = len(signals.states), len(signals.controls)
-    checked(data["A"], "A", (n, n))  # against the names, before A says how many rows the others have
-    checked(data["B"], "B", (n, m))
+    arrays, regimes = _blocks(data, n, m) if scheduled else ({name: data.get(name) for name in ARRAYS}, {})
+    if not scheduled:
+        checked(data["A"], "A", (n, n))  # against the names, before A says how many rows the others have
+        checked(data["B"], "B", (n, m))
     domain = None
     if "domain" in data:
         sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
@@ -174,9 +191,9 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
             raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
     if "margin" in alarm:
         alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
-    arrays: dict[str, Any] = {name: data.get(name) for name in ARRAYS}
     return {
         **arrays,
+        **regimes,
         "signals": signals,
         "sampling": sampling,
         "domain": domain,
@@ -184,6 +201,30 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in _object(data.get("fit", {}), "fit").items()},
         "validation": _object(data.get("validation", {}), "validation"),
     }
+
+
+def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arrays, and schedule and data of the blocks, of a scheduled model."""
+    schedule = Schedule.from_list(data["schedule"])
+    blocks = data["blocks"]
+    if not isinstance(blocks, list) or len(blocks) != schedule.blocks:
+        raise ModelError(f"field 'blocks' must be a list of {plural(schedule.blocks, 'block')}, one per knot or mode")
+    found: dict[str, list[Array]] = {name: [] for name in ARRAYS}
+    facts = []
+    for r, block in enumerate(blocks):
+        block = _object(block, f"blocks[{r}]", {*ARRAYS, "transitions", "tied_to"})
+        for name in ARRAYS:
+            shape = SHAPES[name].shape(n, m)
+            if name not in block and name in REQUIRED:
+                raise ModelError(f"field 'blocks[{r}].{name}' is missing; fit the model again")
+            value = np.zeros(shape) if block.get(name) is None else block[name]
+            found[name].append(checked(value, f"blocks[{r}].{name}", shape, name in HALF_WIDTHS))
+        for name, most in (("transitions", math.inf), ("tied_to", schedule.blocks - 1)):
+            value = block.get(name)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most):
+                raise ModelError(f"field 'blocks[{r}].{name}' is {reprlib.repr(value)}; it must be a whole number")
+        facts.append(BlockData(block.get("transitions"), block.get("tied_to")))
+    return {name: np.stack(arrays) for name, arrays in found.items()}, {"schedule": schedule, "block_data": facts}
 
 
 def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +31,10 @@ class OperatingPoint:
         Positive scales of the states.
     U : array (m,)
         Positive scales of the controls.
+    s_s : array (q,), optional
+        Steady state of the further scheduling signals; default none.
+    S : array (q,), optional
+        Their positive scales; default none.
 
     Raises
     ------
@@ -42,15 +46,17 @@ class OperatingPoint:
     u_s: Array
     X: Array
     U: Array
+    s_s: Array = field(default_factory=lambda: np.empty(0))
+    S: Array = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        for name in ("x_s", "u_s", "X", "U"):
+        for name in ("x_s", "u_s", "X", "U", "s_s", "S"):
             value = np.array(getattr(self, name), dtype=np.float64, ndmin=1)
             value.flags.writeable = False
             object.__setattr__(self, name, value)
             if value.ndim != 1 or not np.isfinite(value).all():
                 raise TransientError(f"operating point: {name} must be a vector of finite numbers")
-        for steady, scale in (("x_s", "X"), ("u_s", "U")):
+        for steady, scale in (("x_s", "X"), ("u_s", "U"), ("s_s", "S")):
             if getattr(self, steady).shape != getattr(self, scale).shape:
                 raise TransientError(f"operating point: {steady} and {scale} differ in length")
             if not (getattr(self, scale) > 0).all():
@@ -75,7 +81,9 @@ class OperatingPoint:
         return cls(np.zeros(n), np.zeros(m), np.ones(n), np.ones(m))
 
     @classmethod
-    def of(cls, states: Sequence[Signal], controls: Sequence[Signal]) -> OperatingPoint:
+    def of(
+        cls, states: Sequence[Signal], controls: Sequence[Signal], scheduling: Sequence[Signal] = ()
+    ) -> OperatingPoint:
         """From signals whose steady and scale are numbers.
 
         Parameters
@@ -84,6 +92,8 @@ class OperatingPoint:
             In the order of x.
         controls : sequence of Signal
             In the order of u.
+        scheduling : sequence of Signal, optional
+            Further scheduling signals.
 
         Returns
         -------
@@ -108,7 +118,19 @@ class OperatingPoint:
             numbers(controls, "steady"),
             numbers(states, "scale"),
             numbers(controls, "scale"),
+            numbers(scheduling, "steady"),
+            numbers(scheduling, "scale"),
         )
+
+    @property
+    def steady(self) -> Array:
+        """Steady state of [x; u; s] (n + m + q,)."""
+        return np.concatenate((self.x_s, self.u_s, self.s_s))
+
+    @property
+    def scale(self) -> Array:
+        """Scales of [x; u; s] (n + m + q,)."""
+        return np.concatenate((self.X, self.U, self.S))
 
     def normalise_x(self, x: ArrayLike) -> Array:
         """States as deviations.
@@ -139,6 +161,21 @@ class OperatingPoint:
             Dimensionless.
         """
         return np.asarray(normalised(np.asarray(u, dtype=np.float64), self.u_s, self.U))
+
+    def normalise_s(self, s: ArrayLike) -> Array:
+        """Further scheduling signals as deviations.
+
+        Parameters
+        ----------
+        s : array (..., q)
+            Recorded units.
+
+        Returns
+        -------
+        array (..., q)
+            Dimensionless.
+        """
+        return np.asarray(normalised(np.asarray(s, dtype=np.float64), self.s_s, self.S))
 
     def recorded_x(self, x: ArrayLike) -> Array:
         """State deviations in recorded units.

@@ -263,6 +263,13 @@ class Schedule:
                 left |= (values < axis.knots[0]) | (values > axis.knots[-1])
         return left
 
+    @property
+    def words(self) -> str:
+        """Its signals with their numbers of knots or modes."""
+        return " and ".join(
+            f"{axis.signal} ({plural(len(axis), 'knot' if axis.knots else 'mode')})" for axis in self.axes
+        )
+
     def to_list(self) -> list[dict[str, Any]]:
         """As it is in a model file.
 

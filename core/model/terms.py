@@ -125,16 +125,17 @@ def tables(arrays: dict[str, Array]) -> tuple[Array, Array, Array]:
 
     Returns
     -------
-    nominal, half : array (n, n + m + 1)
+    nominal, half : array (n, n + m + 1), or (R, n, n + m + 1) of R blocks
         One column for each of `regressors`.
-    noise : array (n,)
+    noise : array (n,), or (R, n)
         Sum of the half-widths of the other terms.
     """
 
     def side_by_side(which: str) -> Array:
         columns = [arrays[getattr(term, which)] for term in _RATES]
-        return np.hstack([column.reshape(len(column), -1) for column in columns])
+        return np.concatenate([column.reshape(*rows, -1) for column in columns], axis=-1)
 
+    rows = arrays["v"].shape
     others = [arrays[term.half] for term in TERMS if not term.times_dt]
     return side_by_side("nominal"), side_by_side("half"), np.sum(others, axis=0) if len(others) > 1 else others[0]
 

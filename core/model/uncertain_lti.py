@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,12 +17,13 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.bounds import centre_and_half, lower_of, upper_of
+from uncertain_lti.model.bounds import Judge, blended, centre_and_half, lower_of, normalised, recorded, upper_of
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 _BLOCK = 65536  # products per block of the vectorised path: they stay in the cache
@@ -35,9 +38,12 @@ class UncertainLTI:
         h &= Δt (ΔA |x| + ΔB |u| + Δc) + v \\
         x_{min}, x_{max} &= x + Δt (A x + B u + c) ∓ h
 
+    With a schedule of R blocks every array has a leading axis of R, and the elements are blended with the weights of
+    the scheduling vector before the bounds are computed (`schedule`).
+
     Parameters
     ----------
-    A : array (n, n)
+    A : array (n, n), or (R, n, n) with a schedule, and so for those that follow
         Nominal elements, 1/s.
     B : array (n, m)
         The same for the controls, 1/s.
@@ -51,6 +57,10 @@ class UncertainLTI:
         Half-width of the drift, 1/s; 0 by default.
     v : array (n,), optional
         Half-width of measurement noise, normalised; not multiplied by Δt; 0 by default.
+    schedule : Schedule, optional
+        Weights of the blocks; None for one block.
+    block_data : sequence of BlockData, optional
+        What the fit knows of each block; default nothing.
     signals : SignalMap, optional
         Names, topics, operating point; default names x1, x2, ..., u1, u2, ... and values used as they are.
     sampling : Sampling, optional
@@ -80,6 +90,8 @@ class UncertainLTI:
         dc: ArrayLike | None = None,
         v: ArrayLike | None = None,
         *,
+        schedule: Schedule | None = None,
+        block_data: Sequence[BlockData] | None = None,
         signals: SignalMap | None = None,
         sampling: Sampling | None = None,
         domain: Domain | None = None,
@@ -92,19 +104,23 @@ class UncertainLTI:
         self.c: Array
         self.dc: Array
         self.v: Array
+        self.schedule = schedule
+        lead = () if schedule is None else (schedule.blocks,)
         self.A = checked(A, "A", None)
-        n = len(self.A) if self.A.ndim else 0
-        if self.A.shape != (n, n) or n == 0:
-            raise ModelError(f"A has shape {self.A.shape}; it must be square, one row per state")
+        n = self.A.shape[-1] if self.A.ndim else 0
+        if self.A.shape != (*lead, n, n) or n == 0:
+            each = f", once for each of {plural(lead[0], 'block')}" if lead else ""
+            raise ModelError(f"A has shape {self.A.shape}; it must be square, one row per state{each}")
         self.B = checked(B, "B", None)
         if self.B.size == 0:
-            self.B = np.zeros((n, 0))
-        if self.B.ndim != 2 or self.B.shape[0] != n:
-            raise ModelError(f"B has shape {self.B.shape}; it must have {plural(n, 'row')}, one per state")
-        m = self.B.shape[1]
+            self.B = np.zeros((*lead, n, 0))
+        if self.B.ndim != self.A.ndim or self.B.shape[:-1] != (*lead, n):
+            each = f" of {plural(lead[0], 'block')}" if lead else ""
+            raise ModelError(f"B has shape {self.B.shape}; it must have {plural(n, 'row')}, one per state{each}")
+        m = self.B.shape[-1]
         given: dict[str, Any] = {"dA": dA, "dB": dB, "c": c, "dc": dc, "v": v}
         for name, value in given.items():
-            shape = SHAPES[name].shape(n, m)
+            shape = (*lead, *SHAPES[name].shape(n, m))
             half_width = name in HALF_WIDTHS
             value = np.zeros(shape) if value is None and name not in REQUIRED else value
             setattr(self, name, checked(value, name, shape, half_width))
@@ -122,7 +138,15 @@ class UncertainLTI:
                 f"A {self.A.shape} and B {self.B.shape}"
             )
         self.signals = signals
-        self.operating_point = OperatingPoint.of(signals.states, signals.controls)
+        self.operating_point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
+        names = [s.name for s in signals.signals]
+        self._positions = list(schedule.positions(names)) if schedule is not None else []
+        for name in names[n + m :]:
+            if schedule is None or name not in [axis.signal for axis in schedule.axes]:
+                raise ModelError(f"scheduling signal '{name}' schedules nothing; leave it out")
+        self.block_data = tuple(block_data or (BlockData() for _ in range(lead[0] if lead else 1)))
+        if len(self.block_data) != (lead[0] if lead else 1):
+            raise ModelError(f"{plural(len(self.block_data), 'block')} of data for {plural(*lead or (1,), 'block')}")
         self.sampling = sampling or _sampling(signals)
         unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
         self.domain = domain or unbounded
@@ -135,12 +159,71 @@ class UncertainLTI:
     @property
     def n(self) -> int:
         """Number of states."""
-        return int(self.A.shape[0])
+        return int(self.A.shape[-1])
 
     @property
     def m(self) -> int:
         """Number of controls."""
-        return int(self.B.shape[1])
+        return int(self.B.shape[-1])
+
+    @property
+    def q(self) -> int:
+        """Number of further scheduling signals, which are neither state nor control."""
+        return len(self.signals.scheduling)
+
+    @cached_property
+    def blocks(self) -> tuple[UncertainLTI, ...]:
+        """Each block as a model of its own, without a schedule; of a model without one, itself."""
+        if self.schedule is None:
+            return (self,)
+        return tuple(
+            self._unscheduled({name: getattr(self, name)[r] for name in ARRAYS}) for r in range(self.schedule.blocks)
+        )
+
+    def at(self, **values: float) -> UncertainLTI:
+        """The uncertain linear model that holds at one point of the schedule.
+
+        Parameters
+        ----------
+        **values : float
+            Of each scheduling signal by its name, in recorded units.
+
+        Returns
+        -------
+        UncertainLTI
+            Without a schedule: the blocks there, blended.
+
+        Raises
+        ------
+        ModelError
+            The names are not those of the scheduling signals, or a mode is not listed.
+        """
+        if self.schedule is None:
+            if values:
+                raise ModelError(f"the model has no schedule, and {', '.join(values)} is given; leave it out")
+            return self
+        names = [axis.signal for axis in self.schedule.axes]
+        if set(values) != set(names):
+            raise ModelError(f"give a value of {' and of '.join(names)}, and nothing else")
+        point = self.operating_point
+        s = [
+            float(normalised(float(values[name]), float(point.steady[i]), float(point.scale[i])))
+            for name, i in zip(names, self._positions, strict=True)
+        ]
+        places, weights = self.schedule.corners(np.array(s)[:, None])
+        if places[0, 0] < 0:
+            raise ModelError(f"{names[0]}: no block for {values}; modes are listed in the model")
+        return self._unscheduled({name: blended(getattr(self, name), places, weights)[..., 0] for name in ARRAYS})
+
+    def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:
+        """One block with the signals of this model that are states and controls."""
+        return UncertainLTI(
+            **arrays,
+            signals=replace(self.signals, scheduling=(), schedule=()),
+            sampling=self.sampling,
+            domain=self.domain,
+            alarm_rule=self.alarm_rule,
+        )
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -157,10 +240,10 @@ class UncertainLTI:
 
         Returns
         -------
-        list of (Term, array (n,), array (n,))
+        list of (Term, array (n,), array (n,)), or arrays (R, n) with a schedule
             Each with its nominal elements, 0 where it has none, and its half-widths.
         """
-        zeros = np.zeros(self.n)
+        zeros = np.zeros_like(self.v)
         return [(t, getattr(self, t.nominal) if t.nominal else zeros, getattr(self, t.half)) for t in ADDITIVE]
 
     def __repr__(self) -> str:
@@ -168,6 +251,8 @@ class UncertainLTI:
         text += f"{plural(self.m, 'control')}"
         if self.m:
             text += f": {', '.join(self.control_names)}"
+        if self.schedule is not None:
+            text += f"; {plural(self.schedule.blocks, 'block')} over {self.schedule.words}"
         if "criterion" in self.fit_summary:
             count = plural(self.fit_summary.get("transitions"), "transition")
             text += f"; fitted by {self.fit_summary['criterion']} to {count}"
@@ -202,7 +287,9 @@ class UncertainLTI:
 
     # --- one-step bounds ---
 
-    def centre_and_half(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike) -> tuple[Array, Array]:
+    def centre_and_half(
+        self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
         """Centre and half-width of the bounds; see `bounds`.
 
         Parameters
@@ -213,11 +300,13 @@ class UncertainLTI:
             Normalised control at t_k.
         dt : float or array (...)
             Δt_k, s.
+        s : array (..., q), optional
+            Normalised further scheduling signals at t_k; for models that have some.
 
         Returns
         -------
         array (..., n)
-            Centre, normalised.
+            Centre, normalised; NaN for a mode that is not listed.
         array (..., n)
             Half-width, normalised.
 
@@ -229,16 +318,17 @@ class UncertainLTI:
         x = np.asarray(x, dtype=np.float64)
         u = np.asarray(u, dtype=np.float64)
         dt = np.asarray(dt, dtype=np.float64)
+        s = np.zeros(0) if s is None else np.asarray(s, dtype=np.float64)
         if x.shape[-1:] != (self.n,) or u.shape[-1:] != (self.m,):
             raise ModelError(f"x has shape {x.shape} and u {u.shape}; they must end in {self.n} and {self.m}")
-        lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1], dt.shape)
+        if s.shape[-1:] != (self.q,):
+            names = ", ".join(signal.name for signal in self.signals.scheduling)
+            raise ModelError(f"s has shape {s.shape}; it must end in {self.q}" + f", with {names}" * bool(names))
+        lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1], s.shape[:-1], dt.shape)
         count = math.prod(lead)  # not -1: that says nothing where there are no controls
-        flat_x = np.broadcast_to(x, (*lead, self.n)).reshape(count, self.n)
-        flat_u = np.broadcast_to(u, (*lead, self.m)).reshape(count, self.m)
+        flat = [np.broadcast_to(a, (*lead, a.shape[-1])).reshape(count, a.shape[-1]).T for a in (x, u, s)]
         centre, half = np.empty((self.n, count)), np.empty((self.n, count))
-        self.columns_centre_and_half(
-            np.vstack([flat_x.T, flat_u.T]), np.broadcast_to(dt, lead).reshape(count), centre, half
-        )
+        self.columns_centre_and_half(np.vstack(flat), np.broadcast_to(dt, lead).reshape(count), centre, half)
         return centre.T.reshape(*lead, self.n), half.T.reshape(*lead, self.n)
 
     def columns_centre_and_half(self, z: Array, dt: Array, centre: Array, half: Array) -> None:
@@ -246,19 +336,144 @@ class UncertainLTI:
 
         Parameters
         ----------
-        z : array (n + m, K)
-            Normalised [x; u].
+        z : array (n + m + q, K)
+            Normalised [x; u; s].
         dt : array (K,)
             s.
         centre, half : array (n, K)
             Take the result.
         """
+        n, m = self.n, self.m
         for start in range(0, len(dt), self._block):
             part = slice(start, start + self._block)
-            phi = regressors(z[: self.n, part], z[self.n :, part])
-            centre[:, part], half[:, part] = centre_and_half(*self.tables, phi, dt[part])
+            phi = regressors(z[:n, part], z[n : n + m, part])
+            corners = () if self.schedule is None else self.schedule.corners(z[self._positions, part])
+            centre[:, part], half[:, part] = centre_and_half(*self.tables, phi, dt[part], *corners)
 
-    def bounds(self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0) -> tuple[Array, Array]:
+    def normalised_columns(self, steps: Transitions) -> Array:
+        """[x; u; s] of transitions.
+
+        Parameters
+        ----------
+        steps : Transitions
+            K of them, recorded units.
+
+        Returns
+        -------
+        array (n + m + q, K)
+            Normalised.
+        """
+        point = self.operating_point
+        parts = point.normalise_x(steps.x), point.normalise_u(steps.u), point.normalise_s(steps.s)
+        return np.vstack([part.T for part in parts])
+
+    def regime(self, z: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Whether the blocks that hold at some samples can be trusted.
+
+        Parameters
+        ----------
+        z : array (n + m + q, K)
+            Normalised [x; u; s].
+
+        Returns
+        -------
+        listed : array of bool (K,)
+            There is a block: every mode is listed in the model. All, without a schedule.
+        unknown : array of bool (K,)
+            A scheduling signal lies beyond its end knots, or no recording visited a block that holds. None, without a
+            schedule.
+        """
+        count = z.shape[1]
+        if self.schedule is None:
+            return np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+        s = z[self._positions]
+        places, weights = self.schedule.corners(s)
+        known = np.array([data.known for data in self.block_data])
+        return places[0] >= 0, self.schedule.beyond(s) | ((weights > 0) & ~known[places]).any(axis=0)
+
+    def why_unknown(self, values: Sequence[float]) -> str:
+        """In words, why the regime of a sample is unknown.
+
+        Parameters
+        ----------
+        values : sequence of float (n + m + q,)
+            [x; u; s], recorded units.
+
+        Returns
+        -------
+        str
+            Names the scheduling signals, their values and the knots; empty where the regime is known.
+        """
+        if self.schedule is None:
+            return ""
+        found = []
+        point = self.operating_point
+        z = normalised(np.asarray(values, dtype=np.float64), point.steady, point.scale)[self._positions]
+        for axis, i, s in zip(self.schedule.axes, self._positions, z.tolist(), strict=True):
+            ends = recorded(np.array([axis.values[0], axis.values[-1]]), point.steady[i], point.scale[i])
+            if axis.knots and not axis.knots[0] <= s <= axis.knots[-1]:
+                found.append(f"{axis.signal} = {values[i]:.6g} is beyond its knots {ends[0]:.6g} to {ends[1]:.6g}")
+        places, weights = (a[:, 0] for a in self.schedule.corners(z[:, None]))
+        for r in places[(weights > 0) & (places >= 0)].tolist():
+            if not self.block_data[r].known:
+                found.append(f"no recording visited {self.block_name(r)}")
+        return ", and ".join(found)
+
+    def block_name(self, r: int) -> str:
+        """Where one block holds, in words.
+
+        Parameters
+        ----------
+        r : int
+            Number of the block.
+
+        Returns
+        -------
+        str
+            `fan_speed = 0.92`, for example, in recorded units; empty without a schedule.
+        """
+        if self.schedule is None:
+            return ""
+        point, signals = self.operating_point, self.signals.signals
+        parts = []
+        for axis, place, i in zip(self.schedule.axes, self.schedule.indices[r], self._positions, strict=True):
+            value = float(recorded(axis.values[place], float(point.steady[i]), float(point.scale[i])))
+            parts.append(f"{axis.signal} = {value:.6g} {signals[i].unit}".rstrip())
+        return ", ".join(parts)
+
+    def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
+        """What judges one transition after another by the bounds of this model.
+
+        Parameters
+        ----------
+        margin : float
+            Multiplies the half-widths.
+        counted : array of bool (n,)
+            States whose violations count.
+
+        Returns
+        -------
+        Judge
+            With the same bits as `bounds`.
+        """
+        point, domain = self.operating_point, self.domain
+        return Judge(
+            *self.tables,
+            point.steady,
+            point.scale,
+            domain.least,
+            domain.greatest,
+            margin,
+            counted,
+            None if domain.measure is None else domain.measure.occupied,
+            self.schedule,
+            self._positions,
+            [data.known for data in self.block_data],
+        )
+
+    def bounds(
+        self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0, s: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
         """One-step bounds, Leibov (2006), eqs. (6)(7) with the additive terms.
 
         Parameters
@@ -271,23 +486,25 @@ class UncertainLTI:
             Δt_k, s.
         margin : float
             Multiplies the half-widths.
+        s : array (..., q), optional
+            Normalised further scheduling signals at t_k; for models that have some.
 
         Returns
         -------
         lower, upper : array (..., n)
-            Normalised x_min and x_max at t_{k+1}.
+            Normalised x_min and x_max at t_{k+1}; NaN for a mode that is not listed.
 
         Raises
         ------
         ModelError
             Shapes do not fit.
         """
-        centre, half = self.centre_and_half(x, u, dt)
+        centre, half = self.centre_and_half(x, u, dt, s)
         return np.asarray(lower_of(centre, half, margin)), np.asarray(upper_of(centre, half, margin))
 
     # --- the nominal model on its own ---
 
-    def simulate(self, x0: ArrayLike, u: ArrayLike, dt: ArrayLike) -> Array:
+    def simulate(self, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLike | None = None) -> Array:
         """Free run of the nominal model, x_{k+1} = x_k + Δt_k (A x_k + B u_k + c), as in eq. (3) with ΔA = ΔB = 0.
 
         Parameters
@@ -298,6 +515,8 @@ class UncertainLTI:
             Normalised controls.
         dt : float or array (N,)
             Δt_k, s.
+        s : array (N, q), optional
+            Normalised further scheduling signals; for models that have some. A schedule on a state follows the run.
 
         Returns
         -------
@@ -306,11 +525,17 @@ class UncertainLTI:
         """
         u = np.asarray(u, dtype=np.float64)
         dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(u),))
+        s = np.zeros((len(u), 0)) if s is None else np.asarray(s, dtype=np.float64)
         x = np.empty((len(u) + 1, self.n))
         x[0] = x0
+        A, B, c = self.A, self.B, self.c
         with np.errstate(over="ignore", invalid="ignore"):  # an unstable model runs away, and may
             for k in range(len(u)):
-                x[k + 1] = x[k] + dt[k] * (self.A @ x[k] + self.B @ u[k] + self.c)
+                if self.schedule is not None:
+                    z = np.concatenate((x[k], u[k], s[k]))
+                    corners = self.schedule.corners(z[self._positions, None])
+                    A, B, c = (blended(blocks, *corners)[..., 0] for blocks in (self.A, self.B, self.c))
+                x[k + 1] = x[k] + dt[k] * (A @ x[k] + B @ u[k] + c)
         return x
 
     def discrepancy(self, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
@@ -340,11 +565,12 @@ class UncertainLTI:
         """
         x = self.operating_point.normalise_x(transient.x)
         u = self.operating_point.normalise_u(transient.u)
+        s = self.operating_point.normalise_s(transient.s)
         usable, dt = transient.usable, transient.dt
         error = np.full((len(usable), self.n), np.nan)
         edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
         for start, stop in edges.reshape(-1, 2):
-            free = self.simulate(x[start], u[start:stop], dt[start:stop])
+            free = self.simulate(x[start], u[start:stop], dt[start:stop], s[start:stop])
             error[start:stop] = free[1:] - x[start + 1 : stop + 1]
         weights = np.ones(self.n) if W is None else np.asarray(W, dtype=np.float64)
         if weights.shape not in ((self.n,), (len(usable), self.n), (len(usable), self.n, self.n)):
@@ -368,14 +594,14 @@ class UncertainLTI:
 
         Returns
         -------
-        array (n,) of complex
+        array (n,) of complex, or (R, n) with a schedule
             1/s, sorted by real part, greatest first.
         """
         values = np.linalg.eigvals(self.A).astype(np.complex128)
-        return values[np.lexsort((values.imag, -values.real))]
+        return np.take_along_axis(values, np.lexsort((values.imag, -values.real)), axis=-1)
 
     def spectral_radius(self, dt: float | None = None) -> float:
-        """Largest |eigenvalue| of I + Δt A; above 1 the nominal recursion (3) runs away.
+        """Largest |eigenvalue| of I + Δt A, of any block; above 1 the nominal recursion (3) runs away there.
 
         Parameters
         ----------
@@ -413,7 +639,8 @@ class UncertainLTI:
         arguments = {
             name: getattr(self, name)
             for name in (
-                *ARRAYS, "signals", "sampling", "domain", "alarm_rule", "fit_summary", "validation"
+                *ARRAYS, "schedule", "block_data", "signals", "sampling", "domain", "alarm_rule", "fit_summary",
+                "validation",
             )
         }  # fmt: skip
         return UncertainLTI(**{**arguments, **changes})

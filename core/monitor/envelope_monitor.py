@@ -21,7 +21,6 @@ from uncertain_lti.model.bounds import (
     LOWER,
     UPPER,
     UTILISATION,
-    Judge,
     Judgement,
     contained,
     lower_of,
@@ -60,12 +59,23 @@ class Verdict:
         In place of that of the step, where the monitor gives no verdict on it.
     """
 
-    __slots__ = ("t_ns", "arrival_ns", "status", "outside_domain", "alarm", "_after", "_judgement")
+    __slots__ = (
+        "t_ns",
+        "arrival_ns",
+        "status",
+        "outside_domain",
+        "unknown_regime",
+        "alarm",
+        "_after",
+        "_judgement",
+        "_before",
+    )
 
     def __init__(self, step: Step, alarm: bool, judgement: Judgement | None, status: Status | None = None) -> None:
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, status or step.status
-        self._after = step.after
+        self._after, self._before = step.after, step.before
         self.outside_domain = judgement is not None and judgement.outside_domain
+        self.unknown_regime = judgement is not None and judgement.unknown_regime
         self.alarm = alarm
         self._judgement = judgement
 
@@ -74,7 +84,11 @@ class Verdict:
             return f"Verdict({self.status.value}: no verdict)"
         left = int((self.flags == 1.0).sum())
         said = f"{left} of {plural(len(self.flags), 'state')} violated" if left else "contained"
-        return f"Verdict({said}{', outside the fitted domain' * self.outside_domain}{', ALARM' * self.alarm})"
+        return f"Verdict({said}{', ' + self._where if self.outside_domain else ''}{', ALARM' * self.alarm})"
+
+    @property
+    def _where(self) -> str:
+        return "in a regime that was not fitted" if self.unknown_regime else "outside the fitted domain"
 
     @property
     def judged(self) -> bool:
@@ -131,6 +145,11 @@ class Verdict:
         return _packer(len(found))(*found)
 
     @property
+    def before(self) -> list[float]:
+        """[x; u; s] of the sample before, in recorded units (n + m + q,)."""
+        return list(self._before)
+
+    @property
     def flags(self) -> Array:
         """0 contained, 1 violated, NaN no verdict (n,)."""
         return np.array(self.numbers("flags"), dtype=np.float64)
@@ -185,6 +204,11 @@ class Verdicts:
         The alarm after each sample.
     unfitted_step : array (N+1,) of bool
         The step is out of the fitted range, so there is no verdict.
+    unlisted_mode : array (N+1,) of bool
+        The model lists no such mode of its scheduling signal, so there is no verdict.
+    unknown_regime : array (N+1,) of bool
+        A scheduling signal lies beyond the end knots, or no recording visited the regime; then the sample counts as
+        outside the domain, too.
     """
 
     transient: Transient
@@ -196,6 +220,8 @@ class Verdicts:
     outside_domain: NDArray[np.bool_]
     alarm: NDArray[np.bool_]
     unfitted_step: NDArray[np.bool_]
+    unlisted_mode: NDArray[np.bool_]
+    unknown_regime: NDArray[np.bool_]
 
     def __repr__(self) -> str:
         judged, left = int(self.judged.sum()), int(self.violated.sum())
@@ -230,10 +256,14 @@ class Verdicts:
         Returns
         -------
         list of Status
-            N+1, as of `Transient.statuses`, with STEP where a step is out of the range of the fit.
+            N+1, as of `Transient.statuses`, with STEP where a step is out of the range of the fit, and MODE where the
+            model lists no such mode.
         """
         kinds = self.transient.statuses()
-        return [Status.STEP if odd else kind for odd, kind in zip(self.unfitted_step.tolist(), kinds, strict=True)]
+        for which, kind in ((self.unfitted_step, Status.STEP), (self.unlisted_mode, Status.MODE)):
+            for k in np.flatnonzero(which):
+                kinds[k] = kind
+        return kinds
 
     @property
     def state(self) -> Array:
@@ -302,17 +332,7 @@ class EnvelopeMonitor:
         if len(self.masked) == len(names):
             raise ModelError("every state of the model is masked; leave at least one that can raise the alarm")
         self._counted = np.array([name not in masked for name in names])
-        point, domain = model.operating_point, model.domain
-        self._judge = Judge(
-            *model.tables,
-            np.concatenate((point.x_s, point.u_s)),
-            np.concatenate((point.X, point.U)),
-            domain.least,
-            domain.greatest,
-            self.rule.margin,
-            self._counted,
-            None if domain.measure is None else domain.measure.occupied,
-        )
+        self._judge = model.judge_of(self.rule.margin, self._counted)
         self.alarm_statistic: AlarmStatistic = AlarmWindow(self.rule)
         self._shortest, self._longest = model.sampling.step_range
 
@@ -332,7 +352,7 @@ class EnvelopeMonitor:
         """Forget the recent verdicts and the alarm."""
         self.alarm_statistic.reset()
 
-    def predict(self, x: ArrayLike, u: ArrayLike, dt: float) -> tuple[Array, Array]:
+    def predict(self, x: ArrayLike, u: ArrayLike, dt: float, s: ArrayLike = ()) -> tuple[Array, Array]:
         """Bounds one step ahead, recorded units.
 
         Parameters
@@ -343,15 +363,17 @@ class EnvelopeMonitor:
             Control, recorded units.
         dt : float
             Step, s.
+        s : array (q,), optional
+            Further scheduling signals, recorded units.
 
         Returns
         -------
         array (n,)
-            Lower bound.
+            Lower bound; NaN for a mode that the model does not list.
         array (n,)
             Upper bound.
         """
-        z = np.concatenate((np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)))
+        z = np.concatenate([np.asarray(a, dtype=np.float64) for a in (x, u, s)])
         verdict = self.expect(0, z.tolist(), dt)
         return verdict.lower, verdict.upper
 
@@ -362,8 +384,8 @@ class EnvelopeMonitor:
         ----------
         t_ns : int
             Instant for which the bounds are, ns.
-        z : sequence of float (n + m,)
-            [x; u] before it, recorded units.
+        z : sequence of float (n + m + q,)
+            [x; u; s] before it, recorded units.
         dt : float
             Step, s.
 
@@ -412,6 +434,8 @@ class EnvelopeMonitor:
         if not contained(self._shortest, step.dt, self._longest):
             return Verdict(step, window.alarm, None, Status.STEP)
         judgement = self._judge.judge(step.before, step.after, step.dt)
+        if judgement is None:
+            return Verdict(step, window.alarm, None, Status.MODE)
         if armed:
             window.push(judgement.violation)
         return Verdict(step, window.alarm, judgement)
@@ -441,23 +465,33 @@ class EnvelopeMonitor:
                 f"{plural(transient.u.shape[1], 'control')}, and the "
                 f"model has {model.n} and {model.m}"
             )
+        if transient.s.shape[1] != model.q:
+            raise ModelError(
+                f"{transient.name}: {plural(transient.s.shape[1], 'further scheduling signal')}, and the model has "
+                f"{model.q}; read it with the signals of the model"
+            )
         steps = transient.transitions()
         count, n = len(transient), model.n
         fitted = np.asarray(contained(self._shortest, steps.dt, self._longest))
-        unfitted_step = np.zeros(count, dtype=bool)
+        unfitted_step, unlisted_mode = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         if not fitted.all():
             unfitted_step[steps.k[~fitted] + 1] = True
             steps = steps.take(fitted)
+        listed, unknown = model.regime(model.normalised_columns(steps))
+        if not listed.all():
+            unlisted_mode[steps.k[~listed] + 1] = True
+            steps, unknown = steps.take(listed), unknown[listed]
         arrival = steps.k + 1
         flags, lower = np.full((count, n), np.nan), np.full((count, n), np.nan)
         upper, utilisation = np.full((count, n), np.nan), np.full((count, n), np.nan)
         judged, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        x, u = point.normalise_x(steps.x), point.normalise_u(steps.u)
-        x_next = point.normalise_x(steps.x_next)
-        flags[arrival], low, high, utilisation[arrival] = self._judge_all(x, u, steps.dt, x_next)
+        z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
+        flags[arrival], low, high, utilisation[arrival] = self._judge_all(z, steps.dt, x_next)
         lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
         judged[arrival] = True
-        outside[arrival] = model.domain.outside(x, u)
+        unknown_regime = np.zeros(count, dtype=bool)
+        unknown_regime[arrival] = unknown
+        outside[arrival] = unknown | model.domain.outside(z[:n].T, z[n : n + model.m].T)
         violated = ((flags == 1.0) & self._counted).any(axis=1)
         alarm = np.zeros(count, dtype=bool)
         resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
@@ -465,11 +499,16 @@ class EnvelopeMonitor:
             after = raised(violated[start:stop][judged[start:stop]], self.rule)
             held = np.concatenate([[False], after])  # without a verdict the last one stands
             alarm[start:stop] = held[np.cumsum(judged[start:stop])]
-        return Verdicts(transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step)
+        return Verdicts(
+            transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
+            unknown_regime,
+        )  # fmt: skip
 
-    def _judge_all(self, x: Array, u: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array]:
-        """flags, lower, upper (normalised), utilisation of transitions (K, n), (K, m), (K,), (K, n)."""
-        centre, half = self.model.centre_and_half(x, u, dt)
+    def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array]:
+        """flags, lower, upper (normalised), utilisation of transitions [x; u; s] (n + m + q, K), (K,), (K, n)."""
+        columns = np.empty((self.model.n, len(dt))), np.empty((self.model.n, len(dt)))
+        self.model.columns_centre_and_half(z, dt, *columns)
+        centre, half = (a.T for a in columns)
         lower, upper = lower_of(centre, half, self.rule.margin), upper_of(centre, half, self.rule.margin)
         flags = np.where(contained(lower, x_next, upper), 0.0, 1.0)
         return flags, np.asarray(lower), np.asarray(upper), np.asarray(utilisation_of(x_next - centre, half))

@@ -193,7 +193,12 @@ class Journal:
         since = session.sampler.counters - self._counters
         if signals := session.lacking(self._counters):
             found.append(f"{', '.join(signals)} missing, stale or not finite")
-        for status, name in ((Status.GAP, "gaps"), (Status.RESET, "resets"), (Status.STEP, Status.STEP.value)):
+        for status, name in (
+            (Status.GAP, "gaps"),
+            (Status.RESET, "resets"),
+            (Status.STEP, Status.STEP.value),
+            (Status.MODE, Status.MODE.value),
+        ):
             if since[name]:
                 found.append(WHY[status])
         dropped = [status.value for status in Status if status.dropped and since[status.value]]

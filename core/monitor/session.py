@@ -142,6 +142,8 @@ class Period:
     began: float
     verdicts: int = 0
     outside: int = 0
+    unknown: int = 0
+    last_unknown: Verdict | None = None
     alarm: bool = False
     violations: Counter[int] = field(default_factory=Counter)
     statuses: Counter[Status] = field(default_factory=Counter)
@@ -499,8 +501,8 @@ class Session:
         period = self.period
         if verdict.status is not Status.OK:  # looking up one of these is slow
             period.statuses[verdict.status] += 1
-            if verdict.status is Status.STEP:  # the sampler does not know the model's range
-                self.sampler.counters[Status.STEP.value] += 1
+            if verdict.status in (Status.STEP, Status.MODE):  # the sampler does not know the model
+                self.sampler.counters[verdict.status.value] += 1
         alarm = self.alarm
         self.alarms += alarm and not alarm_before
         period.alarm |= alarm
@@ -510,6 +512,9 @@ class Session:
         self.verdicts += 1
         period.verdicts += 1
         period.outside += verdict.outside_domain
+        if verdict.unknown_regime:
+            period.unknown += 1
+            period.last_unknown = verdict
         if verdict.violated:
             for i, flag in enumerate(verdict.numbers("flags")):
                 if flag == 1.0:
@@ -648,9 +653,12 @@ class Session:
     ) -> Report:
         never = [topic for topic in self.types if topic not in self._heard]
         complaints, calm = list(problems), list[str]()
-        if period.outside:
-            complaints.append(f"outside the fitted domain in {period.outside} of {period.verdicts} verdicts")
-        for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP):
+        if period.last_unknown is not None:
+            why = self.model.why_unknown(period.last_unknown.before)
+            complaints.append(f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}")
+        if outside := period.outside - period.unknown:
+            complaints.append(f"outside the fitted domain in {outside} of {period.verdicts} verdicts")
+        for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE):
             if period.statuses[status]:
                 which = ""
                 if status is Status.MISSING:
@@ -808,5 +816,6 @@ WHY = {
     Status.GAP: "the step is longer than max_gap",
     Status.RESET: "time stepped back",
     Status.MISSING: "a signal is missing, stale or not finite",
+    Status.MODE: "the scheduling signal has a value that the model does not list",
     Status.STEP: "the step is shorter or longer than those that the model was fitted to",
 }

@@ -45,7 +45,8 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     """
     transient = verdicts.transient
     t = transient.t_ns
-    judged, odd = int(verdicts.judged.sum()), int(verdicts.unfitted_step.sum())
+    judged = int(verdicts.judged.sum())
+    odd = [(int(verdicts.unfitted_step.sum()), Status.STEP), (int(verdicts.unlisted_mode.sum()), Status.MODE)]
     width = np.where(verdicts.judged[:, None], verdicts.upper - verdicts.lower, np.nan)
     states = {}
     for i, name in enumerate(model.state_names):
@@ -69,10 +70,11 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "recording": transient.name,
         "samples": len(transient),
         "verdicts": judged,
-        "no_verdict": [*unused(transient), *([f"{odd} {Status.STEP.value}"] if odd else [])],
+        "no_verdict": [*unused(transient), *(f"{count} {kind.value}" for count, kind in odd if count)],
         "violated": int(verdicts.violated.sum()),
         "inside": None if not judged else 1.0 - int(verdicts.violated.sum()) / judged,
         "outside_domain": int(verdicts.outside_domain.sum()),
+        "unknown_regime": int(verdicts.unknown_regime.sum()),
         "states": states,
         "alarm": bool(alarms),
         "alarms": [{**_instant(transient, start), **_length(t, (start, stop))} for start, stop in alarms],

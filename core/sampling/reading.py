@@ -117,10 +117,12 @@ def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None)
     if samples is None:
         samples = sample_by_message(stream, signals, progress)
     assert signals.max_gap is not None
+    m = len(signals.controls)
     return Transient(
         samples.t_ns,
         samples.x,
-        samples.u,
+        samples.held[:, :m],
+        s=samples.held[:, m:],
         name=os.fspath(stream.bag.path),
         signals=signals,
         max_gap=signals.max_gap,
@@ -158,8 +160,8 @@ def sample_by_message(stream: Stream, signals: SignalMap, progress: Progress | N
     rows = [iter(v.tolist()) for v in stream.values]
     t: list[int] = []
     x: list[NDArray[np.float64]] = []
-    u: list[NDArray[np.float64]] = []
-    m = len(signals.controls)
+    held: list[NDArray[np.float64]] = []
+    unknown = np.full(len(signals.held), math.nan)
     messages: Iterable[Any] = zip(stream.topic.tolist(), stream.arrival.tolist(), stream.stamp.tolist(), strict=True)
     if progress is not None:
         messages = progress(messages, len(stream.topic))
@@ -167,15 +169,15 @@ def sample_by_message(stream: Stream, signals: SignalMap, progress: Progress | N
         for step in sampler.push(topics[position], arrival, stamp if stamp >= 0 else None, next(rows[position])):
             if step.status.dropped:
                 continue
-            if u:
-                u[-1] = step.u  # fixed only now that the next sample has arrived
+            if held:
+                held[-1] = step.u  # fixed only now that the next sample has arrived
             t.append(step.t_ns)
             x.append(step.x_next)
-            u.append(np.full(m, math.nan))
+            held.append(unknown)
     return Samples(
         np.array(t, dtype=np.int64),
         np.array(x).reshape(len(t), len(signals.states)),
-        np.array(u).reshape(len(t), m),
+        np.array(held).reshape(len(t), len(unknown)),
         sampler.counters,
     )
 
@@ -434,27 +436,15 @@ def _types(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]:
 def _resolve_operating_point(signals: SignalMap, transients: Sequence[Transient]) -> tuple[SignalMap, str]:
     recordings = []
     for t in transients:
-        rows = np.hstack([t.x, t.u])[:-1]  # the last row has no control yet
+        rows = np.hstack([t.x, t.u, t.s])[:-1]  # the last row has no control yet
         recordings += np.split(rows, np.flatnonzero(np.diff(t.segment[:-1])) + 1)  # nobody knows what was in a gap
     steady, scale, words = resolve_auto(signals.signals, recordings)
     filled = [replace(s, steady=a, scale=b) for s, a, b in zip(signals.signals, steady, scale, strict=True)]
-    n = len(signals.states)
-    return replace(signals, states=tuple(filled[:n]), controls=tuple(filled[n:])), words
+    return signals.replace_signals(filled), words
 
 
 def _with_signals(transient: Transient, signals: SignalMap, note: str | None) -> Transient:
-    return Transient(
-        transient.t_ns,
-        transient.x,
-        transient.u,
-        name=transient.name,
-        signals=signals,
-        max_gap=transient.max_gap,
-        min_step=transient.min_step,
-        counters=transient.counters,
-        sources=transient.sources,
-        notes=(*transient.notes, *([note] if note else [])),
-    )
+    return transient.replace(signals=signals, notes=(*transient.notes, *([note] if note else [])))
 
 
 def unused(transient: Transient) -> list[str]:

@@ -50,8 +50,8 @@ class Step:
         Arrival of the message, ns.
     dt : float
         Δt_k, s.
-    before : sequence of float (n + m,)
-        x and u of sample k.
+    before : sequence of float (n + m + q,)
+        x, u and the further scheduling signals s of sample k.
     after : sequence of float (n,)
         x of sample k+1.
     """
@@ -71,7 +71,7 @@ class Step:
 
     @property
     def u(self) -> NDArray[np.float64]:
-        """Controls at t_k (m,)."""
+        """Controls at t_k, and after them the further scheduling signals (m + q,)."""
         return np.array(self.before[len(self.after) :], dtype=np.float64)
 
     @property
@@ -329,7 +329,7 @@ class Sampler:
         skew_ns = self.max_gap_ns if signals.max_skew is None else to_ns(signals.max_skew)
         n = self._n = len(signals.states)
         max_age = [skew_ns] * n
-        max_age += [LONGEST_NS if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls]
+        max_age += [LONGEST_NS if c.max_hold is None else to_ns(c.max_hold) for c in signals.held]
         self._topics = {topic: _Topic(signals, topic, max_age) for topic in signals.topics}
         self._clock = self._topics[signals.clock]
         self._others = [topic for topic in self._topics.values() if topic is not self._clock]
@@ -522,7 +522,7 @@ class Sampler:
         Returns
         -------
         (int, list of float) or None
-            Its instant, ns, and [x; u] (n + m); None before the first sample.
+            Its instant, ns, and [x; u; s] (n + m + q); None before the first sample.
         """
         if self._open is None:
             return None

@@ -41,15 +41,16 @@ class Samples:
         Instants, ns.
     x : array (N, n)
         States; NaN for what is missing.
-    u : array (N, m)
-        Controls; u[k] acts from t[k] on, and is NaN where nothing follows that it leads to.
+    held : array (N, m + q)
+        Controls, then further scheduling signals; those of sample k act from t[k] on, and are NaN where nothing
+        follows that they lead to.
     counters : Counter
         Those of the `Sampler`.
     """
 
     t_ns: Integers
     x: Values
-    u: Values
+    held: Values
     counters: Counters
 
 
@@ -172,7 +173,7 @@ class _Sampling:
         self.n = len(signals.states)
         self.max_gap, self.min_step = to_ns(signals.max_gap), to_ns(signals.min_step)
         skew = self.max_gap if signals.max_skew is None else to_ns(signals.max_skew)
-        self.max_age = [skew] * self.n + [_FAR if c.max_hold is None else to_ns(c.max_hold) for c in signals.controls]
+        self.max_age = [skew] * self.n + [_FAR if c.max_hold is None else to_ns(c.max_hold) for c in signals.held]
         self.counters: Counters = Counters()
         self.topics: dict[str, _Messages] = {}
         for position, name in enumerate(signals.topics):
@@ -298,7 +299,7 @@ class _Sampling:
                 z[:, position] = np.where(source >= segment_begin, z[np.maximum(source, 0), position], math.nan)
 
     def _samples(self, instants: Integers, z: Values, own: Values, opens: Mask, back: Mask) -> Samples:
-        clock, m = self.signals.clock, len(self.signals.controls)
+        clock, m = self.signals.clock, len(self.signals.held)
         finite: Mask = np.asarray(np.isfinite(z).all(axis=1))
         if all(s.topic == clock for s in self.signals.states):  # decided when the sample opens
             count = len(instants)
@@ -311,10 +312,10 @@ class _Sampling:
             x = z[:, : self.n].copy()
         judged = ~opens[1:count]
         self._count("missing", judged & ~(finite[: count - 1] & np.isfinite(x[1:]).all(axis=1)))
-        u = np.full((count, m), math.nan)
-        u[:-1] = z[: max(count - 1, 0), self.n :]
-        u[:-1][back[1:count]] = math.nan
-        return Samples(instants[:count].copy(), x, u, self.counters)
+        held = np.full((count, m), math.nan)
+        held[:-1] = z[: max(count - 1, 0), self.n :]
+        held[:-1][back[1:count]] = math.nan
+        return Samples(instants[:count].copy(), x, held, self.counters)
 
 
 def _latest(time: Integers, at: Integers, arrived: Integers) -> Integers:

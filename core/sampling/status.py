@@ -14,6 +14,7 @@ class Status(StrEnum):
     GAP = "gap"  # the step is longer than max_gap: first sample of a new segment
     MISSING = "missing"  # a signal at either end is missing, stale, NaN or infinite
     STEP = "step out of range"  # the step is shorter or longer than those that the model was fitted to
+    MODE = "mode not in the model"  # the scheduling signal has a value that the model does not list
     EQUAL = "equal stamp"  # dropped: the instant of the sample before
     SHORT = "short step"  # dropped: less than min_step after the sample before
     LATE = "late"  # dropped: at most max_gap before the sample before

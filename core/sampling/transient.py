@@ -40,6 +40,8 @@ class Transitions:
         Controls at t_k.
     x_next : array (N, n)
         States at t_{k+1}.
+    s : array (N, q)
+        Further scheduling signals at t_k.
     """
 
     k: NDArray[np.intp]
@@ -47,6 +49,7 @@ class Transitions:
     x: Array
     u: Array
     x_next: Array
+    s: Array
 
     def take(self, which: NDArray[np.bool_]) -> Transitions:
         """Some of them.
@@ -61,7 +64,9 @@ class Transitions:
         Transitions
             In the same order.
         """
-        return Transitions(self.k[which], self.dt[which], self.x[which], self.u[which], self.x_next[which])
+        return Transitions(
+            self.k[which], self.dt[which], self.x[which], self.u[which], self.x_next[which], self.s[which]
+        )
 
     @property
     def consecutive(self) -> bool:
@@ -80,6 +85,9 @@ class Transient:
         States in recorded units; NaN where a sample has none.
     u : array (N+1, m)
         Controls in recorded units, u[k] acting from t[k] to t[k+1]; the last row is never used.
+    s : array (N+1, q), optional
+        Further scheduling signals in recorded units, which are neither state nor control; s[k] is known at t[k], and
+        the last row is never used. Default none.
     name : str, default "transient"
         What messages call this run (the bag or file).
     signals : SignalMap, optional
@@ -88,6 +96,8 @@ class Transient:
         Names where there is no SignalMap; default x1, x2, ...
     control_names : sequence of str, optional
         Names where there is no SignalMap; default u1, u2, ...
+    scheduling_names : sequence of str, optional
+        Names where there is no SignalMap; default s1, s2, ...
     max_gap : float, optional
         A step longer than this, s, starts a new segment. Default 2.5 x the median step; math.inf for no limit.
     min_step : float, default 0.0
@@ -108,6 +118,7 @@ class Transient:
     t_ns: NDArray[np.int64]
     x: Array
     u: Array
+    s: Array
     segment: NDArray[np.int32]
     counters: Counters
 
@@ -117,10 +128,12 @@ class Transient:
         x: ArrayLike,
         u: ArrayLike,
         *,
+        s: ArrayLike | None = None,
         name: str = "transient",
         signals: SignalMap | None = None,
         state_names: Sequence[str] | None = None,
         control_names: Sequence[str] | None = None,
+        scheduling_names: Sequence[str] | None = None,
         max_gap: float | None = None,
         min_step: float = 0.0,
         counters: Mapping[str, int] | None = None,
@@ -132,10 +145,12 @@ class Transient:
         t_ns = _nanoseconds(t, name, recorded=signals is not None)
         self.x = _matrix(x, len(t_ns), "x", name)
         self.u = _matrix(u, len(t_ns), "u", name)
+        self.s = np.empty((len(t_ns), 0)) if s is None else _matrix(s, len(t_ns), "s", name)
         if self.x.shape[1] == 0:
             raise TransientError(f"{name}: x has no column; give at least one state")
         self.state_names = _names(state_names, signals.states if signals else None, "x", self.x, name)
         self.control_names = _names(control_names, signals.controls if signals else None, "u", self.u, name)
+        self.scheduling_names = _names(scheduling_names, signals.scheduling if signals else None, "s", self.s, name)
         self.counters = Counters(counters or {})
         self.sources = tuple(os.fspath(s) for s in sources)
         self.notes = tuple(notes)
@@ -153,9 +168,42 @@ class Transient:
         kept, self.segment = _segments(t_ns, to_ns(self.max_gap), min_step_ns, self.counters)
         self.t_ns = t_ns
         if len(kept) < len(t_ns):
-            self.t_ns, self.x, self.u = t_ns[kept], self.x[kept], self.u[kept]
-        for array in (self.t_ns, self.x, self.u, self.segment):
+            self.t_ns, self.x, self.u, self.s = t_ns[kept], self.x[kept], self.u[kept], self.s[kept]
+        for array in (self.t_ns, self.x, self.u, self.s, self.segment):
             array.flags.writeable = False
+
+    def replace(self, part: slice = slice(None), **changes: Any) -> Transient:
+        """The same run, or a part of it, with some constructor arguments replaced.
+
+        Parameters
+        ----------
+        part : slice, optional
+            Samples; a part has neither counters nor notes of its own. Default all.
+        **changes : object
+            Constructor arguments by name.
+
+        Returns
+        -------
+        Transient
+            A new transient.
+        """
+        arguments: dict[str, Any] = {
+            "s": self.s[part],
+            **{
+                name: getattr(self, name)
+                for name in (
+                    "name", "signals", "state_names", "control_names", "scheduling_names", "max_gap", "min_step",
+                    "sources",
+                )
+            },
+        }  # fmt: skip
+        if part == slice(None):
+            arguments |= {"counters": self.counters, "notes": self.notes}
+        arguments |= changes
+        if changes.get("signals") is not None:  # it has the names
+            for which in ("state_names", "control_names", "scheduling_names"):
+                arguments[which] = changes.get(which)
+        return Transient(self.t_ns[part], self.x[part], self.u[part], **arguments)
 
     @property
     def t(self) -> Array:
@@ -173,10 +221,10 @@ class Transient:
         if len(self.t_ns) < 2:
             return np.zeros(0, dtype=bool)
         same = self.segment[1:] == self.segment[:-1]
-        if np.isfinite(self.x).all() and np.isfinite(self.u).all():  # the usual case, in a fraction of the time
+        if all(np.isfinite(a).all() for a in (self.x, self.u, self.s)):  # the usual case, in a fraction of the time
             return np.asarray(same)
         finite_x = np.asarray(np.isfinite(self.x).all(axis=1))
-        finite_u = np.asarray(np.isfinite(self.u).all(axis=1))
+        finite_u = np.asarray(np.isfinite(self.u).all(axis=1)) & np.isfinite(self.s).all(axis=1)
         usable: NDArray[np.bool_] = same & finite_x[:-1] & finite_u[:-1] & finite_x[1:]
         return usable
 
@@ -191,9 +239,9 @@ class Transient:
         usable = self.usable
         if usable.all():  # the usual clean case: views, no copies
             k = np.arange(len(usable))
-            return Transitions(k, self.dt, self.x[:-1], self.u[:-1], self.x[1:])
+            return Transitions(k, self.dt, self.x[:-1], self.u[:-1], self.x[1:], self.s[:-1])
         k = np.flatnonzero(usable)
-        return Transitions(k, self.dt[k], self.x[k], self.u[k], self.x[k + 1])
+        return Transitions(k, self.dt[k], self.x[k], self.u[k], self.x[k + 1], self.s[k])
 
     def statuses(self) -> list[Status]:
         """What the `Sampler` says of each sample, (N+1,).
@@ -231,9 +279,10 @@ class Transient:
         """Range, largest step and missing samples of each signal."""
         rows = []
         units = [s.unit for s in self.signals.signals] if self.signals else [""] * 10**4
-        names = [*self.state_names, *self.control_names]
-        kinds = ["state"] * len(self.state_names) + ["control"] * len(self.control_names)
-        columns = [*self.x.T, *self.u[:-1].T]
+        groups = {"state": self.state_names, "control": self.control_names, "scheduling": self.scheduling_names}
+        names = [name for group in groups.values() for name in group]
+        kinds = [kind for kind, group in groups.items() for _ in group]
+        columns = [*self.x.T, *self.u[:-1].T, *self.s[:-1].T]
         for name, kind, unit, values in zip(names, kinds, units, columns, strict=False):
             finite = values[np.isfinite(values)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (math.nan, math.nan)

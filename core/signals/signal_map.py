@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -63,6 +63,25 @@ class Signal:
     delay: int = 0
 
 
+@dataclass(frozen=True)
+class ScheduleRule:
+    """What a signals file says of one scheduling signal.
+
+    Parameters
+    ----------
+    signal : str
+        A state, a control or a further scheduling signal.
+    knots : "auto", int, tuple of float or None, optional
+        Chosen by what is left out, a number of knots, or knots in recorded units; None for modes.
+    modes : tuple of float, optional
+        Values of a discrete signal, in recorded units.
+    """
+
+    signal: str
+    knots: Literal["auto"] | int | tuple[float, ...] | None = None
+    modes: tuple[float, ...] = ()
+
+
 class UncarriedTopicError(SignalError):
     """A signals file names a topic that carries no signal.
 
@@ -89,6 +108,8 @@ class SignalMap:
         States, in the order of x; at least one.
     controls : tuple of Signal, optional
         Controls, in the order of u.
+    scheduling : tuple of Signal, optional
+        Further signals that are neither state nor control, and schedule the model.
     clock : str or None, optional
         Topic whose messages define the sample instants; None for the slowest state topic.
     max_gap : float or None, optional
@@ -102,6 +123,8 @@ class SignalMap:
         most of its messages carry a stamp.
     additive : {"none", "disturbance", "noise", "both"} or None, optional
         The additive term of a fit that is given none.
+    schedule : tuple of ScheduleRule, optional
+        How a fit that is given no schedule is scheduled; empty for one block.
     structure : object, optional
         The rules on single elements that a fit keeps (`identification.structure`); None for no rule.
     table : TableLayout or None, optional
@@ -117,12 +140,14 @@ class SignalMap:
 
     states: tuple[Signal, ...]
     controls: tuple[Signal, ...] = ()
+    scheduling: tuple[Signal, ...] = ()
     clock: str | None = None
     max_gap: float | None = None
     min_step: float = 0.0
     max_skew: float | None = None
     time: Mapping[str, TimeSource] = field(default_factory=dict)
     additive: Additive | None = None
+    schedule: tuple[ScheduleRule, ...] = ()
     structure: Any = None
     table: TableLayout | None = None
     source: str = "signals"
@@ -131,10 +156,10 @@ class SignalMap:
         if not self.states:
             raise SignalError(f"{self.source}: 'states' is empty; list at least one state")
         seen: set[str] = set()
-        for signal in (*self.states, *self.controls):
+        for signal in self.signals:
             where = f"{self.source}: signal '{signal.name}'"
             if signal.name in seen:
-                raise SignalError(f"{where} is listed twice; give each state and control its own name")
+                raise SignalError(f"{where} is listed twice; give each signal its own name")
             seen.add(signal.name)
             try:
                 FieldPath(signal.field)
@@ -164,6 +189,15 @@ class SignalMap:
                     f"{self.source}: state '{signal.name}' has max_hold or delay; both are for controls "
                     f"(the age of a state is limited by max_skew)"
                 )
+        for signal in self.scheduling:
+            if signal.delay:
+                raise SignalError(f"{self.source}: scheduling signal '{signal.name}' has a delay; that is for controls")
+        for rule in self.schedule:
+            if rule.signal not in seen:
+                raise SignalError(
+                    f"{self.source}: schedule: '{rule.signal}' is no state, control or scheduling signal; there are "
+                    f"{', '.join(s.name for s in self.signals)}"
+                )
         if self.clock is not None and self.clock not in {s.topic for s in self.states}:
             raise UncarriedTopicError(
                 f"{self.source}: clock is {self.clock}, which carries no state; choose one of "
@@ -189,19 +223,45 @@ class SignalMap:
             )
 
     def __len__(self) -> int:
-        return len(self.states) + len(self.controls)
+        return len(self.signals)
 
     def __iter__(self) -> Iterator[Signal]:
         return iter(self.signals)
 
     def __getitem__(self, position: int) -> Signal:
-        """Signal at a position of [x; u]."""
+        """Signal at a position of [x; u; s]."""
         return self.signals[position]
 
     @property
     def signals(self) -> tuple[Signal, ...]:
-        """States, then controls, in the order of z = [x; u]."""
-        return self.states + self.controls
+        """States, controls, then further scheduling signals: the order of z = [x; u; s]."""
+        return self.states + self.controls + self.scheduling
+
+    @property
+    def held(self) -> tuple[Signal, ...]:
+        """Signals whose last value holds until the next: controls, then further scheduling signals."""
+        return self.controls + self.scheduling
+
+    def replace_signals(self, signals: Sequence[Signal]) -> SignalMap:
+        """The same map with other signals in the place of these.
+
+        Parameters
+        ----------
+        signals : sequence of Signal
+            As many as `signals`, in that order.
+
+        Returns
+        -------
+        SignalMap
+            A new map.
+        """
+        n, m = len(self.states), len(self.controls)
+        return replace(
+            self,
+            states=tuple(signals[:n]),
+            controls=tuple(signals[n : n + m]),
+            scheduling=tuple(signals[n + m :]),
+        )
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -256,11 +316,7 @@ class SignalMap:
         SignalMap
             A new map.
         """
-        return replace(
-            self,
-            states=tuple(replace(s, type=types.get(s.topic, s.type)) for s in self.states),
-            controls=tuple(replace(s, type=types.get(s.topic, s.type)) for s in self.controls),
-        )
+        return self.replace_signals([replace(s, type=types.get(s.topic, s.type)) for s in self.signals])
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SignalMap:
@@ -315,11 +371,13 @@ class SignalMap:
                 "min_step",
                 "max_skew",
                 "additive",
+                "schedule",
                 "structure",
                 "table",
                 "topics",
                 "states",
                 "controls",
+                "scheduling",
             },
         )
         time: dict[str, TimeSource] = {}
@@ -339,16 +397,50 @@ class SignalMap:
         return cls(
             states=_signals(top.get("states"), f"{source}: states", need_topics),
             controls=_signals(top.get("controls"), f"{source}: controls", need_topics),
+            scheduling=_signals(top.get("scheduling"), f"{source}: scheduling", need_topics),
             clock=clock,
             max_gap=checked_number(top.get("max_gap"), f"{source}: max_gap"),
             min_step=checked_number(top.get("min_step"), f"{source}: min_step") or 0.0,
             max_skew=checked_number(top.get("max_skew"), f"{source}: max_skew"),
             time=time,
             additive=additive,
+            schedule=_schedule(top.get("schedule"), f"{source}: schedule"),
             structure=top.get("structure"),
             table=TableLayout.from_dict(top["table"], f"{source}: table") if top.get("table") is not None else None,
             source=source,
         )
+
+
+def _schedule(data: Any, where: str) -> tuple[ScheduleRule, ...]:
+    if data is None:
+        return ()
+    if not isinstance(data, list):
+        raise SignalError(f"{where}: a list is wanted here, not {kind_in_yaml(data)}; see config/signals/")
+    rules = []
+    for position, entry in enumerate(data):
+        here = f"{where}[{position}]"
+        entry = checked_mapping(entry, here, {"signal", "knots", "modes"})
+        if not isinstance(entry.get("signal"), str):
+            raise SignalError(f"{here}: 'signal' is {reprlib.repr(entry.get('signal'))}; write the name of a signal")
+        knots, modes = entry.get("knots"), entry.get("modes")
+        if (knots is None) == (modes is None):
+            raise SignalError(f"{here}: write knots (auto, a number, or a list) or modes (a list), one of the two")
+        if knots is not None and knots != "auto" and not isinstance(knots, list):
+            if isinstance(knots, bool) or not isinstance(knots, int) or knots < 1:
+                raise SignalError(f"{here}: knots is {reprlib.repr(knots)}; write auto, a number, or a list of knots")
+            rules.append(ScheduleRule(entry["signal"], knots))
+        elif knots == "auto":
+            rules.append(ScheduleRule(entry["signal"], "auto"))
+        else:
+            which, values = ("knots", knots) if modes is None else ("modes", modes)
+            if not isinstance(values, list) or not values:
+                raise SignalError(f"{here}: {which} is {reprlib.repr(values)}; write a list of numbers")
+            numbers = [checked_number(v, f"{here}: {which}[{i}]") for i, v in enumerate(values)]
+            if None in numbers:
+                raise SignalError(f"{here}: {which} has an empty entry; write a number")
+            listed = tuple(v for v in numbers if v is not None)
+            rules.append(ScheduleRule(entry["signal"], *((listed,) if modes is None else (None, listed))))
+    return tuple(rules)
 
 
 def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:

@@ -33,19 +33,7 @@ def cut(transient: Transient, start: int, stop: int) -> Transient:
     Transient
         Without counters and notes.
     """
-    part = slice(start, stop)
-    return Transient(
-        transient.t_ns[part],
-        transient.x[part],
-        transient.u[part],
-        name=transient.name,
-        signals=transient.signals,
-        state_names=transient.state_names,
-        control_names=transient.control_names,
-        max_gap=transient.max_gap,
-        min_step=transient.min_step,
-        sources=transient.sources,
-    )
+    return transient.replace(slice(start, stop))
 
 
 def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
@@ -93,7 +81,7 @@ def guard_interval(model: UncertainLTI, cuts: Sequence[tuple[Transient, int, int
     float
         Time on each side of a block that is not fitted, s.
     """
-    stable = [-v.real for v in model.eigenvalues() if v.real < 0]
+    stable = [-v.real for v in model.eigenvalues().ravel() if v.real < 0]
     shortest = min(float(t.t[stop - 1] - t.t[start]) for t, start, stop in cuts)
     return min(3.0 / min(stable) if stable else math.inf, 0.5 * shortest)
 

@@ -151,7 +151,9 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
     steps = steps.take(judged[steps.k + 1])
     width = (verdicts.upper - verdicts.lower)[judged]
     point = full.operating_point
-    low, high = full.bounds(point.normalise_x(steps.x), point.normalise_u(steps.u), steps.dt)
+    low, high = full.bounds(
+        point.normalise_x(steps.x), point.normalise_u(steps.u), steps.dt, s=point.normalise_s(steps.s)
+    )
     whole = (high - low) * point.X
     flags = verdicts.flags[judged] == 1.0
     resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
