@@ -34,7 +34,7 @@ def columns(signals: SignalMap, messages: Sequence[Sent]) -> dict[str, Any]:
 
 
 def plain(samples: Samples) -> tuple[object, ...]:
-    arrays = (samples.t_ns, samples.x, samples.u)
+    arrays = (samples.t_ns, samples.x, samples.held)
     return *((a.dtype, a.shape, a.tobytes()) for a in arrays), dict(samples.counters)
 
 

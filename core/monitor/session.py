@@ -123,6 +123,10 @@ class Period:
         Verdicts given in it.
     outside : int, default 0
         Those from outside the fitted domain.
+    unknown : int, default 0
+        Those of a regime that was not fitted.
+    last_unknown : Verdict or None, optional
+        The last of these.
     alarm : bool, default False
         The alarm was raised at some time in it.
     violations : Counter of int
