@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,11 +17,13 @@ from uncertain_lti.identification.cluster import DaskFleet
 from uncertain_lti.identification.diagnosis import too_few
 from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import Columns, Problem, assemble, is_constant
+from uncertain_lti.identification.problem import Columns, Problem, Regimes, assemble, is_constant
+from uncertain_lti.identification.regimes import Knots, scheduled_by
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.sampling.reading import load_signals, sample, time_source
@@ -65,6 +67,7 @@ def fit_archive(
     criterion: str = "qp",
     additive: Additive | None = None,
     *,
+    schedule: Schedule | Mapping[str, Knots] | None = None,
     cache: str | os.PathLike[str] | None = None,
     client: Any = None,
     alarm_rule: AlarmRule | None = None,
@@ -82,6 +85,8 @@ def fit_archive(
         As for `fit`.
     additive : {"none", "disturbance", "noise", "both"}, optional
         As for `fit`.
+    schedule : Schedule or mapping, optional
+        As for `fit`, but that knots must be given, not how many.
     cache : path, optional
         Folder for the arrays, written while the bags are read; passes then read it block by block.
     client : distributed.Client, optional
@@ -136,15 +141,17 @@ def fit_archive(
 
     signals = _resolve(visit("looking at", survey, signals), signals, recordings)
     additive = additive or signals.additive or "none"
+    scheduled = scheduled_by(schedule, signals)
+    regimes = None if scheduled is None else Regimes.of(scheduled, signals)
     structure = None
     if signals.structure:
         names = ([s.name for s in signals.states], [s.name for s in signals.controls])
-        structure = Structure.from_rules(signals.structure, *names, f"{signals.source}: structure")
+        structure = Structure.from_rules(signals.structure, *names, f"{signals.source}: structure", scheduled)
     fleet: Fleet
     if client is not None:
         # whether Δt is constant decides what is identifiable, and must be one answer for all partitions
         constant = additive == "both" and all(visit("steps of", _constant_dt, signals))
-        columns = Columns.of(additive, constant)
+        columns = Columns.of(additive, constant, regimes)
         tasks = [(load, (recording, signals, columns)) for recording in recordings]
         fleet = DaskFleet(client, tasks, counting("reading"))
         counts, dt = fleet.counts, None
@@ -154,13 +161,13 @@ def fit_archive(
         with CacheWriter(cache) as writer:
             for number, recording in enumerate(recordings, start=1):
                 counting(f"reading {recording[0]}")(number)
-                problem = load(recording, signals, Columns())
+                problem = load(recording, signals, Columns(regimes=regimes))
                 counts.append(problem.N)
                 steps.append(problem.dt)
                 if problem.N:
                     writer.add(problem)
         dt = np.concatenate(steps)
-        columns = Columns.of(additive, is_constant(dt))
+        columns = Columns.of(additive, is_constant(dt), regimes)
         fleet = Fleet([writer.partition(np.ones(len(signals.states)), columns)])
     _check(fleet, signals)
     try:
@@ -265,8 +272,8 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     transient = sample(
         read_stream(open_recording(recording[0], recording[1], indexed=True, layout=signals.table), signals), signals
     )
-    point = OperatingPoint.of(signals.states, signals.controls)
-    return replace(assemble([transient], point, None, "none", empty=True), columns=columns)
+    point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
+    return replace(assemble([transient], point, None, "none", empty=True, regimes=columns.regimes), columns=columns)
 
 
 def _constant_dt(recording: Recording, signals: SignalMap) -> bool:

@@ -22,7 +22,7 @@ _DATA, _FACTS = "transitions.f64", "facts.json"
 
 @dataclass(frozen=True)
 class DiskPartition:
-    """A `Partition` in a folder: blocks of [z; x_next; Δt] as float64, read again by every pass.
+    """A `Partition` in a folder: blocks of [z; s; x_next; Δt] as float64, read again by every pass.
 
     Only one block is in memory at a time.
 
@@ -40,6 +40,8 @@ class DiskPartition:
         Constant in time.
     columns : Columns
         Terms that are unknown.
+    q : int, default 0
+        Number of further scheduling signals.
     """
 
     folder: Path
@@ -48,6 +50,7 @@ class DiskPartition:
     p: int
     weights: Array
     columns: Columns
+    q: int = 0
 
     @property
     def N(self) -> int:
@@ -67,7 +70,8 @@ class DiskPartition:
         FitError
             The file is shorter than its facts say.
         """
-        lines = self.p + self.n + 1
+        first = self.p + self.q
+        lines = first + self.n + 1
         with open(self.folder / _DATA, "rb", buffering=0) as stream:
             for start in range(0, self.count, BLOCK):
                 size = min(BLOCK, self.count - start)
@@ -75,7 +79,8 @@ class DiskPartition:
                 if len(data) < lines * size:
                     raise FitError(f"{self.folder}: the cache is cut short; delete the folder and fit again")
                 table = data.reshape(lines, size)
-                yield Block(start, table[: self.p], table[self.p : -1], table[-1], self.weights)
+                s = table[self.p : first] if self.q else None
+                yield Block(start, table[: self.p], table[first:-1], table[-1], self.weights, s)
 
     def with_columns(self, columns: Columns) -> DiskPartition:
         """The same transitions with other unknown terms.
@@ -114,7 +119,7 @@ class CacheWriter:
         self._pending: list[Array] = []
         self._waiting = 0
         self._count = 0
-        self._shape: tuple[int, int] | None = None
+        self._shape: tuple[int, int, int] | None = None
 
     def __enter__(self) -> CacheWriter:
         self._made = not self.folder.exists()
@@ -144,11 +149,12 @@ class CacheWriter:
         FitError
             Recordings differ in their numbers of signals, or the folder cannot be written.
         """
-        shape = (problem.n, problem.p)
+        further = [] if problem.s_columns is None else [problem.s_columns]
+        shape = (problem.n, problem.p, sum(map(len, further)))
         if self._shape not in (None, shape):
             raise FitError(f"{self.folder}: recordings differ in their numbers of signals")
         self._shape = shape
-        table = np.vstack([problem.z_columns, problem.next_columns, problem.dt])
+        table = np.vstack([problem.z_columns, *further, problem.next_columns, problem.dt])
         self._pending.append(table)
         self._waiting += table.shape[1]
         if self._waiting >= BLOCK:
@@ -174,8 +180,8 @@ class CacheWriter:
                 self._write(self._waiting)
             self._stream.close()
             if kind is None and self._shape is not None:
-                n, p = self._shape
-                facts = {"format": _FORMAT, "transitions": self._count, "n": n, "p": p}
+                n, p, q = self._shape
+                facts = {"format": _FORMAT, "transitions": self._count, "n": n, "p": p, "q": q}
                 with whole_file(self.folder / _FACTS) as stream:
                     stream.write(json.dumps(facts).encode())
             complete = kind is None
@@ -212,5 +218,5 @@ class CacheWriter:
         """
         if self._shape is None:
             raise FitError(f"{self.folder}: no usable transition was written")
-        n, p = self._shape
-        return DiskPartition(self.folder, self._count, n, p, weights, columns)
+        n, p, q = self._shape
+        return DiskPartition(self.folder, self._count, n, p, weights, columns, q)

@@ -10,12 +10,12 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import excitation, residuals, sensors
+from uncertain_lti.identification import excitation, regimes, residuals, sensors
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.excitation import quoted as _list
 from uncertain_lti.identification.noise import Memory, memory
 from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.problem import Columns, Problem
+from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 
@@ -175,13 +175,15 @@ def describe(
     """
     states = model.state_names
     names = [*states, *model.control_names]
+    scheduled, problem = problem, replace(problem, columns=replace(problem.columns, regimes=None))
+    all_sums, sums = sums, sums.one_block()
     found, messages = _rank(problem, sums, names)
     apart = not messages
+    messages += _tied(model, scheduled, all_sums)
     part = _stretches(problem)
-    alike = excitation.collinear(
-        problem, sums, names, 1e-12 * problem.p, residuals.lagged_states(model.signals.signals, model.n)
-    )
-    signals = model.signals.signals
+    signals = (*model.signals.states, *model.signals.controls)
+    lagged = residuals.lagged_states(signals, model.n)
+    alike = excitation.collinear(problem, sums, names, 1e-12 * problem.p, lagged)
 
     def place(some: Sequence[int]) -> str:
         return _where(problem, some, transients)
@@ -193,38 +195,79 @@ def describe(
     told, follow = _recordings(model, problem, part, sums, names, transients, place, bool(broken))
     messages += told
     messages += _noise_like(known, part, states, follow)
-    past = bool(residuals.lagged_states(model.signals.signals, model.n))  # A alone is then not the dynamics
+    past = bool(lagged)  # A alone is then not the dynamics
     slow = [] if past else _slow(model, known, apart and not alike, bool(follow))
     messages += slow
-    unstable = [v for v in model.eigenvalues() if v.real > 0]
-    if past:
-        pass
-    elif unstable:
-        values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
-        messages.append(
-            f"the nominal model is unstable (eigenvalues {values} 1/s): one-step bounds restart from the measured "
-            f"state and stay valid, a free run does not"
-        )
-    elif model.spectral_radius() > 1.0 + 1e-9:
-        messages.append(
-            f"the nominal recursion runs away at the recorded step (spectral radius {model.spectral_radius():.4g}): "
-            f"one-step bounds restart from the measured state and stay valid, a free run does not"
-        )
-    nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
-    wide = np.argwhere(half > np.abs(nominal))
-    if len(wide):
-        i, j = max(wide.tolist(), key=lambda ij: float(half[ij[0], ij[1]] - abs(nominal[ij[0], ij[1]])))
-        messages.append(
-            f"{len(wide)} of {nominal.size} half-widths exceed their nominal elements (most: {states[i]} from "
-            f"{names[j]}, {nominal[i, j]:.3g} ± {half[i, j]:.3g} 1/s): the sign of these effects is not known"
-        )
+    if not past:
+        messages += _unstable(model)
+    messages += _unsure(model, names)
     columns = problem.columns
     if not columns.noise and not columns.disturbance:
-        messages += _near_rest(problem, part, sums, mean_width, states)
+        messages += _near_rest(scheduled, _stretches(scheduled), all_sums, mean_width, states)
     messages += _wide(sums, mean_width, states, known, few, bool(slow) and SLOW in slow[0], follow)
     if columns.drift and columns.noise and not columns.disturbance:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return found, messages
+
+
+def _tied(model: UncertainLTI, problem: Problem, sums: Moments) -> list[str]:
+    """Blocks that share the elements of another, and what the blocks lack."""
+    columns = problem.columns
+    if columns.regimes is None:
+        return []
+    tied = [r if data.tied_to is None else data.tied_to for r, data in enumerate(model.block_data)]
+    messages = regimes.tied_words(columns.regimes.schedule, sums, columns, problem.p, tied, model.signals.signals)
+    if not columns.drift:
+        messages.append(
+            "the blocks have no drift c, which carries the steady state from knot to knot: --additive disturbance, or "
+            "both, gives them one"
+        )
+    return messages
+
+
+def _at(model: UncertainLTI, block: int) -> str:
+    """at the knot of a block; empty of a model with one."""
+    return f" at {regimes.place(model.schedule, block, model.signals.signals)}" if model.schedule is not None else ""
+
+
+def _few(words: Sequence[str]) -> str:
+    """The first of them, and how many more there are."""
+    return "; ".join(words[:3]) + (f"; and {len(words) - 3} more" if len(words) > 3 else "")
+
+
+def _unstable(model: UncertainLTI) -> list[str]:
+    """Whether the nominal model, of every block, stays bounded in a free run."""
+    growing, running = [], []
+    for r, block in enumerate(model.blocks):
+        unstable = [v for v in block.eigenvalues() if v.real > 0]
+        if unstable:
+            values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
+            growing.append(f"eigenvalues {values} 1/s{_at(model, r)}")
+        elif block.spectral_radius() > 1.0 + 1e-9:
+            running.append(f"spectral radius {block.spectral_radius():.4g}{_at(model, r)}")
+    stay = "one-step bounds restart from the measured state and stay valid, a free run does not"
+    if growing:
+        return [f"the nominal model is unstable ({_few(growing)}): {stay}"]
+    if running:
+        return [f"the nominal recursion runs away at the recorded step ({_few(running)}): {stay}"]
+    return []
+
+
+def _unsure(model: UncertainLTI, names: Sequence[str]) -> list[str]:
+    """Half-widths above their nominal elements."""
+    nominal, half = (
+        np.stack([np.hstack([getattr(b, name) for name in both]) for b in model.blocks])
+        for both in (("A", "B"), ("dA", "dB"))
+    )
+    wide = np.argwhere(half > np.abs(nominal))
+    if not len(wide):
+        return []
+    r, i, j = max(wide.tolist(), key=lambda at: float(half[tuple(at)] - abs(nominal[tuple(at)])))
+    return [
+        f"{len(wide)} of {nominal.size} half-widths exceed their nominal elements (most: {names[i]} from "
+        f"{names[j]}{_at(model, r)}, {nominal[r, i, j]:.3g} ± {half[r, i, j]:.3g} 1/s): the sign of these effects is "
+        f"not known"
+    ]
 
 
 def _recordings(
@@ -241,7 +284,7 @@ def _recordings(
 
     broken: some numbers are no movement; what the jumps do to the residuals comes from them.
     """
-    signals = model.signals.signals
+    signals = (*model.signals.states, *model.signals.controls)
     past = residuals.lagged_states(signals, model.n)
     rare = excitation.rare(part, names)
     known = {*rare, *past}
@@ -249,7 +292,9 @@ def _recordings(
     found = None if late or broken else residuals.residuals(part)
     # what a slow topic or a late control explains needs no further state
     follow = {i for i in range(model.n) if found and found.follows(i) and not any(f"'{names[i]}'" in m for m in held)}
-    speed = max((abs(v) for v in model.eigenvalues()), default=0.0) * (model.sampling.dt_median or np.inf)
+    speed = max((abs(v) for block in model.blocks for v in block.eigenvalues()), default=0.0) * (
+        model.sampling.dt_median or np.inf
+    )
     uneven = [] if broken else sensors.jittering(part, signals, float(speed), model.sampling.clock)
     messages = [*rare.values(), *uneven]
     if found:
@@ -362,7 +407,7 @@ def _slow(model: UncertainLTI, known: Memory, apart: bool, hidden: bool) -> list
     dt = model.sampling.dt_median
     if dt is None:
         return []
-    fastest = max(model.eigenvalues(), key=abs)
+    fastest = max((v for block in model.blocks for v in block.eigenvalues()), key=abs)
     turn = abs(fastest) * dt
     if turn <= FAST:
         return []
@@ -499,7 +544,7 @@ def _gain(problem: Problem, size: Array) -> Array:
         index = np.union1d(nearest, index[:: problem.N // TRIED])
     part = replace(problem.subset(index), weights=np.ones(problem.n))
     widths = []
-    for columns in (problem.columns, Columns(frozenset({"v"}))):
+    for columns in (problem.columns, replace(problem.columns, names=frozenset({"v"}))):
         some = replace(part, columns=columns)
         solution = WorkingSet(Fleet([some])).quadratic()
         widths.append((part.dt[:, None] * (some.psi() @ np.maximum(solution.d, 0.0))).mean(axis=0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any, Literal
@@ -19,7 +19,8 @@ from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Judged, Moments
-from uncertain_lti.identification.problem import Columns, Problem, assemble, median_step
+from uncertain_lti.identification.problem import Columns, Problem, Regimes, assemble, median_step
+from uncertain_lti.identification.regimes import Knots, block_data, scheduled_by
 from uncertain_lti.identification.repair import repair
 from uncertain_lti.identification.row import LEAST, InfeasibleError
 from uncertain_lti.identification.structure import Structure
@@ -27,7 +28,7 @@ from uncertain_lti.identification.working_set import GOOD, Solution, WorkingSet
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.operating_point import OperatingPoint
-from uncertain_lti.model.terms import ADDITIVE
+from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.additive import Additive
@@ -48,6 +49,7 @@ def fit(
     transient_weights: Sequence[float] | None = None,
     count: Literal["sample", "transient"] = "sample",
     structure: Structure | None = None,
+    schedule: Schedule | Mapping[str, Knots] | None = None,
     discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
@@ -81,6 +83,11 @@ def fit(
         In (10) and (11), every sample weighs the same, or every transient does, however long it is.
     structure : Structure, optional
         Elements that are known, or bounded. Default: the rules of the signals file, if it has any.
+    schedule : Schedule or mapping, optional
+        Of a scheduled (piecewise-linear) model. A mapping has one or two signals, a state, a control or a further
+        scheduling signal, each with its knots in recorded units, with `Modes`, or with how many knots: then from the
+        least to the greatest recorded value, the inner ones where they shrink the largest residuals most. Default:
+        what the signals file says, else one block.
     discard : int or float, default 0
         Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
         their effect on the objective and listed in `model.fit_summary["discarded"]`, beside the widths with them.
@@ -118,20 +125,29 @@ def fit(
     signals = _common_signals(transients)
     n, m = len(signals.states), len(signals.controls)
     if operating_point is None:
-        operating_point = OperatingPoint.of(signals.states, signals.controls)
+        operating_point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
     elif (len(operating_point.x_s), len(operating_point.u_s)) != (n, m):
         raise FitError(
             f"the operating point has {plural(len(operating_point.x_s), 'state')} and "
             f"{plural(len(operating_point.u_s), 'control')}, "
             f"the transients {n} and {m}"
         )
+    elif len(operating_point.s_s) != (q := len(signals.scheduling)):
+        raise FitError(
+            f"the operating point has {plural(len(operating_point.s_s), 'further scheduling signal')}, the transients "
+            f"{q}; give s_s and S"
+        )
     signals = _at(signals, operating_point)
+    if additive is None:
+        additive = signals.additive or "none"
+    scheduled = _regimes(schedule, signals, transients, operating_point, additive)
     if structure is None and signals.structure:
         structure = Structure.from_rules(
             signals.structure,
             [s.name for s in signals.states],
             [s.name for s in signals.controls],
             f"{signals.source}: structure",
+            scheduled.schedule if scheduled else None,
         )
     if structure is not None:
         if (structure.n, structure.m) != (n, m):
@@ -140,9 +156,15 @@ def fit(
             )
         if method == "cvxpy":
             raise FitError("method cvxpy takes no structure; use the working-set method")
-    if additive is None:
-        additive = signals.additive or "none"
-    problem = assemble(transients, operating_point, weights, additive, transient_weights=transient_weights, count=count)
+    problem = assemble(
+        transients,
+        operating_point,
+        weights,
+        additive,
+        transient_weights=transient_weights,
+        count=count,
+        regimes=scheduled,
+    )
     check_solvable(problem, transients, [s.name for s in signals.states])
 
     def name(error: InfeasibleError) -> FitError:
@@ -268,12 +290,23 @@ def fit_fleet(
     domain = Domain(low[:n], high[:n], low[n:], high[n:], fleet.occupancy(low, high))
 
     def build(theta: Array, d: Array) -> UncertainLTI:
-        return _model(fleet.columns, signals, sums, theta, d, dt_median, domain, alarm_rule)
+        return _model(fleet.columns, signals, sums, theta, d, dt_median, domain, alarm_rule, engine.tied)
 
     limits = engine.half_limits
 
     def repaired(gentle: bool) -> tuple[UncertainLTI, Array, Judged]:
-        return repair(build, fleet, sums, solution.theta, solution.d, solution.violation, limits, gentle)
+        return repair(
+            build,
+            fleet,
+            sums,
+            solution.theta,
+            solution.d,
+            solution.violation,
+            limits,
+            np.column_stack([row.size_unit for row in engine.rows]),
+            None if engine.shared is None else engine.shared[1],
+            gentle,
+        )
 
     model, d, judged = repaired(False)
     reference = _criterion(engine, criterion, solution.d, judged) if solution.delta is None else solution.delta
@@ -306,6 +339,8 @@ def fit_fleet(
         },
         "versions": dict(_versions()),
     }
+    if fleet.columns.regimes is not None:
+        facts["blocks"] = _block_facts(model, fleet, sums, d, dt_median)
     if describe_on is not None:
         whole = describe_on.N == sums.count and method == "working-set"
         few = carriers(describe_on, structure) if seek_carriers and whole else None
@@ -314,6 +349,35 @@ def fit_fleet(
         )
         facts["messages"] += _distance(gap)
     return model.replace(fit_summary=facts)
+
+
+def _block_facts(
+    model: UncertainLTI, fleet: Fleet, sums: Moments, d: Array, dt_median: float | None
+) -> list[dict[str, Any]]:
+    """Of each block its transitions, those of which it has the largest weight, and the widths there."""
+    total, largest = fleet.block_widths(d)
+    mean = np.divide(total, sums.visits[:, None], out=np.full(total.shape, np.nan), where=sums.visits[:, None] > 0)
+    return [
+        {
+            "transitions": int(sums.visits[r]),
+            "mean_width": mean[r] if sums.visits[r] else None,
+            "max_width": largest[r] if sums.visits[r] else None,
+            "spectral_radius": block.spectral_radius() if dt_median is not None else None,
+        }
+        for r, block in enumerate(model.blocks)
+    ]
+
+
+def _regimes(
+    schedule: Schedule | Mapping[str, Knots] | None,
+    signals: SignalMap,
+    transients: Sequence[Transient],
+    point: OperatingPoint,
+    additive: Additive,
+) -> Regimes | None:
+    """What a fit is scheduled by; None for one block."""
+    found = scheduled_by(schedule, signals, lambda: assemble(transients, point, None, additive))
+    return None if found is None else Regimes.of(found, signals)
 
 
 def _distance(gap: float) -> list[str]:
@@ -409,6 +473,11 @@ def _common_signals(transients: Sequence[Transient]) -> SignalMap:
                 f"{', '.join(other.control_names) or 'none'}, {first.name} has {', '.join(first.state_names)} and "
                 f"{', '.join(first.control_names) or 'none'}; read all recordings with one signals file"
             )
+        if other.scheduling_names != first.scheduling_names:
+            raise FitError(
+                f"{other.name} has the scheduling signals {', '.join(other.scheduling_names) or 'none'}, {first.name} "
+                f"has {', '.join(first.scheduling_names) or 'none'}; read all recordings with one signals file"
+            )
         if other.signals != first.signals:
             raise FitError(f"{other.name} and {first.name} were read with different signals; read them together")
     if first.signals is not None:
@@ -416,6 +485,7 @@ def _common_signals(transients: Sequence[Transient]) -> SignalMap:
     return SignalMap(
         tuple(Signal(name, "", _field(name, f"x{i + 1}")) for i, name in enumerate(first.state_names)),
         tuple(Signal(name, "", _field(name, f"u{j + 1}")) for j, name in enumerate(first.control_names)),
+        tuple(Signal(name, "", _field(name, f"s{j + 1}")) for j, name in enumerate(first.scheduling_names)),
         max_gap=None if np.isinf(first.max_gap) else first.max_gap,
         min_step=first.min_step,
         source="arrays",
@@ -432,16 +502,10 @@ def _field(name: str, otherwise: str) -> str:
 
 
 def _at(signals: SignalMap, point: OperatingPoint) -> SignalMap:
-    return replace(
-        signals,
-        states=tuple(
-            replace(s, steady=float(a), scale=float(b))
-            for s, a, b in zip(signals.states, point.x_s, point.X, strict=True)
-        ),
-        controls=tuple(
-            replace(s, steady=float(a), scale=float(b))
-            for s, a, b in zip(signals.controls, point.u_s, point.U, strict=True)
-        ),
+    steady = np.concatenate((point.x_s, point.u_s, point.s_s)).tolist()
+    scale = np.concatenate((point.X, point.U, point.S)).tolist()
+    return signals.replace_signals(
+        [replace(s, steady=a, scale=b) for s, a, b in zip(signals.signals, steady, scale, strict=True)]
     )
 
 
@@ -454,17 +518,21 @@ def _model(
     dt_median: float | None,
     domain: Domain,
     alarm_rule: AlarmRule | None,
+    tied: Sequence[int],
 ) -> UncertainLTI:
     n, p = len(signals.states), len(sums.low)
-    additive = {term.nominal: theta[k] for k, term in enumerate(columns.nominal, start=p)}
-    additive |= {term.half: d[k] for k, term in enumerate(columns.half, start=p)}
+    nominal, half = theta.reshape(columns.count, -1, n), d.reshape(columns.count, -1, n)
+    arrays: dict[str, Any] = {"A": nominal[:, :n], "B": nominal[:, n:p], "dA": half[:, :n], "dB": half[:, n:p]}
+    arrays = {name: values.transpose(0, 2, 1) for name, values in arrays.items()}
+    arrays |= {term.nominal: nominal[:, k] for k, term in enumerate(columns.nominal, start=p)}
+    arrays |= {term.half: half[:, k] for k, term in enumerate(columns.half, start=p)}
+    if columns.regimes is None:
+        arrays = {name: values[0] for name, values in arrays.items()}
     clock_types = [s.type for s in signals.states if s.topic == signals.clock]
     return UncertainLTI(
-        theta[:n].T,
-        theta[n:p].T,
-        d[:n].T,
-        d[n:p].T,
-        **{name: additive.get(name) for term in ADDITIVE for name in term.names},
+        **arrays,
+        schedule=None if columns.regimes is None else columns.regimes.schedule,
+        block_data=None if columns.regimes is None else block_data(sums, tied),
         signals=signals,
         sampling=Sampling(
             clock=signals.clock or "",

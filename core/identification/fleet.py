@@ -174,6 +174,24 @@ class Fleet:
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
 
+    def block_widths(self, d: Array) -> tuple[Array, Array]:
+        """Widths at the transitions of each block; see `passes.block_widths`.
+
+        Parameters
+        ----------
+        d : array (q, n)
+            Half-widths.
+
+        Returns
+        -------
+        array (R, n)
+            Sum of the widths.
+        array (R, n)
+            Largest width.
+        """
+        results = self.map(passes.block_widths, self._same(d))
+        return np.sum([r[0] for r in results], axis=0), np.max([r[1] for r in results], axis=0)
+
     def moving_from_rest(self) -> tuple[int, int, float]:
         """Samples with x = u = 0 and a successor that is not 0.
 

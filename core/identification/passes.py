@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,8 @@ class Moments:
         Longest step, s.
     count : int
         Number of transitions.
+    visits : array (R,) of int
+        Transitions of which each block has the largest weight.
     """
 
     plain_gram: Array
@@ -58,6 +60,7 @@ class Moments:
     dt_min: float
     dt_max: float
     count: int
+    visits: NDArray[np.intp]
 
     def __add__(self, other: Moments) -> Moments:
         def both(a: Array | None, b: Array | None) -> Array | None:
@@ -76,6 +79,43 @@ class Moments:
             min(self.dt_min, other.dt_min),
             max(self.dt_max, other.dt_max),
             self.count + other.count,
+            self.visits + other.visits,
+        )
+
+    def one_block(self) -> Moments:
+        """The sums of the same transitions with one block for all: the weights of a schedule add up to 1.
+
+        Returns
+        -------
+        Moments
+            Of [x; u] and the additive terms.
+        """
+        count = len(self.visits)
+        if count == 1:
+            return self
+        n = len(self.rate_square)
+
+        def fold(sums: Array, *axes: int) -> Array:
+            for axis in axes:
+                size = sums.shape[axis] // count
+                split = (*sums.shape[:axis], count, size, *sums.shape[axis + 1 :])
+                sums = sums.reshape(split).sum(axis=axis)
+            return sums
+
+        coupled = None
+        if self.coupled is not None:
+            q = len(self.plain_gram)
+            folded = fold(self.coupled.reshape(n, q, n, q), 1, 3)
+            coupled = folded.reshape(n * q // count, n * q // count)
+        return replace(
+            self,
+            plain_gram=fold(self.plain_gram, 0, 1),
+            gram=None if self.gram is None else fold(self.gram, 1, 2),
+            coupled=coupled,
+            centre=fold(self.centre, 0, 1),
+            target=fold(self.target, 0),
+            width_sum=fold(self.width_sum, 0),
+            visits=np.array([self.count]),
         )
 
     @property
@@ -110,7 +150,7 @@ _SINGLE_THREADED = 2**18
 
 def _pieces(part: Partition) -> Iterator[Block]:
     """All transitions, in pieces of a size that suits the cache."""
-    most = max(_PIECE // (part.p + part.n), 2048)
+    most = max(_PIECE // (part.p * part.columns.count + part.n), 2048)
     for block in part.blocks():
         if len(block) <= most:
             yield block
@@ -206,7 +246,7 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
         The partition has no transition.
     """
     columns, n, p = part.columns, part.n, part.p
-    q = p + len(columns.half)
+    q = columns.count * (p + len(columns.half))
     sums: Moments | None = None
     sampled: list[Block] = []
     index: list[Index] = []
@@ -219,10 +259,16 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
         constant = bool((block.dt == block.dt[0]).all())
         unit = float(block.dt[0]) if constant else 1.0
         phi = block.phi(columns) if constant else block.phi(columns) * block.dt
-        psi = np.empty((q, len(block)))
-        np.abs(phi[:p], out=psi[:p])  # Δt > 0
-        for row, term in zip(psi[p:], columns.half, strict=True):
-            row[:] = (block.dt if term.times_dt else 1.0) / unit
+        if columns.regimes is None:
+            psi = np.empty((q, len(block)))
+            np.abs(phi[:p], out=psi[:p])  # Δt > 0
+            for row, term in zip(psi[p:], columns.half, strict=True):
+                row[:] = (block.dt if term.times_dt else 1.0) / unit
+            visits = np.array([len(block)])
+        else:
+            psi = block.psi(columns) if constant else block.psi(columns) * block.dt
+            largest = columns.regimes.weights(block.z, block.s).argmax(axis=0)
+            visits = np.bincount(largest, minlength=columns.count)
         step = block.x_next - block.z[:n]
         weights = block.weights
         gram = np.stack([_gram(psi * weights[:, i], psi) for i in range(n)]) if weights.ndim == 2 else None
@@ -247,6 +293,7 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
             float(block.dt.min()),
             float(block.dt.max()),
             len(block),
+            visits,
         )
         sums = found if sums is None else sums + found
     if sums is None:
@@ -262,7 +309,14 @@ def _per_row(blocks: list[Block], index: list[Index], n: int, p: int) -> list[Sa
     rate = (np.hstack([b.x_next for b in blocks]) - z[:n]) / dt
     root = np.hstack([np.broadcast_to(b.root_weights(), (n, len(b))) for b in blocks])
     order = np.concatenate(index)
-    return [Samples(order, z, rate[i], dt, root[i]) for i in range(n)]
+    s = _joined([b.s for b in blocks])
+    return [Samples(order, z, rate[i], dt, root[i], s) for i in range(n)]
+
+
+def _joined(parts: Sequence[Array | None]) -> Array | None:
+    """Scheduling signals side by side; None if there are none."""
+    there = [part for part in parts if part is not None]
+    return np.hstack(there) if there else None
 
 
 @dataclass(frozen=True)
@@ -281,6 +335,8 @@ class Samples:
         Δt, s.
     root_weight : array (K,)
         √w_ii.
+    s : array (q, K), optional
+        Scheduling signals that are neither state nor control.
     """
 
     index: Index
@@ -288,13 +344,19 @@ class Samples:
     rate: Array
     dt: Array
     root_weight: Array
+    s: Array | None = None
 
     def __len__(self) -> int:
         return len(self.index)
 
     def __getitem__(self, chosen: Index | NDArray[np.bool_]) -> Samples:
         return Samples(
-            self.index[chosen], self.z[:, chosen], self.rate[chosen], self.dt[chosen], self.root_weight[chosen]
+            self.index[chosen],
+            self.z[:, chosen],
+            self.rate[chosen],
+            self.dt[chosen],
+            self.root_weight[chosen],
+            None if self.s is None else self.s[:, chosen],
         )
 
     @classmethod
@@ -320,12 +382,14 @@ class Samples:
         if len(parts) == 1:
             return parts[0]
         index, first = np.unique(np.concatenate([s.index for s in parts]), return_index=True)
+        further = _joined([s.s for s in parts])
         return cls(
             index,
             np.hstack([s.z for s in parts])[:, first],
             np.concatenate([s.rate for s in parts])[first],
             np.concatenate([s.dt for s in parts])[first],
             np.concatenate([s.root_weight for s in parts])[first],
+            None if further is None else further[:, first],
         )
 
 
@@ -339,7 +403,7 @@ class Candidate:
         Nominal elements, one column per row of the model, 1/s.
     d : array (q, n)
         Half-widths likewise.
-    size_unit : array (q,)
+    size_unit : array (q,), or (q, n) of each row
         The size of a sample is size_unit·ψ.
     scale : array (n,)
         Slack of row i is divided by size x scale_i.
@@ -397,21 +461,24 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
 
     # slack < reach is a comparison with half-widths that are smaller, for the width of (11) larger, by the reach
     def shifted() -> Array:
-        inner = d - np.outer(reach * candidate.scale, candidate.size_unit)
+        unit = candidate.size_unit.T
+        inner = d - (reach * candidate.scale)[:, None] * unit
         if candidate.limit is None:
             return inner
-        return np.vstack(
-            [inner, d + np.outer(np.minimum(reach, candidate.room) * candidate.scale, candidate.size_unit)]
-        )
+        outer = d + (np.minimum(reach, candidate.room) * candidate.scale)[:, None] * unit
+        return np.vstack([inner, outer])
 
     halves = shifted()
     for block in _pieces(part):
         psi = block.psi(columns)
         # a constant step goes into the elements, unless the transitions are too few for it to save time
         step = float(block.dt[0]) if part.N > _FEW_ALL and (block.dt == block.dt[0]).all() else None
-        residual = _product(theta[:, :p] * (step or 1.0), block.z)
-        if columns.drift:
-            residual += theta[:, p:] * (step or 1.0)
+        if columns.regimes is not None:
+            residual = _product(theta * (step or 1.0), block.phi(columns))
+        else:
+            residual = _product(theta[:, :p] * (step or 1.0), block.z)
+            if columns.drift:
+                residual += theta[:, p:] * (step or 1.0)
         rate = block.x_next[rows] - block.z[rows]
         if not step:
             rate /= block.dt
@@ -469,6 +536,7 @@ class _Near:
                 np.concatenate([s.rate for s in samples]),
                 np.concatenate([s.dt for s in samples]),
                 np.concatenate([s.root_weight for s in samples]),
+                _joined([s.s for s in samples]),
             ),
             np.concatenate([part.slack for part in parts]),
         )
@@ -480,19 +548,22 @@ def _near(candidate: Candidate, block: Block, columns: Columns, chosen: Index, r
     which = candidate.rows[row]
     z, dt = block.z[:, k], block.dt[k]
     root = block.root_weights()
-    psi = Block(block.start, z, z, dt, block.weights).psi(columns)
+    s = None if block.s is None else block.s[:, k]
+    psi = columns.psi(z, dt, s)
     samples = Samples(
         k + (block.start + offset),
         z,
         (block.x_next[which, k] - z[which, np.arange(len(k))]) / dt,
         dt,
         root[which, k if root.shape[1] > 1 else 0],
+        s,
     )
     half = np.einsum("qk,qk->k", candidate.d[:, row], psi)
     slack = half - residual
     if candidate.limit is not None:
         slack = np.minimum(slack, candidate.limit[row] / (2.0 * samples.root_weight * dt) - half)
-    size = candidate.size_unit @ psi
+    unit = candidate.size_unit
+    size = unit @ psi if unit.ndim == 1 else np.einsum("qk,qk->k", unit[:, row], psi)
     size[size == 0.0] = 1.0  # at rest without an additive term nothing but rest is contained
     return _Near(row, samples, slack / (size * candidate.scale[row]))
 
@@ -554,14 +625,15 @@ def judge(part: Partition, model: UncertainLTI) -> Judged:
     zeros = np.zeros(part.n)
     total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
     for block in _pieces(part):
-        found = _judged_in_doubt(block, model, total.largest) if block.weights.ndim == 1 else None
+        quick = block.weights.ndim == 1 and part.columns.regimes is None
+        found = _judged_in_doubt(block, model, total.largest) if quick else None
         total = total + (found or _judged(block, model))
     return total
 
 
 def _judged(block: Block, model: UncertainLTI) -> Judged:
     """`judge` of one piece, every transition by the verdict's arithmetic."""
-    inside, half = _inside_and_half(model, block.z, block.x_next, block.dt)
+    inside, half = _inside_and_half(model, block.signals, block.x_next, block.dt)
     largest = 2.0 * half.max(axis=1)
     if block.weights.ndim == 1:
         weighted = largest * np.sqrt(block.weights)
@@ -649,10 +721,40 @@ def _judged_in_doubt(block: Block, model: UncertainLTI, known: Array) -> Judged 
     outside, largest = np.zeros(n, dtype=np.intp), np.zeros(n)
     if len(chosen):
         padded = np.resize(chosen, _FEW)  # a fixed number, as `ordered_sum` tries each shape first
-        inside, widths = _inside_and_half(model, block.z[:, padded], block.x_next[:, padded], block.dt[padded])
+        inside, widths = _inside_and_half(model, block.signals[:, padded], block.x_next[:, padded], block.dt[padded])
         outside = len(chosen) - np.count_nonzero(inside[:, : len(chosen)], axis=1)
         largest = 2.0 * widths.max(axis=1)
     return Judged(outside, largest, largest * np.sqrt(block.weights))
+
+
+def block_widths(part: Partition, d: Array) -> tuple[Array, Array]:
+    """Widths per step at the transitions of each block, those of which it has the largest weight.
+
+    Parameters
+    ----------
+    part : Partition
+        The transitions, with a schedule.
+    d : array (q, n)
+        Half-widths.
+
+    Returns
+    -------
+    array (R, n)
+        Sum of the widths, normalised.
+    array (R, n)
+        Largest width.
+    """
+    columns = part.columns
+    assert columns.regimes is not None
+    total, largest = np.zeros((columns.count, part.n)), np.zeros((columns.count, part.n))
+    for block in _pieces(part):
+        width = _product(np.ascontiguousarray(2.0 * d.T), block.psi(columns)) * block.dt
+        which = columns.regimes.weights(block.z, block.s).argmax(axis=0)
+        for r in np.unique(which):
+            own = width[:, which == r]
+            total[r] += own.sum(axis=1)
+            largest[r] = np.maximum(largest[r], own.max(axis=1))
+    return total, largest
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:

@@ -11,28 +11,113 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ADDITIVE, Term
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.signals.additive import CHOICES, CHOICES_TEXT, Additive
+from uncertain_lti.signals.signal_map import SignalMap
 
 BLOCK = 16384
 """Transitions per pass block: their regressors stay in the cache."""
 
 
 @dataclass(frozen=True)
+class Regimes:
+    """A schedule, and where its signals are among those of a transition.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        Knots and modes, normalised.
+    positions : tuple of int
+        Of each of its axes the row of [x; u; s].
+    """
+
+    schedule: Schedule
+    positions: tuple[int, ...]
+
+    @classmethod
+    def of(cls, schedule: Schedule, signals: SignalMap) -> Regimes:
+        """Where the signals of a schedule are.
+
+        Parameters
+        ----------
+        schedule : Schedule
+            The schedule.
+        signals : SignalMap
+            With its signals.
+
+        Returns
+        -------
+        Regimes
+            The schedule with positions.
+
+        Raises
+        ------
+        FitError
+            A signal is not there; names it.
+        """
+        try:
+            return cls(schedule, schedule.positions([s.name for s in signals.signals]))
+        except ModelError as error:
+            raise FitError(str(error)) from None
+
+    def vectors(self, z: Array, s: Array | None) -> Array:
+        """Scheduling vectors.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array (axes, K)
+            Normalised.
+        """
+        p = len(z)
+        rows = [z[j] if j < p or s is None else s[j - p] for j in self.positions]
+        return np.stack(rows)
+
+    def weights(self, z: Array, s: Array | None) -> Array:
+        """Weights of all blocks, w(s).
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array (R, K)
+            Weights, which sum to 1.
+        """
+        return self.schedule.weights(self.vectors(z, s))
+
+
+@dataclass(frozen=True)
 class Columns:
-    """Which arrays of the additive terms are unknown besides A, B, ΔA, ΔB.
+    """Which arrays of the additive terms are unknown besides A, B, ΔA, ΔB, and how many blocks of them all there are.
+
+    The unknowns of a row are those of the first block, then those of the second, and so on.
 
     Parameters
     ----------
     names : frozenset of str
         Of "c", "dc" and "v", those that are.
+    regimes : Regimes, optional
+        Of a scheduled model; None for one block.
     """
 
     names: frozenset[str] = frozenset()
+    regimes: Regimes | None = None
 
     @property
     def nominal(self) -> tuple[Term, ...]:
@@ -59,8 +144,62 @@ class Columns:
         """Whether v is unknown."""
         return "v" in self.names
 
+    @property
+    def count(self) -> int:
+        """Number of blocks, R."""
+        return 1 if self.regimes is None else self.regimes.schedule.blocks
+
+    def phi(self, z: Array, s: Array | None) -> Array:
+        """Regressors φ of the nominal row: z, and 1 for each additive term; of R blocks, each times its weight.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array (r, K)
+            φ / Δt.
+        """
+        phi = np.vstack([z, np.ones((len(self.nominal), z.shape[1]))]) if self.nominal else z
+        return self._weighted(phi, z, s)
+
+    def psi(self, z: Array, dt: Array, s: Array | None) -> Array:
+        """Regressors ψ of the half-width: |z|, and for each additive term 1 or, if Δt does not multiply it, 1/Δt.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        dt : array (K,)
+            Δt, s.
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array (q, K)
+            ψ / Δt; of R blocks, each times its weight.
+        """
+        p = len(z)
+        psi = np.empty((p + len(self.half), z.shape[1]))
+        np.abs(z, out=psi[:p])
+        for row, term in zip(psi[p:], self.half, strict=True):
+            row[:] = 1.0 if term.times_dt else 1.0 / dt
+        return self._weighted(psi, z, s)
+
+    def _weighted(self, base: Array, z: Array, s: Array | None) -> Array:
+        """w(s) ⊗ base."""
+        if self.regimes is None:
+            return base
+        weights = self.regimes.weights(z, s)
+        return (weights[:, None] * base).reshape(-1, z.shape[1])
+
     def unknowns(self, p: int) -> int:
-        """Number of unknowns per row with p states and controls.
+        """Number of unknowns per row and block with p states and controls.
 
         Parameters
         ----------
@@ -70,12 +209,12 @@ class Columns:
         Returns
         -------
         int
-            Unknowns per row, nominal elements and half-widths.
+            Nominal elements and half-widths.
         """
         return 2 * p + len(self.names)
 
     @classmethod
-    def of(cls, additive: Additive, constant_dt: bool) -> Columns:
+    def of(cls, additive: Additive, constant_dt: bool, regimes: Regimes | None = None) -> Columns:
         """For an `additive` option.
 
         With a constant Δt, Δt·dc + v is one number: v takes it and dc is 0, because v is the one that still
@@ -87,6 +226,8 @@ class Columns:
             The option of `fit`.
         constant_dt : bool
             Whether all steps are equal.
+        regimes : Regimes, optional
+            Of a scheduled model.
 
         Returns
         -------
@@ -101,7 +242,7 @@ class Columns:
         if additive not in CHOICES:
             raise FitError(f"additive is {additive!r}; it must be {CHOICES_TEXT}")
         names = {"none": "", "disturbance": "c dc", "noise": "v", "both": "c v" if constant_dt else "c dc v"}
-        return cls(frozenset(names[additive].split()))
+        return cls(frozenset(names[additive].split()), regimes)
 
 
 @dataclass(frozen=True)
@@ -120,6 +261,8 @@ class Block:
         Δt, s.
     weights : array (n,), (K, n) or (K, n, n)
         W(t_{k+1}).
+    s : array (q, K), optional
+        Scheduling signals that are neither state nor control.
     """
 
     start: int
@@ -127,6 +270,7 @@ class Block:
     x_next: Array
     dt: Array
     weights: Array
+    s: Array | None = None
 
     def __len__(self) -> int:
         return len(self.dt)
@@ -153,7 +297,8 @@ class Block:
         """
         weights = self.weights if self.weights.ndim == 1 else self.weights[start:stop]
         part = slice(start, stop)
-        return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights)
+        s = None if self.s is None else self.s[:, part]
+        return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights, s)
 
     def every(self, first: int, stride: int) -> Block:
         """A copy of every stride-th transition from the first.
@@ -172,7 +317,8 @@ class Block:
         """
         weights = self.weights if self.weights.ndim == 1 else self.weights[first::stride].copy()
         part = slice(first, None, stride)
-        return Block(self.start, self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy(), weights)
+        s = None if self.s is None else self.s[:, part].copy()
+        return Block(self.start, self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy(), weights, s)
 
     def rate(self) -> Array:
         """(x_next - x) / Δt.
@@ -186,8 +332,13 @@ class Block:
         rate /= self.dt
         return rate
 
+    @property
+    def signals(self) -> Array:
+        """[x; u; s], (p + q, K)."""
+        return self.z if self.s is None else np.vstack([self.z, self.s])
+
     def phi(self, columns: Columns) -> Array:
-        """Regressors φ of the nominal row: z, and 1 for each additive term.
+        """Regressors of the nominal row.
 
         Parameters
         ----------
@@ -197,12 +348,12 @@ class Block:
         Returns
         -------
         array (r, K)
-            φ / Δt.
+            As of `Columns.phi`.
         """
-        return np.vstack([self.z, np.ones((len(columns.nominal), len(self)))]) if columns.nominal else self.z
+        return columns.phi(self.z, self.s)
 
     def psi(self, columns: Columns) -> Array:
-        """Regressors ψ of the half-width: |z|, and for each additive term 1 or, if Δt does not multiply it, 1/Δt.
+        """Regressors of the half-width.
 
         Parameters
         ----------
@@ -212,14 +363,9 @@ class Block:
         Returns
         -------
         array (q, K)
-            ψ / Δt.
+            As of `Columns.psi`.
         """
-        p = len(self.z)
-        psi = np.empty((p + len(columns.half), len(self)))
-        np.abs(self.z, out=psi[:p])
-        for row, term in zip(psi[p:], columns.half, strict=True):
-            row[:] = 1.0 if term.times_dt else 1.0 / self.dt
-        return psi
+        return columns.psi(self.z, self.dt, self.s)
 
     def root_weights(self) -> Array:
         """Roots of the diagonal weights.
@@ -302,6 +448,8 @@ class Problem:
         W(t_{k+1}).
     columns : Columns
         Terms that are unknown.
+    s_columns : array (q, N), optional
+        Scheduling signals that are neither state nor control, samples in columns.
     """
 
     z_columns: Array
@@ -311,6 +459,7 @@ class Problem:
     k: NDArray[np.intp]
     weights: Array
     columns: Columns
+    s_columns: Array | None = None
 
     @property
     def N(self) -> int:
@@ -351,7 +500,8 @@ class Problem:
             Views.
         """
         weights = self.weights if self.weights.ndim == 1 else self.weights[part]
-        return Block(part.start or 0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights)
+        s = None if self.s_columns is None else self.s_columns[:, part]
+        return Block(part.start or 0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights, s)
 
     def blocks(self) -> Iterator[Block]:
         """All transitions, in blocks that stay in the cache.
@@ -392,7 +542,7 @@ class Problem:
         array (K, r)
             As of `Block.phi`.
         """
-        return self._rows(part).phi(self.columns).T
+        return self.block(part).phi(self.columns).T
 
     def psi(self, part: slice = slice(None)) -> Array:
         """Regressors of the half-width with samples in rows.
@@ -407,7 +557,7 @@ class Problem:
         array (K, q)
             As of `Block.psi`.
         """
-        return self._rows(part).psi(self.columns).T
+        return self.block(part).psi(self.columns).T
 
     def row_weights(self, part: slice = slice(None)) -> Array:
         """Diagonal weights with samples in rows.
@@ -422,11 +572,7 @@ class Problem:
         array (K, n)
             w_ii(t_{k+1}).
         """
-        return np.broadcast_to(self._rows(part).root_weights().T ** 2, (len(self.dt[part]), self.n))
-
-    def _rows(self, part: slice) -> Block:
-        weights = self.weights if self.weights.ndim == 1 else self.weights[part]
-        return Block(0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights)
+        return np.broadcast_to(self.block(part).root_weights().T ** 2, (len(self.dt[part]), self.n))
 
     def subset(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Problem:
         """The same problem on some transitions; a slice is no copy.
@@ -453,6 +599,7 @@ class Problem:
             self.k[index],
             weights,
             self.columns,
+            None if self.s_columns is None else self.s_columns[:, index],
         )
 
     def without(self, index: NDArray[np.intp]) -> Problem:
@@ -516,6 +663,7 @@ def assemble(
     empty: bool = False,
     transient_weights: Sequence[float] | None = None,
     count: Literal["sample", "transient"] = "sample",
+    regimes: Regimes | None = None,
 ) -> Problem:
     """Put the usable transitions of all recordings into one problem.
 
@@ -535,6 +683,8 @@ def assemble(
         One factor per transient on all its weights.
     count : {"sample", "transient"}
         Every transition weighs the same, or every transient does, however long it is.
+    regimes : Regimes, optional
+        Of a scheduled model.
 
     Returns
     -------
@@ -544,8 +694,8 @@ def assemble(
     Raises
     ------
     FitError
-        No transitions; values whose squares overflow; weights of a wrong shape, not positive, not symmetric or not
-        positive definite.
+        No transitions; values whose squares overflow; a mode that the schedule does not list; weights of a wrong shape,
+        not positive, not symmetric or not positive definite.
     """
     n = len(point.x_s)
     steps = [t.transitions() for t in transients]
@@ -578,15 +728,61 @@ def assemble(
             square += _normalise(s.x_next[-1:], point.x_s, point.X, x_next[:, stop - 1 : stop])
         else:
             square += _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
-    if not square <= LARGEST**2:
+    further, more = _scheduling(steps, point)
+    if not square + more <= LARGEST**2:
         raise _too_large(transients)
-    columns = Columns.of(additive, is_constant(dt))
+    columns = Columns.of(additive, is_constant(dt), regimes)
     chosen = _weights(weights, transients, k, source, n)
     factors = _factors(transient_weights, count, source, len(transients))
     if factors is not None:
         factors = factors[source]
         chosen = factors[:, None] * chosen if chosen.ndim < 3 else factors[:, None, None] * chosen
-    return Problem(z, x_next, dt, source, k, chosen, columns)
+    problem = Problem(z, x_next, dt, source, k, chosen, columns, further)
+    if regimes is not None:
+        refuse_unlisted(problem, regimes, transients)
+    return problem
+
+
+def refuse_unlisted(problem: Problem, regimes: Regimes, transients: Sequence[Transient]) -> None:
+    """Refuse a mode that the schedule does not list.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    regimes : Regimes
+        The schedule.
+    transients : sequence of Transient
+        The recordings, by their position in `problem.source`.
+
+    Raises
+    ------
+    FitError
+        There is one; names the mode, the recording and the remedy.
+    """
+    vectors = regimes.vectors(problem.z_columns, problem.s_columns)
+    for axis, values, row in zip(regimes.schedule.axes, vectors, regimes.positions, strict=True):
+        unlisted = np.flatnonzero(~np.isin(values, axis.modes))
+        if axis.modes and len(unlisted):
+            transient, k = transients[problem.source[unlisted[0]]], int(problem.k[unlisted[0]])
+            recorded = np.hstack([transient.x[k], transient.u[k], transient.s[k]])[row]
+            raise FitError(
+                f"{transient.name}: '{axis.signal}' is {recorded:g} at t = {transient.t[k]:.6g} s (and in "
+                f"{plural(len(unlisted), 'transition')} of all), a mode that the schedule does not list; list it, or "
+                f"leave that part of the recording out"
+            )
+
+
+def _scheduling(steps: Sequence[Transitions], point: OperatingPoint) -> tuple[Array | None, float]:
+    """Scheduling signals that are neither state nor control, normalised, (q, N), and the sum of their squares."""
+    if not len(point.s_s):
+        return None, 0.0
+    s = np.empty((len(point.s_s), sum(len(step.dt) for step in steps)))
+    start, square = 0, 0.0
+    for step in steps:
+        square += _normalise(step.s, point.s_s, point.S, s[:, start : start + len(step.dt)])
+        start += len(step.dt)
+    return s, square
 
 
 def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -598,7 +794,8 @@ def _too_large(transients: Sequence[Transient]) -> FitError:
     """The error for values whose squares overflow, naming signal and recording."""
     largest, name, recording = 0.0, "", ""
     for t in transients:
-        for signal, values in zip((*t.state_names, *t.control_names), (*t.x.T, *t.u.T), strict=True):
+        names = (*t.state_names, *t.control_names, *t.scheduling_names)
+        for signal, values in zip(names, (*t.x.T, *t.u.T, *t.s.T), strict=True):
             here = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
             if here > largest:
                 largest, name, recording = here, signal, t.name
@@ -611,8 +808,9 @@ def _too_large(transients: Sequence[Transient]) -> FitError:
 def _without_values(transients: Sequence[Transient]) -> str:
     """Why there may be no usable transition, by signal."""
     first, total = transients[0], sum(len(t) for t in transients)
-    known = sum(np.isfinite(np.concatenate([t.x, t.u], axis=1)).sum(axis=0) for t in transients)
-    counts = dict(zip((*first.state_names, *first.control_names), np.asarray(known).tolist(), strict=True))
+    known = sum(np.isfinite(np.concatenate([t.x, t.u, t.s], axis=1)).sum(axis=0) for t in transients)
+    names = (*first.state_names, *first.control_names, *first.scheduling_names)
+    counts = dict(zip(names, np.asarray(known).tolist(), strict=True))
     never = [name for name, count in counts.items() if not count]
     if never:
         many = len(never) > 1

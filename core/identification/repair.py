@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
@@ -25,6 +25,8 @@ def repair(
     d: Array,
     violation: Array,
     limits: tuple[Array, Array],
+    units: Array,
+    shared: Index | None = None,
     gentle: bool = False,
 ) -> tuple[UncertainLTI, Array, Judged]:
     """Lift d until `Fleet.judge` finds nothing outside in any row.
@@ -50,6 +52,10 @@ def repair(
         Times the size of a sample, which is the sum of |ψ| over their root mean squares.
     limits : pair of array (q, n)
         Least and largest half-widths that the structure allows.
+    units : array (q, n)
+        The size of a sample is units·ψ, of each row; 0 where a column is all zero.
+    shared : array (q, n) of int, optional
+        Of each half-width the first that it shares its value with; default none but itself.
     gentle : bool
         Try lifts far below an ulp first: for an envelope so narrow that a few ulps are much of it.
 
@@ -67,27 +73,29 @@ def repair(
     FitError
         Samples stay outside however far the half-widths are lifted.
     """
-    n, p = fleet.n, fleet.p
-    free = sums.psi_scale > 0
-    unit = np.zeros(len(sums.psi_scale))
-    unit[free] = 1.0 / sums.psi_scale[free]
+    n, p, columns = fleet.n, fleet.p, fleet.columns
+    free = units > 0
     low, high = limits
     fixed = low == high
-    movable = free[:, None] & ~fixed
-    lifted = np.where(fixed, d, d + np.outer(unit, np.maximum(violation, 0.0)))
-    nominal = np.zeros(d.shape)
-    nominal[:p] = np.abs(theta[:p])
-    columns = fleet.columns
+    movable = free & ~fixed
+    lifted = np.where(fixed, d, d + units * np.maximum(violation, 0.0))
+    blocks = (columns.count, -1, n)
+    nominal, own = np.zeros(d.shape).reshape(blocks), np.zeros(d.shape).reshape(blocks)
+    elements = np.abs(theta).reshape(blocks)
+    nominal[:, :p] = elements[:, :p]
     for k, term in enumerate(columns.half, start=p):
         if term in columns.nominal:
-            nominal[k] = np.abs(theta[p + columns.nominal.index(term)])
-    own = np.zeros(d.shape)
-    own[np.arange(n), np.arange(n)] = 1.0 / sums.dt_min
+            nominal[:, k] = elements[:, p + columns.nominal.index(term)]
+    own[:, np.arange(n), np.arange(n)] = 1.0 / sums.dt_min
     base = np.clip(lifted, low, high)
-    rounding = nominal + base + own
+    rounding = nominal.reshape(d.shape) + base + own.reshape(d.shape)
     for i in np.flatnonzero((fixed & (rounding > 0)).any(axis=0)):  # the others carry what these cannot
         share = float(sums.psi_scale @ (rounding[:, i] * fixed[:, i]))
-        rounding[:, i] += unit * share
+        rounding[:, i] += units[:, i] * share
+    if shared is not None:  # they stay equal to the bit
+        most = np.zeros(d.shape)
+        np.maximum.at(most, (shared, np.arange(n)), rounding)
+        rounding = most[shared, np.arange(n)]
     todo = np.ones(n, dtype=bool)
     lifted = base
     for attempt in range(-6 if gentle else 0, _ROUNDS):
@@ -101,7 +109,7 @@ def repair(
         if not movable[:, todo].any(axis=0).all():
             break
     row = int(np.argmax(todo))
-    if fixed[free, row].any():
+    if fixed[free[:, row], row].any():
         raise FitError(
             f"structure: with half-widths that are fixed, '{model.state_names[row]}' leaves "
             f"{plural(int(judged.outside[row]), 'transition')} outside, by rounding at least; let a half-width of "

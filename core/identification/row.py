@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
@@ -62,6 +65,100 @@ class InfeasibleError(FitError):
         self.row, self.index, self.distance, self.together = row, index, distance, together
 
 
+@dataclass(frozen=True)
+class Chosen:
+    """Columns that are unknowns; several columns may be one unknown.
+
+    Parameters
+    ----------
+    first : array (u,) of int
+        The first column of each unknown.
+    members : array (size,) of int or None
+        Of each column its unknown, -1 for none; None where every unknown is one column.
+    """
+
+    first: Index
+    members: Index | None
+
+    @classmethod
+    def of(cls, wanted: NDArray[np.bool_], shared: Index | None) -> Chosen:
+        """Unknowns for the columns that are wanted.
+
+        Parameters
+        ----------
+        wanted : array (size,) of bool
+            Alike for all that share.
+        shared : array (size,) of int or None
+            Of each column the first that it shares its element with; None where none shares.
+
+        Returns
+        -------
+        Chosen
+            The unknowns.
+        """
+        if shared is None:
+            return cls(np.flatnonzero(wanted), None)
+        first = np.flatnonzero(wanted & (shared == np.arange(len(shared))))
+        place = np.full(len(shared), -1, dtype=np.intp)
+        place[first] = np.arange(len(first))
+        return cls(first, place[shared])
+
+    @cached_property
+    def matrix(self) -> Array:
+        """1 where a column belongs to an unknown, (size, u)."""
+        assert self.members is not None
+        matrix: Array = (self.members[:, None] == np.arange(len(self.first))).astype(np.float64)
+        return matrix
+
+    def take(self, rows: Array) -> Array:
+        """Rows of each unknown, summed.
+
+        Parameters
+        ----------
+        rows : array (size, ...)
+            One for each column.
+
+        Returns
+        -------
+        array (u, ...)
+            One for each unknown.
+        """
+        return rows[self.first] if self.members is None else self.matrix.T @ rows
+
+    def square(self, gram: Array) -> Array:
+        """A Gram matrix of the unknowns.
+
+        Parameters
+        ----------
+        gram : array (size, size)
+            Of the columns.
+
+        Returns
+        -------
+        array (u, u)
+            Of the unknowns.
+        """
+        if self.members is None:
+            return gram[np.ix_(self.first, self.first)]
+        return self.matrix.T @ gram @ self.matrix
+
+    def put(self, elements: Array, values: Array | float) -> None:
+        """Write the unknowns to all their columns.
+
+        Parameters
+        ----------
+        elements : array (size,)
+            Takes the result.
+        values : array (u,) or float
+            Of each unknown.
+        """
+        if self.members is None:
+            elements[self.first] = values
+        else:
+            there = self.members >= 0
+            elements[there] = np.broadcast_to(values, len(self.first))[self.members[there]]
+
+
 class Row:
     """One row of the model in scaled unknowns ξ = [θ d], with the samples held for it and the working set among them.
 
@@ -75,12 +172,21 @@ class Row:
         Of all data.
     bounds : four arrays
         Of `Structure.stacked`.
+    shared : pair of array (r,) and (q,) of int, optional
+        Of each nominal element and each half-width the first that it shares its value with; default none but itself.
     """
 
-    def __init__(self, i: int, sums: Moments, bounds: tuple[Array, Array, Array, Array]) -> None:
+    def __init__(
+        self,
+        i: int,
+        sums: Moments,
+        bounds: tuple[Array, Array, Array, Array],
+        shared: tuple[Index, Index] | None = None,
+    ) -> None:
         self.i = i
         self.sums = sums
         self._bounds = bounds
+        self._shared = shared
         self.refined = False
         self.width: Array = np.empty(0)
         self.kept: float | None = None  # violation, in units of the size, of an answer of before that was good
@@ -105,33 +211,44 @@ class Row:
         i, sums, bounds = self.i, self.sums, self._bounds
         self.scale = scale
         theta_low, theta_high, d_low, d_high = (b[:, i] for b in bounds)
-        dead_phi, dead_psi = sums.phi_scale == 0, sums.psi_scale == 0
+        phi_scale, psi_scale = sums.phi_scale, sums.psi_scale
+        if self._shared is not None:
+            phi_scale, psi_scale = self._scales(sums.centre, 0), self._scales(sums.plain_gram, 1)
+        dead_phi, dead_psi = phi_scale == 0, psi_scale == 0
         fixed_phi, fixed_psi = theta_low == theta_high, d_low == d_high
         self.theta = np.where(fixed_phi, theta_low, np.clip(0.0, theta_low, theta_high))
         self.d = np.where(fixed_psi, d_low, np.where(dead_psi, d_low, 0.0))
-        self.free_phi = np.flatnonzero(~dead_phi & ~fixed_phi)
-        self.free_psi = np.flatnonzero(~dead_psi & ~fixed_psi)
+        self.phi_columns = Chosen.of(~dead_phi & ~fixed_phi, self._shared and self._shared[0])
+        self.psi_columns = Chosen.of(~dead_psi & ~fixed_psi, self._shared and self._shared[1])
+        self.free_phi, self.free_psi = self.phi_columns.first, self.psi_columns.first
         with np.errstate(divide="ignore"):
-            unit_phi, unit_psi = 1.0 / sums.phi_scale, 1.0 / sums.psi_scale
+            unit_phi, unit_psi = 1.0 / phi_scale, 1.0 / psi_scale
         self.unit_phi, self.unit_psi = unit_phi[self.free_phi], unit_psi[self.free_psi]
         self.size_unit = np.where(dead_psi, 0.0, unit_psi)
         self.r, self.q = len(self.free_phi), len(self.free_psi)
         self.fixed_theta, self.fixed_d = self.theta.copy(), self.d.copy()
-        self.fixed_theta[self.free_phi] = 0.0
-        self.fixed_d[self.free_psi] = 0.0
+        self.phi_columns.put(self.fixed_theta, 0.0)
+        self.psi_columns.put(self.fixed_d, 0.0)
         to_phi, to_psi = self.scale * self.unit_phi, self.scale * self.unit_psi
         self.lower = np.concatenate([theta_low[self.free_phi] / to_phi, d_low[self.free_psi] / to_psi])
         self.upper = np.concatenate([theta_high[self.free_phi] / to_phi, d_high[self.free_psi] / to_psi])
-        inside = np.ix_(self.free_phi, self.free_phi)
-        self.centre = sums.centre[inside] * np.outer(self.unit_phi, self.unit_phi) / sums.count
+        self.centre = self.phi_columns.square(sums.centre) * np.outer(self.unit_phi, self.unit_phi) / sums.count
         target = sums.target[:, i] - sums.centre @ self.fixed_theta
-        self.target = target[self.free_phi] * self.unit_phi / (sums.count * self.scale)
+        self.target = self.phi_columns.take(target) * self.unit_phi / (sums.count * self.scale)
         plain = self._gram(sums.plain_gram, sums.count)
         self.plain, self.plain_linear, _ = plain
         self.gram, self.linear, self.known = plain if sums.gram is None else self._gram(sums.gram[i], sums.count)
         self.basis: Array | None = None  # scaled θ = basis η, in refined coordinates
         self.asked: Array = np.empty((0, self.r))  # asked η >= asked_limits: what the structure says of θ there
         self.asked_limits: Array = np.empty(0)
+
+    def _scales(self, gram: Array, which: int) -> Array:
+        """Root mean squares of columns, each of those that share an element taken with the others."""
+        assert self._shared is not None
+        joined = np.zeros((len(gram), len(gram)))
+        joined[np.arange(len(gram)), self._shared[which]] = 1.0
+        squares = np.diagonal(joined.T @ gram @ joined) / self.sums.count
+        return np.sqrt(np.maximum(squares, 0.0))[self._shared[which]]
 
     def refine(self) -> None:
         """Go over to coordinates in which the envelope has order one, however narrow and collinear the data.
@@ -144,8 +261,9 @@ class Row:
         theta, d, before = self.theta, self.d, self.limit_unit
         phi = self._phi(samples)
         step = samples.rate * samples.dt
-        fixed = np.where(np.isin(np.arange(len(self.theta)), self.free_phi), 0.0, self.theta)
-        columns = (phi[self.free_phi] * samples.dt).T * self.unit_phi
+        fixed = self.theta.copy()
+        self.phi_columns.put(fixed, 0.0)
+        columns = (self.phi_columns.take(phi) * samples.dt).T * self.unit_phi
         left, values, right = np.linalg.svd(columns, full_matrices=False)
         keep = values > COLLINEAR * values.max(initial=0.0)
         inverse = right[keep].T / values[keep]
@@ -155,7 +273,7 @@ class Row:
             base, residual = base + change, residual - columns @ change
         low, high = (b[:, self.i][self.free_phi] for b in self._bounds[:2])
         base = np.clip(base * self.unit_phi, low, high)
-        fixed[self.free_phi] = base
+        self.phi_columns.put(fixed, base)
         residual = step - fixed @ phi * samples.dt
         largest = float(np.abs(samples.z[self.i]).max(initial=0.0)) + float(np.abs(step).max(initial=0.0))
         rounding = _EPS * largest
@@ -163,11 +281,11 @@ class Row:
         self._coordinates(scale)
         self.refined = True
         self.tolerance = max(TOLERANCE, 0.25 * rounding / scale)
-        self.fixed_theta[self.free_phi] = base
+        self.phi_columns.put(self.fixed_theta, base)
         self.lower[: self.r] -= base / (self.unit_phi * scale)
         self.upper[: self.r] -= base / (self.unit_phi * scale)
         target = self.sums.target[:, self.i] - self.sums.centre @ self.fixed_theta
-        self.target = target[self.free_phi] * self.unit_phi / (self.sums.count * scale)
+        self.target = self.phi_columns.take(target) * self.unit_phi / (self.sums.count * scale)
         if self.r:
             root = np.sqrt(len(step))
             self.basis = inverse * root
@@ -206,8 +324,7 @@ class Row:
         return np.asarray(self.width[positions] * self.width_unit / (2.0 * self.samples.root_weight[positions]))
 
     def _phi(self, samples: Samples) -> Array:
-        extra = len(self._columns.nominal)
-        return np.vstack([samples.z, np.ones((extra, len(samples)))]) if extra else samples.z
+        return self._columns.phi(samples.z, samples.s)
 
     def scaled(self) -> tuple[Array, Array]:
         """Return the row's elements as differences from its fixed part, in scaled units.
@@ -225,8 +342,8 @@ class Row:
     def _gram(self, gram: Array, count: int) -> tuple[Array, Array, float]:
         """Squared widths as ½ dᵀ G d + gᵀ d + k in scaled units; G has order one."""
         unit = self.unit_psi
-        inside = gram[np.ix_(self.free_psi, self.free_psi)] * np.outer(unit, unit) / count
-        linear = (gram @ self.fixed_d)[self.free_psi] * unit / (count * self.scale)
+        inside = self.psi_columns.square(gram) * np.outer(unit, unit) / count
+        linear = self.psi_columns.take(gram @ self.fixed_d) * unit / (count * self.scale)
         largest = float(np.diagonal(inside).max(initial=0.0)) or 1.0
         known = 0.5 * float(self.fixed_d @ gram @ self.fixed_d) / (count * self.scale**2)
         self.largest = largest
@@ -252,12 +369,12 @@ class Row:
         """
         self._store_theta(answer[: self.r])
         d = np.maximum(answer[self.r :], np.maximum(self.lower[self.r :], 0.0))
-        self.d[self.free_psi] = d * self.unit_psi * self.scale
+        self.psi_columns.put(self.d, d * self.unit_psi * self.scale)
 
     def _store_theta(self, answer: Array) -> None:
         change = answer if self.basis is None else self.basis @ answer
         theta = change * self.unit_phi * self.scale
-        self.theta[self.free_phi] = theta + self.fixed_theta[self.free_phi] if self.refined else theta
+        self.phi_columns.put(self.theta, theta + self.fixed_theta[self.free_phi] if self.refined else theta)
 
     def hold(self, samples: Samples, columns: Columns) -> None:
         """Hold these samples, and the working set so far.
@@ -274,16 +391,13 @@ class Row:
         kept = self.samples[self.pool]
         self.samples = samples = Samples.join([samples, kept], p)
         self.pool = np.searchsorted(samples.index, kept.index)
-        ones = np.ones(len(samples))
-        phi = self._phi(samples)
-        extra = [ones if term.times_dt else 1.0 / samples.dt for term in columns.half]
-        psi = np.vstack([np.abs(samples.z), *extra])
+        phi, psi = self._phi(samples), columns.psi(samples.z, samples.dt, samples.s)
         size = self.size_unit @ psi
         size[size == 0.0] = 1.0
         # rows of the programme: each sample divided by its own size, so that one near rest weighs as any other
-        self.plain_phi = ((phi[self.free_phi] * self.unit_phi[:, None]) / size).T
+        self.plain_phi = ((self.phi_columns.take(phi) * self.unit_phi[:, None]) / size).T
         self.phi = self.plain_phi if self.basis is None else self.plain_phi @ self.basis
-        self.psi = ((psi[self.free_psi] * self.unit_psi[:, None]) / size).T
+        self.psi = ((self.psi_columns.take(psi) * self.unit_psi[:, None]) / size).T
         self.y = (samples.rate - self.fixed_theta @ phi) / (size * self.scale)
         self.half = (self.fixed_d @ psi) / (size * self.scale)
         self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
@@ -616,10 +730,10 @@ class Row:
         unit = self.unit_psi * self.scale
         fixed = np.concatenate(widths)
         fixed[mine] = self.fixed_d
-        gram = coupled[mine, mine][np.ix_(self.free_psi, self.free_psi)] * np.outer(unit, unit)
+        gram = self.psi_columns.square(coupled[mine, mine]) * np.outer(unit, unit)
         self.largest = float(np.diagonal(gram).max(initial=0.0)) or 1.0
         self.gram = gram / self.largest
-        self.linear = (coupled[mine] @ fixed)[self.free_psi] * unit / self.largest
+        self.linear = self.psi_columns.take(coupled[mine] @ fixed) * unit / self.largest
 
     def solve_among(self) -> str:
         """(10) with full weights, of this row given the others.

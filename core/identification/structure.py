@@ -7,10 +7,12 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ADDITIVE, HALF_WIDTHS, TERMS
 
 
@@ -30,6 +32,12 @@ class Structure:
         Lower bounds by the same names; NaN for none. A sign constraint is a bound of 0. Half-widths are never below 0.
     upper : mapping of str to ArrayLike, optional
         Upper bounds likewise.
+    blocks : int, optional
+        Of a scheduled model whose blocks differ in what is known of them: every array has a first axis of that
+        length. Default: what is known holds for every block, however many there are.
+    shared : mapping, optional
+        By the same names arrays of bool of the shape of one block: True for an element that is the same in all
+        blocks.
 
     Raises
     ------
@@ -44,11 +52,21 @@ class Structure:
         fixed: Mapping[str, ArrayLike] | None = None,
         lower: Mapping[str, ArrayLike] | None = None,
         upper: Mapping[str, ArrayLike] | None = None,
+        *,
+        blocks: int | None = None,
+        shared: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        self.n, self.m = n, m
+        self.n, self.m, self.blocks = n, m, blocks
         nominal = [term for term in TERMS if term.nominal]
-        self._shapes = {term.nominal: term.shape(n, m) for term in nominal}
-        self._shapes |= {term.half: term.shape(n, m) for term in TERMS}
+        one_block = {term.nominal: term.shape(n, m) for term in nominal}
+        one_block |= {term.half: term.shape(n, m) for term in TERMS}
+        self._shapes = {name: shape if blocks is None else (blocks, *shape) for name, shape in one_block.items()}
+        self.shared = {name: np.zeros(shape, dtype=bool) for name, shape in one_block.items()}
+        for name, values in (shared or {}).items():
+            self._known(name)
+            if np.shape(values) != one_block[name] or np.asarray(values).dtype != np.bool_:
+                raise FitError(f"structure: shared {name} must be true or false for each element, {one_block[name]}")
+            self.shared[name] = np.array(values)
         self.lower: dict[str, Array] = {}
         self.upper: dict[str, Array] = {}
         for name, shape in self._shapes.items():
@@ -75,9 +93,12 @@ class Structure:
                 at = tuple(np.argwhere(self.lower[name] < 0)[0].tolist())
                 raise FitError(f"structure: {name}{list(at)} is a half-width and cannot be below 0")
 
-    def _read(self, name: str, values: ArrayLike) -> Array:
+    def _known(self, name: str) -> None:
         if name not in self._shapes:
             raise FitError(f"structure: there is no '{name}'; there are {', '.join(self._shapes)}")
+
+    def _read(self, name: str, values: ArrayLike) -> Array:
+        self._known(name)
         try:
             array = np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError):
@@ -88,13 +109,22 @@ class Structure:
 
     @classmethod
     def from_rules(
-        cls, rules: Any, states: Sequence[str], controls: Sequence[str], source: str = "structure"
+        cls,
+        rules: Any,
+        states: Sequence[str],
+        controls: Sequence[str],
+        source: str = "structure",
+        schedule: Schedule | None = None,
     ) -> Structure:
         """From the list under `structure:` in a signals file.
 
         Each rule names elements by `state` (the row; `*` for all) and `from` (a state, a control, `drift`, `noise` or
         `*` for every state and control), and says `nominal` and/or `half_width`: a number, or {min: a, max: b}.
         A later rule overrides an earlier one.
+
+        Of a scheduled model, `knot` names the knot or mode that a rule holds for, by its number from 1 on (a list of
+        numbers if there are two scheduling signals), or all, which is the default; `shared: true` has the elements be
+        the same at all of them.
 
         Parameters
         ----------
@@ -106,6 +136,8 @@ class Structure:
             Names.
         source : str, default "structure"
             What errors call the list.
+        schedule : Schedule, optional
+            Of a scheduled model.
 
         Returns
         -------
@@ -118,7 +150,8 @@ class Structure:
             A rule names what is not there, or is not of this form.
         """
         n, m = len(states), len(controls)
-        structure = cls(n, m)
+        blocks = 1 if schedule is None else schedule.blocks
+        structure = cls(n, m, blocks=blocks)
         if not isinstance(rules, list):
             raise FitError(f"{source}: a list of rules is wanted, not {type(rules).__name__}")
         for number, rule in enumerate(rules):
@@ -128,8 +161,19 @@ class Structure:
                 "from",
                 "nominal",
                 "half_width",
+                "knot",
+                "shared",
             }:
-                raise FitError(f"{here}: a rule has the keys state, from, and nominal and/or half_width")
+                raise FitError(
+                    f"{here}: a rule has the keys state, from, and nominal and/or half_width, or shared; and knot, if "
+                    f"it is not for all knots"
+                )
+            which = _blocks(rule.get("knot", "all"), schedule, f"{here}: knot")
+            same = rule.get("shared", False)
+            if not isinstance(same, bool):
+                raise FitError(f"{here}: shared is {same!r}; write true or false")
+            if "shared" in rule and "knot" in rule and rule["knot"] != "all":
+                raise FitError(f"{here}: what is shared is so at all knots; leave out knot, or shared")
             rows = range(n) if rule["state"] == "*" else [_position(rule["state"], states, f"{here}: state")]
             columns: list[tuple[str, str, int | None]] = []
             additive = [term for term in ADDITIVE if rule["from"] == term.word]
@@ -142,17 +186,23 @@ class Structure:
                 columns = [("A", "dA", j) if j < n else ("B", "dB", j - n)]
             for i in rows:
                 for nominal, half, column in columns:
-                    at = (i,) if column is None else (i, column)
+                    at: tuple[int, ...] = (i,) if column is None else (i, column)
                     for key, name in (("nominal", nominal), ("half_width", half)):
+                        if "shared" in rule and name and (key in rule or not {"nominal", "half_width"} & set(rule)):
+                            structure.shared[name][at] = same
                         if key in rule:
                             if not name:
                                 raise FitError(f"{here}: {rule['from']} has no nominal value; say half_width")
                             low, high = _range(rule[key], f"{here}: {key}")
-                            structure.lower[name][at] = (
-                                max(low, 0.0) if name in HALF_WIDTHS and low == -math.inf else low
-                            )
-                            structure.upper[name][at] = high
-        return cls(n, m, lower=structure.lower, upper=structure.upper)
+                            low = max(low, 0.0) if name in HALF_WIDTHS and low == -math.inf else low
+                            for block in which:
+                                structure.lower[name][(block, *at)] = low
+                                structure.upper[name][(block, *at)] = high
+        lower, upper = structure.lower, structure.upper
+        if schedule is None:
+            one = [{name: array[0] for name, array in side.items()} for side in (lower, upper)]
+            return cls(n, m, lower=one[0], upper=one[1])
+        return cls(n, m, lower=lower, upper=upper, blocks=blocks, shared=structure.shared)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the model file; null for no bound.
@@ -160,16 +210,19 @@ class Structure:
         Returns
         -------
         dict
-            `lower` and `upper`, each by the names of `Structure`.
+            `lower` and `upper`, each by the names of `Structure`, and `shared` where an element is.
         """
 
         def plain(values: Any) -> Any:
             return [plain(v) for v in values] if isinstance(values, list) else values if math.isfinite(values) else None
 
-        return {
+        data: dict[str, Any] = {
             side: {name: plain(array.tolist()) for name, array in getattr(self, side).items()}
             for side in ("lower", "upper")
         }
+        if any(array.any() for array in self.shared.values()):
+            data["shared"] = {name: array.tolist() for name, array in self.shared.items()}
+        return data
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], n: int, m: int) -> Structure:
@@ -195,22 +248,27 @@ class Structure:
             It is not of that form.
         """
 
-        def arrays(side: str) -> dict[str, Array]:
+        def arrays(side: str, kind: type = np.float64) -> dict[str, Any]:
             try:
-                return {name: np.array(values, dtype=np.float64) for name, values in data[side].items() if values}
+                return {name: np.array(values, dtype=kind) for name, values in data[side].items() if values}
             except (AttributeError, KeyError, TypeError, ValueError):
                 raise FitError("structure: the model file does not hold it as it was written; fit again") from None
 
         shaped = {side: {k: v for k, v in arrays(side).items() if v.size} for side in ("lower", "upper")}
-        return cls(n, m, lower=shaped["lower"], upper=shaped["upper"])
+        A = shaped["lower"].get("A")
+        blocks = len(A) if A is not None and A.ndim == 3 else None
+        shared = {k: v for k, v in arrays("shared", bool).items() if v.size} if "shared" in data else None
+        return cls(n, m, lower=shaped["lower"], upper=shaped["upper"], blocks=blocks, shared=shared)
 
-    def stacked(self, names: Collection[str]) -> tuple[Array, Array, Array, Array]:
+    def stacked(self, names: Collection[str], tied: Sequence[int] = (0,)) -> tuple[Array, Array, Array, Array]:
         """Bounds in the order of the unknowns.
 
         Parameters
         ----------
         names : collection of str
             Arrays of the additive terms that the fit has.
+        tied : sequence of int, optional
+            Of each block of the fit the one whose elements it has, itself if they are its own; default one block.
 
         Returns
         -------
@@ -233,18 +291,108 @@ class Structure:
             forced = (self.lower[name] > 0) | (self.upper[name] < 0)
             if name not in names and forced.any():
                 raise FitError(f"structure: {name} is not 0, and the fit has no such term; choose another additive")
-        sides = []
-        for side in (self.lower, self.upper):
-            theta, d = (
-                [
-                    np.atleast_2d(side[name].T)
-                    for term in TERMS
-                    if (name := getattr(term, which)) and (term.required or name in names)
-                ]
-                for which in ("nominal", "half")
+        if self.blocks not in (None, len(tied)):
+            raise FitError(f"structure is for {plural(self.blocks, 'block')}, and the fit has {len(tied)}")
+        theta, d = (
+            tuple(
+                np.vstack([np.vstack(self._columns(side, which, names, r)) for r in tied])
+                for side in (self.lower, self.upper)
             )
-            sides.append((np.vstack(theta), np.vstack(d)))
-        return sides[0][0], sides[1][0], sides[0][1], sides[1][1]
+            for which in ("nominal", "half")
+        )
+        return theta[0], theta[1], d[0], d[1]
+
+    def _columns(
+        self, arrays: Mapping[str, NDArray[Any]], which: str, names: Collection[str], block: int | None
+    ) -> list[NDArray[Any]]:
+        """The arrays of the unknowns of a block, one row per column of the regressors; None for those of one block."""
+        return [
+            np.atleast_2d((arrays[name] if self.blocks is None or block is None else arrays[name][block]).T)
+            for term in TERMS
+            if (name := getattr(term, which)) and (term.required or name in names)
+        ]
+
+    def shared_elements(
+        self, names: Collection[str], tied: Sequence[int]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
+        """Which unknowns are one.
+
+        Parameters
+        ----------
+        names : collection of str
+            Arrays of the additive terms that the fit has.
+        tied : sequence of int
+            Of each block of the fit the one whose elements it has, itself if they are its own.
+
+        Returns
+        -------
+        tuple of array (r, n) and (q, n) of int, or None
+            Of each nominal element and each half-width the position of the one that it is; None where none is shared.
+        """
+        own = all(r == block for r, block in enumerate(tied))
+        if own and (len(tied) == 1 or not any(array.any() for array in self.shared.values())):
+            return None
+        found = []
+        for which in ("nominal", "half"):
+            same = np.vstack(self._columns(self.shared, which, names, None))
+            place = np.arange(len(same))[:, None]
+            found.append(np.vstack([np.where(same, place, r * len(same) + place) for r in tied]))
+        return found[0], found[1]
+
+
+def narrowed(
+    bounds: tuple[Array, Array, Array, Array], shared: tuple[NDArray[np.intp], NDArray[np.intp]]
+) -> tuple[Array, Array, Array, Array]:
+    """Bounds that hold for every element that is one with others.
+
+    Parameters
+    ----------
+    bounds : tuple of array
+        Of `Structure.stacked`.
+    shared : pair of array of int
+        Of `Structure.shared_elements`.
+
+    Returns
+    -------
+    tuple of array
+        As `bounds`: the greatest of their lower bounds, the least of their upper bounds.
+
+    Raises
+    ------
+    FitError
+        They leave nothing.
+    """
+    sides = []
+    for low, high, same in zip(bounds[::2], bounds[1::2], shared, strict=True):
+        rows = np.arange(low.shape[1])
+        most, least = np.full(low.shape, -math.inf), np.full(high.shape, math.inf)
+        np.maximum.at(most, (same, rows), low)
+        np.minimum.at(least, (same, rows), high)
+        low, high = most[same, rows], least[same, rows]
+        if (low > high).any():
+            raise FitError(
+                "structure: an element that is the same at several knots has other bounds at each of them, which no "
+                "number meets; give it one rule for all knots"
+            )
+        sides += [low, high]
+    return sides[0], sides[1], sides[2], sides[3]
+
+
+def _blocks(knot: Any, schedule: Schedule | None, where: str) -> Sequence[int]:
+    """Blocks that a rule holds for."""
+    if knot == "all":
+        return range(1 if schedule is None else schedule.blocks)
+    if schedule is None:
+        raise FitError(f"{where} is {knot!r}, and the model has no schedule; leave it out")
+    numbers = knot if isinstance(knot, list) else [knot]
+    sizes = [len(axis) for axis in schedule.axes]
+    wanted = "a number" if len(sizes) == 1 else "a list of two numbers"
+    if len(numbers) != len(sizes) or any(isinstance(k, bool) or not isinstance(k, int) for k in numbers):
+        raise FitError(f"{where} is {knot!r}; write {wanted}, or all")
+    for k, axis in zip(numbers, schedule.axes, strict=True):
+        if not 1 <= k <= len(axis):
+            raise FitError(f"{where} is {knot!r}; '{axis.signal}' has {len(axis)}, counted from 1")
+    return [schedule.indices.index(tuple(k - 1 for k in numbers))]
 
 
 def _position(name: Any, names: Sequence[str], where: str) -> int:

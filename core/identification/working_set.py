@@ -12,9 +12,19 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Samples
-from uncertain_lti.identification.row import JOIN, LEAST, ROUGH, TIE_BREAK, WIDTH_SLACK, InfeasibleError, Row
+from uncertain_lti.identification.regimes import tied_blocks
+from uncertain_lti.identification.row import (
+    JOIN,
+    LEAST,
+    ROUGH,
+    TIE_BREAK,
+    WIDTH_SLACK,
+    Chosen,
+    InfeasibleError,
+    Row,
+)
 from uncertain_lti.identification.solvers import dual_bound, solve_qp
-from uncertain_lti.identification.structure import Structure
+from uncertain_lti.identification.structure import Structure, narrowed
 
 _FURTHER = 2.5
 """After the first pass, samples are held whose slack is up to this many times as large: few are left there."""
@@ -97,9 +107,18 @@ class WorkingSet:
         stride = 1 if self.whole else fleet.N // SUBSAMPLE
         self.sums, self._first = fleet.moments(stride)
         structure = structure or Structure(fleet.n, fleet.p - fleet.n)
-        bounds = structure.stacked(fleet.columns.names)
+        columns = fleet.columns
+        self.tied = tied_blocks(self.sums, columns, fleet.p)
+        bounds = structure.stacked(columns.names, self.tied)
+        shared = structure.shared_elements(columns.names, self.tied)
+        self.shared = shared
+        if shared is not None:
+            bounds = narrowed(bounds, shared)
         self.half_limits = bounds[2:]  # least and largest half-widths that the structure allows, (q, n) each
-        self.rows = [Row(i, self.sums, bounds) for i in range(fleet.n)]
+        self.rows = [
+            Row(i, self.sums, bounds, None if shared is None else (shared[0][:, i], shared[1][:, i]))
+            for i in range(fleet.n)
+        ]
         self.solvers: set[str] = set()
         self.rounds, self.passes = 0, 1
         self._reach: Array | None = None  # (2, n), in these scales of the rows
@@ -410,7 +429,7 @@ class WorkingSet:
         return Candidate(
             np.column_stack([row.theta for row in rows]),
             np.column_stack([row.d for row in rows]),
-            rows[0].size_unit,
+            rows[0].size_unit if self.shared is None else np.column_stack([row.size_unit for row in rows]),
             np.array([row.scale for row in rows]),
             limit,
             reach[which],
@@ -425,23 +444,25 @@ class WorkingSet:
             return np.inf
         if limit is not None and row.limit is not None and row.limit < limit * (1.0 - 1e-12):
             return np.inf  # the optimum over more samples is no less, so this is rare
-        p = self.fleet.p
+        p, columns = self.fleet.p, self.fleet.columns
+        unit = row.size_unit.reshape(columns.count, -1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            per_column = np.abs(row.d - d) * np.where(row.size_unit > 0, 1.0 / row.size_unit, 0.0)
-            per_column[:p] += np.abs(row.theta - theta)[:p] * np.where(
-                row.size_unit[:p] > 0, 1.0 / row.size_unit[:p], 0.0
-            )
-        nominal, half = self.fleet.columns.nominal, self.fleet.columns.half
+            inverse = np.where(unit > 0, 1.0 / unit, 0.0)
+            per_column = np.abs(row.d - d).reshape(unit.shape) * inverse
+            change = np.abs(row.theta - theta).reshape(columns.count, -1)
+            per_column[:, :p] += change[:, :p] * inverse[:, :p]
+        nominal, half = columns.nominal, columns.half
         still = [k for k, term in enumerate(half, start=p) if not term.times_dt]
         for j, term in enumerate(
             nominal, start=p
         ):  # |c| <= size x ..., by the term of the size that is constant in time
-            change = abs(float(row.theta[j] - theta[j]))
             if term in half:
-                k = p + half.index(term)
-                per_column[k] += change / row.size_unit[k]
+                k, most = p + half.index(term), 1.0
             elif still:
-                per_column[still[0]] += change * self.sums.dt_max / row.size_unit[still[0]]
+                k, most = still[0], self.sums.dt_max
+            else:
+                continue
+            per_column[:, k] += change[:, j] * most * inverse[:, k]
         return float(per_column.max(initial=0.0)) / row.scale * (1.0 + 1e-9)
 
     def _hold(self, row: Row, samples: Samples) -> None:
@@ -502,11 +523,11 @@ class WorkingSet:
         """(10) with full weights, which couple the rows."""
         assert self.sums.coupled is not None
         rows, q_all = self.rows, len(self.sums.psi_scale)
-        keep = np.concatenate([row.i * q_all + row.free_psi for row in rows])
+        kept = self._kept(q_all)
         unit = np.concatenate([row.unit_psi * row.scale for row in rows])
         fixed = np.concatenate([row.fixed_d for row in rows])
-        gram = self.sums.coupled[np.ix_(keep, keep)] * np.outer(unit, unit)
-        linear = (self.sums.coupled @ fixed)[keep] * unit
+        gram = kept.square(self.sums.coupled) * np.outer(unit, unit)
+        linear = kept.take(self.sums.coupled @ fixed) * unit
         largest = float(np.diagonal(gram).max(initial=1e-300))
         starts = np.concatenate([[0], np.cumsum([row.r + row.q for row in rows])])
         where_d = np.concatenate([np.arange(starts[k] + row.r, starts[k + 1]) for k, row in enumerate(rows)])
@@ -516,9 +537,9 @@ class WorkingSet:
         line = 0
         for k, (row, (block, _)) in enumerate(zip(rows, parts, strict=True)):
             mine = slice(starts[k], starts[k + 1])
-            own = (
-                np.diagonal(self.sums.coupled)[row.i * q_all + row.free_psi] * (row.unit_psi * row.scale) ** 2 / largest
-            )
+            mine_psi = slice(row.i * q_all, (row.i + 1) * q_all)
+            diagonal = np.diagonal(row.psi_columns.square(self.sums.coupled[mine_psi, mine_psi]))
+            own = diagonal * (row.unit_psi * row.scale) ** 2 / largest
             H[mine, mine], f[mine] = row.hessian(np.diag(own), np.zeros(row.q), TIE_BREAK)
             G[line : line + len(block), mine] = block
             line += len(block)
@@ -553,6 +574,19 @@ class WorkingSet:
         self._coupled_slope: Array = (gram @ d + linear) / largest
         self._coupled_value = max(value, least, 1e-300)
 
+    def _kept(self, q: int) -> Chosen:
+        """The unknown half-widths of all rows among those of all, q per row."""
+        first = np.concatenate([row.i * q + row.free_psi for row in self.rows])
+        if self.shared is None:
+            return Chosen(first, None)
+        members, before = [], 0
+        for row in self.rows:
+            own = row.psi_columns.members
+            assert own is not None
+            members.append(np.where(own >= 0, own + before, -1))
+            before += row.q
+        return Chosen(first, np.concatenate(members))
+
     def _weight(self, row: Row) -> float:
         """Sum of w_ii over the transitions, about."""
         assert self.sums.coupled is not None
@@ -577,7 +611,7 @@ class WorkingSet:
         for row, own in zip(self.rows, slopes, strict=True):
             if not row.unknown:
                 continue
-            slope = own[row.free_psi] * row.unit_psi * row.scale
+            slope = row.psi_columns.take(own) * row.unit_psi * row.scale
             largest = float(np.abs(slope).max(initial=0.0))
             _, d = row.scaled()
             if largest * (float(d.sum()) + 1.0) <= 1e-12 * value:  # nothing to gain

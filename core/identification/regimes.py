@@ -1,0 +1,375 @@
+"""Regimes of a scheduled fit: its knots, and the blocks that have data enough for elements of their own."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError, ModelError
+from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.problem import Columns, Problem, Regimes
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.signals.signal_map import Signal, SignalMap
+
+LOOKED_AT = 20_000
+"""Transitions that inner knots are chosen on, at most."""
+CANDIDATES = 16
+"""Places that are tried for an inner knot, as many quantiles of the signal and as many at equal distances."""
+RANK = 1e-12
+"""Relative eigenvalue of a block's regressors, per column, below which a direction counts as never moved."""
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Modes of a discrete scheduling signal, each with a block of its own.
+
+    Parameters
+    ----------
+    values : sequence of float
+        In recorded units.
+    """
+
+    values: Sequence[float]
+
+
+Knots = Sequence[float] | Modes | int | str
+"""Of one scheduling signal its knots in recorded units, its modes, or how many knots; a text is refused."""
+
+
+def tied_blocks(sums: Moments, columns: Columns, p: int) -> list[int]:
+    """Which block's elements each block has: its own, if it has data enough.
+
+    A block needs as many transitions of which it has the largest weight as it has unknowns per row, and its regressors
+    must move in as many independent ways as those of all blocks together. A block that lacks either is tied to the
+    nearest that does not: the least number of knots away, of two the one with more transitions; to another mode only
+    if no knot of its own mode will do. If every block lacks them, all are tied to the one with most transitions.
+
+    Parameters
+    ----------
+    sums : Moments
+        Of all data.
+    columns : Columns
+        With the schedule.
+    p : int
+        Number of states and controls.
+
+    Returns
+    -------
+    list of int
+        One per block; [0] of a model without a schedule.
+    """
+    if columns.regimes is None:
+        return [0]
+    schedule = columns.regimes.schedule
+    reasons = lacking(sums.centre, sums.visits, columns, p)
+    rich = [r for r, reason in enumerate(reasons) if not reason] or [int(np.argmax(sums.visits))]
+    far = [1 if axis.knots else MOST for axis in schedule.axes]
+
+    def distance(r: int, other: int) -> tuple[int, int, int]:
+        steps = zip(schedule.indices[r], schedule.indices[other], far, strict=True)
+        return sum(abs(a - b) * each for a, b, each in steps), -int(sums.visits[other]), other
+
+    return [r if r in rich else min(distance(r, other) for other in rich)[2] for r in range(schedule.blocks)]
+
+
+MOST = 10_000
+"""Knots that another mode is away."""
+
+
+def lacking(gram: Array, visits: NDArray[np.intp], columns: Columns, p: int) -> list[str]:
+    """What each block lacks for elements of its own.
+
+    Parameters
+    ----------
+    gram : array (R r, R r)
+        Of the regressors of the nominal row.
+    visits : array (R,) of int
+        Transitions of which each block has the largest weight.
+    columns : Columns
+        With the schedule.
+    p : int
+        Number of states and controls.
+
+    Returns
+    -------
+    list of str
+        One per block, in words; empty if it lacks nothing.
+    """
+    assert columns.regimes is not None
+    schedule, positions = columns.regimes.schedule, columns.regimes.positions
+    count, unknowns = len(visits), columns.unknowns(p)
+    parts = gram.reshape(count, len(gram) // count, count, -1)
+    whole = _rank(parts.sum(axis=(0, 2)))
+    # within a mode its signal is constant, and cannot be told from a drift or from another such signal
+    modes = [k for k, axis in enumerate(schedule.axes) if axis.modes and positions[k] < p]
+    reasons = []
+    for r, index in enumerate(schedule.indices):
+        there = columns.drift or any(schedule.axes[k].values[index[k]] != 0.0 for k in modes)
+        wanted = whole - (len(modes) + columns.drift) + there
+        if visits[r] < unknowns:
+            reasons.append(f"{plural(int(visits[r]), 'transition')} for {unknowns} unknowns per row")
+        elif (rank := _rank(parts[r, :, r])) < wanted:
+            reasons.append(f"its signals move in {rank} independent ways, where {wanted} are needed")
+        else:
+            reasons.append("")
+    return reasons
+
+
+def _rank(gram: Array) -> int:
+    """Independent columns, of their Gram matrix."""
+    scale = np.sqrt(np.diagonal(gram))
+    there = np.flatnonzero(scale > 0)
+    unit = 1.0 / scale[there]
+    values = np.linalg.eigvalsh(gram[np.ix_(there, there)] * np.outer(unit, unit))
+    return int(np.count_nonzero(values > RANK * len(there)))
+
+
+def block_data(sums: Moments, tied: Sequence[int]) -> tuple[BlockData, ...]:
+    """What the model file says of each block.
+
+    Parameters
+    ----------
+    sums : Moments
+        Of all data.
+    tied : sequence of int
+        Of `tied_blocks`.
+
+    Returns
+    -------
+    tuple of BlockData
+        One per block.
+    """
+    return tuple(
+        BlockData(int(count), None if block == r else block)
+        for r, (count, block) in enumerate(zip(sums.visits, tied, strict=True))
+    )
+
+
+def tied_words(
+    schedule: Schedule, sums: Moments, columns: Columns, p: int, tied: Sequence[int], signals: Sequence[Signal]
+) -> list[str]:
+    """Which blocks share the elements of another, and why.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        The schedule.
+    sums : Moments
+        Of all data.
+    columns : Columns
+        With the schedule.
+    p : int
+        Number of states and controls.
+    tied : sequence of int
+        Of `tied_blocks`.
+    signals : sequence of Signal
+        With the operating point.
+
+    Returns
+    -------
+    list of str
+        Messages, one per block that is tied.
+    """
+    messages = []
+    reasons = lacking(sums.centre, sums.visits, columns, p)
+    for r, (reason, block) in enumerate(zip(reasons, tied, strict=True)):
+        if block == r:
+            continue
+        where, other = place(schedule, r, signals), place(schedule, block, signals)
+        if not sums.visits[r]:
+            reason = "no transition is nearest to it, so there is no bound to trust there"
+        messages.append(
+            f"the block at {where} has too little data for elements of its own ({reason}) and shares those at {other}: "
+            f"record the machine there, or give fewer knots"
+        )
+    return messages
+
+
+def place(schedule: Schedule, block: int, signals: Sequence[Signal]) -> str:
+    """A block in words.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        The schedule.
+    block : int
+        Number of the block.
+    signals : sequence of Signal
+        With the operating point.
+
+    Returns
+    -------
+    str
+        Signals with their knots in recorded units.
+    """
+    named = {s.name: s for s in signals}
+    parts = []
+    for axis, index in zip(schedule.axes, schedule.indices[block], strict=True):
+        signal = named[axis.signal]
+        value = float(signal.steady) + float(signal.scale) * axis.values[index]
+        parts.append(f"{axis.signal} {'= ' if axis.modes else ''}{value:.6g}{' ' + signal.unit if signal.unit else ''}")
+    return ", ".join(parts)
+
+
+def scheduled_by(
+    schedule: Schedule | Mapping[str, Knots] | None,
+    signals: SignalMap,
+    data: Callable[[], Problem] | None = None,
+) -> Schedule | None:
+    """What a fit is scheduled by.
+
+    Parameters
+    ----------
+    schedule : Schedule, mapping or None
+        As `fit` takes it; None for what the signals file says.
+    signals : SignalMap
+        With the operating point.
+    data : callable, optional
+        Gives the data, without a schedule, on which knots are placed if only their number is known; default none.
+
+    Returns
+    -------
+    Schedule or None
+        Normalised; None for one block.
+
+    Raises
+    ------
+    FitError
+        There is no such signal, knots do not increase or are none, or a signal that is to have several never moves;
+        names the signal.
+    """
+    if schedule is None:
+        schedule = {rule.signal: Modes(rule.modes) if rule.knots is None else rule.knots for rule in signals.schedule}
+    if isinstance(schedule, Schedule):
+        return schedule
+    if not isinstance(schedule, Mapping):
+        raise FitError(
+            f"schedule is {type(schedule).__name__}; give a Schedule, or a mapping from signals to knots in recorded "
+            f"units, Modes, or how many knots"
+        )
+    names = [s.name for s in signals.signals]
+    asked: dict[str, Knots] = {}
+    for name, knots in schedule.items():
+        if name not in names:
+            near = difflib.get_close_matches(str(name), names, 3, 0.5)
+            there = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names)}"
+            raise FitError(f"schedule: there is no signal '{name}'; {there}")
+        if isinstance(knots, str):
+            if knots == "auto":
+                raise FitError(
+                    f"schedule: the knots of '{name}' are auto, and this fit chooses none: it is left-out recordings "
+                    f"that decide how many they carry; use the command fit, or give knots or how many"
+                )
+            raise FitError(f"schedule: the knots of '{name}' are {knots!r}; give numbers, Modes, or how many")
+        if isinstance(knots, (int, np.integer)):
+            if isinstance(knots, bool) or knots < 1:
+                raise FitError(f"schedule: '{name}' has {knots!r} knots; give at least 1")
+            if knots == 1:
+                continue
+            if data is None:
+                raise FitError(
+                    f"schedule: '{name}' has {knots} knots, and where they are is unknown before all recordings are "
+                    f"read; list them (a fit to a few of the recordings prints them)"
+                )
+        asked[name] = knots
+    if not asked:
+        return None
+    problem = data() if data and any(isinstance(k, (int, np.integer)) for k in asked.values()) else None
+    try:
+        return Schedule(
+            tuple(
+                _axis(signals.signals[names.index(name)], names.index(name), knots, problem)
+                for name, knots in asked.items()
+            )
+        )
+    except ModelError as error:
+        raise FitError(str(error)) from None
+
+
+def _axis(signal: Signal, row: int, knots: Knots, problem: Problem | None) -> Axis:
+    """Knots or modes of one signal, normalised; row: its position in [x; u; s]."""
+    if isinstance(knots, (int, np.integer)):
+        assert problem is not None
+        return Axis(signal.name, knots=_split(problem, row, int(knots), signal.name))
+    given = knots.values if isinstance(knots, Modes) else knots
+    try:
+        values = np.asarray(list(given), dtype=np.float64)
+    except (TypeError, ValueError):
+        raise FitError(
+            f"schedule: the knots of '{signal.name}' are no numbers; give numbers, Modes, or how many"
+        ) from None
+    # as the samples are normalised, to the bit: a mode is met exactly
+    normalised = tuple(((values - float(signal.steady)) / float(signal.scale)).tolist())
+    return Axis(signal.name, **{"modes" if isinstance(knots, Modes) else "knots": normalised})
+
+
+def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ...]:
+    """Knots from the least to the greatest value, the inner ones where they shrink the largest residual most.
+
+    One after the other: each is tried at places over the range, and stays where the least-squares fit with it leaves
+    the least product of the largest residuals of all states. Squares would go where most of the data is; it is the
+    largest residual that the widths come from.
+    """
+    stride = max(1, -(-problem.N // LOOKED_AT))
+    some = problem.subset(slice(None, None, stride)) if stride > 1 else problem
+    p = problem.p
+    values = some.z_columns[row] if row < p or some.s_columns is None else some.s_columns[row - p]
+    least, most = _range(problem, row)
+    if not least < most:
+        raise FitError(
+            f"schedule: '{name}' is constant in every transition, so it can have no {count} knots; record it moving, "
+            f"or schedule on another signal"
+        )
+    knots = [least, most]
+    even = np.linspace(0, 1, CANDIDATES + 2)[1:-1]
+    seen = np.unique([*np.quantile(values, even, method="nearest"), *(least + (most - least) * even)]).tolist()
+    while len(knots) < count:
+        trials = [
+            (*_left(some, row, sorted([*knots, s]), stride), s) for s in seen if least < s < most and s not in knots
+        ]
+        # an end that is seldom reached need not keep the others from knots of their own
+        trials = [trial for trial in trials if trial[0] <= 2]
+        if not trials:
+            raise FitError(
+                f"schedule: '{name}' takes too few values for {count} knots, or the recordings hold too little near "
+                f"each of them; give fewer, or Modes with its values"
+            )
+        knots = sorted([*knots, min(trials)[2]])
+    return tuple(knots)
+
+
+def _range(problem: Problem, row: int) -> tuple[float, float]:
+    """Least and greatest value of a row of [x; u; s]."""
+    p = problem.p
+    values = problem.z_columns[row] if row < p or problem.s_columns is None else problem.s_columns[row - p]
+    return float(values.min()), float(values.max())
+
+
+def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tuple[int, float]:
+    """How many blocks would lack data, and the sum over the states of the logarithm of the largest residual.
+
+    each: transitions that one of the problem stands for. A block between the ends that lacks data counts as many.
+    """
+    regimes = Regimes(Schedule((Axis("s", knots=tuple(knots)),)), (row,))
+    columns = replace(problem.columns, regimes=regimes)
+    phi = columns.phi(problem.z_columns, problem.s_columns) * problem.dt
+    step = problem.next_columns - problem.z_columns[: problem.n]
+    gram = phi @ phi.T
+    visits = each * np.bincount(
+        regimes.weights(problem.z_columns, problem.s_columns).argmax(axis=0), minlength=len(knots)
+    )
+    lacks = [bool(reason) for reason in lacking(gram, visits, columns, problem.p)]
+    unit = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
+    ridge = 1e-12 * np.eye(len(gram))
+    theta = np.linalg.solve(gram * np.outer(unit, unit) + ridge, (phi @ step.T) * unit[:, None]) * unit[:, None]
+    largest = np.abs(step - theta.T @ phi).max(axis=1)
+    scale = np.maximum(np.abs(step).max(axis=1), 1e-300)
+    left = float(sum(math.log(max(r, 1e-12)) for r in largest / scale))
+    return lacks[0] + lacks[-1] + len(knots) * sum(lacks[1:-1]), left
