@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Iterator
@@ -16,10 +17,13 @@ from bag_writer import Layout, Message, Topic, cdr, float64, header, write
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.stamps import header_stamp_ns
+from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
@@ -259,6 +263,52 @@ def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp
     outputs = Outputs.of(world)
     world.command("play", bag, "--clock", "--lockstep", "envelope_monitor").succeed(120)
     outputs.hold_against(verdicts, ("a",))
+
+
+def scheduled_by_hand() -> UncertainLTI:
+    """`by_hand` over three knots of a state and the modes of a further topic; block 0 was never visited."""
+    one = by_hand(alarm_rule=AlarmRule(2, 5))
+    gear = Signal("gear", "/gear", "data", type="std_msgs/msg/Float64", max_hold=0.3)
+    signals = replace(one.signals, scheduling=(gear,), time={**one.signals.time, "/gear": "log"})
+    schedule = Schedule((Axis("a", knots=(-0.02, 0.0, 0.03)), Axis("gear", modes=(1.0, 2.0))))
+    rng = np.random.default_rng(8)
+    arrays = {
+        name: np.stack([getattr(one, name) * rng.uniform(0.5, 1.0) for _ in range(schedule.blocks)]) for name in ARRAYS
+    }
+    return UncertainLTI(
+        **arrays,
+        schedule=schedule,
+        block_data=[BlockData(r) for r in range(schedule.blocks)],
+        signals=signals,
+        sampling=replace(one.sampling, time=dict(signals.time)),
+        alarm_rule=one.alarm_rule,
+    )
+
+
+def test_a_scheduled_model_gives_live_what_it_gives_offline(world: World, tmp_path: Path) -> None:
+    model = scheduled_by_hand()
+    path = saved(model, tmp_path)
+    plain = header_bag(by_hand(), tmp_path / "plain.mcap", 500)
+    messages = [Message(m.topic, m.log_time_ns, m.data) for m in Bag(plain).raw_messages((STATE, CONTROL))]
+    first = messages[0].log_time
+    gears = [1.0, 2.0, 1.0, 3.0, 2.0, math.nan, 1.0]  # the model lists no third one, and NaN is none
+    for k, gear in enumerate(gears * 4):
+        messages.append(Message("/gear", first + k * 17 * STEP_NS + 1, float64(gear)))
+    messages.sort(key=lambda m: m.log_time)
+    topics = [Topic(STATE, JOINT_STATE), Topic(CONTROL, VECTOR), Topic("/gear")]
+    bag = write(topics, messages).save(tmp_path / "run.mcap")
+    verdicts = offline(path, bag)
+    assert {v.status for v in verdicts} >= {Status.OK, Status.MODE, Status.MISSING}
+    assert 10 < sum(v.unknown_regime for v in verdicts) < sum(v.judged for v in verdicts) - 10
+    checked = EnvelopeMonitor(model).check(read_as_fitted(bag, UncertainLTI.load(path).signals))
+    assert bits(checked.lower[checked.judged]) == bits([v.lower for v in verdicts if v.judged])
+    world.monitor(path, use_sim_time=True)
+    outputs = Outputs.of(world)
+    diagnostics = Diagnostics(world)
+    world.command("play", bag, "--clock", "--lockstep", "envelope_monitor").succeed(120)
+    outputs.hold_against(verdicts, ("a", "b"))
+    texts = " ".join(status.message for message in diagnostics.topic.messages for status in message.status)
+    assert "regime not fitted" in texts and "the scheduling signal has a value that the model does not list" in texts
 
 
 def test_a_looped_bag_starts_anew_and_gives_the_same_again(world: World, tmp_path: Path) -> None:
