@@ -10,6 +10,7 @@ import pytest
 from uncertain_lti import OperatingPoint, Transient, fit, read_transients
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import working_set
+from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.structure import Structure
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,6 +37,21 @@ def test_no_fit_is_above_its_optimum(first):
             assert not np.isfinite(found.optimum).all(), f"{where}: {found.error}"
         compared += known.any()
     assert compared >= 14
+
+
+@pytest.mark.parametrize("seed, known", [(59, True), (304, True), (84, False), (399, False)])
+def test_rows_that_are_solved_in_turn_have_a_bound(seed, known):
+    """Full weights, and by rounding the objective falls as some half-widths grow: without end, a slope would say."""
+    drawn = optimum.case(seed)
+    found = optimum.compare(drawn, "qp")
+    assert found.gap is not None and found.gap <= 1e-5
+    assert np.isfinite(found.excess).all() == known  # where the independent solvers agree
+    assert not known or found.gap >= found.true_gap - 2 * optimum.AGREE
+    engine = working_set.WorkingSet(Fleet([drawn.assembled()]), drawn.options["structure"])
+    engine.quadratic()
+    for row in engine.rows:
+        row.d = 1.01 * row.d
+    assert engine._coupled_linear_gap() >= (1 - 1 / 1.01**2) - 1e-5  # what is 1 % wider is known to be
 
 
 @pytest.mark.parametrize("bag", ["turbofan_pulses_up", "turbofan_pulses_down", "turbofan_check", "turbofan_levels"])

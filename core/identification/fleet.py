@@ -208,6 +208,16 @@ class Fleet:
         _, state, step = max(results, key=lambda r: r[2])
         return sum(r[0] for r in results), state, step
 
+    def least_eigenvalue(self) -> float:
+        """Least eigenvalue of any full weight; see `passes.least_eigenvalue`.
+
+        Returns
+        -------
+        float
+            At most 1.
+        """
+        return min(self.map(passes.least_eigenvalue, self._same()))
+
     def median_dt(self) -> float:
         """Median step.
 

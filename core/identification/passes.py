@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
-from uncertain_lti.identification.problem import Block, Columns, Partition
+from uncertain_lti.identification.problem import Block, Columns, Partition, scaled_eigenvalues
 from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
@@ -799,3 +799,19 @@ def steps(part: Partition) -> Array:
         Δt, s.
     """
     return np.concatenate([block.dt for block in part.blocks()])
+
+
+def least_eigenvalue(part: Partition) -> float:
+    """Least eigenvalue of any full weight, its diagonal scaled to ones.
+
+    Parameters
+    ----------
+    part : Partition
+        The transitions, with full weights.
+
+    Returns
+    -------
+    float
+        Positive, at most 1.
+    """
+    return min(float(scaled_eigenvalues(block.weights)[:, 0].min()) for block in part.blocks())

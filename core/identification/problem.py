@@ -858,6 +858,25 @@ def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> floa
     return square
 
 
+def scaled_eigenvalues(weights: Array) -> Array:
+    """Eigenvalues of full weights whose diagonals are scaled to ones.
+
+    The scales of the states are taken apart, as their squares may differ by more than arithmetic holds.
+
+    Parameters
+    ----------
+    weights : array (K, n, n)
+        Symmetric.
+
+    Returns
+    -------
+    array (K, n)
+        In rising order.
+    """
+    unit = 1.0 / np.sqrt(np.maximum(np.einsum("kii->ki", weights), 1e-300))
+    return np.asarray(np.linalg.eigvalsh(weights * unit[:, :, None] * unit[:, None, :]))
+
+
 def _weights(
     weights: ArrayLike | Sequence[ArrayLike] | None,
     transients: Sequence[Transient],
@@ -905,9 +924,7 @@ def _weights(
         symmetric = np.abs(chosen - chosen.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-12 * largest
         if not symmetric.all():
             raise FitError(f"weights: the matrix of step {int(np.argmin(symmetric))} is not symmetric")
-        # the scales of the states apart, whose squares may differ by more than arithmetic holds
-        unit = 1.0 / np.sqrt(np.maximum(np.einsum("kii->ki", chosen), 1e-300))
-        smallest = np.linalg.eigvalsh(chosen * unit[:, :, None] * unit[:, None, :])[:, 0]
+        smallest = scaled_eigenvalues(chosen)[:, 0]
         if smallest.min() <= 0:
             raise FitError(f"weights: the matrix of step {int(np.argmin(smallest))} is not positive definite")
     elif (chosen <= 0).any():

@@ -838,13 +838,15 @@ class Row:
         """
         self.theta, self.d, self.kept = answer
 
-    def least_linear(self, cost: Array) -> float:
+    def least_linear(self, cost: Array, most: Array | None = None) -> float:
         """Minimise costᵀ d over scaled half-widths that contain the working set.
 
         Parameters
         ----------
         cost : array (q,)
             Of the free half-widths.
+        most : array (q,), optional
+            They are no larger than this.
 
         Returns
         -------
@@ -856,7 +858,10 @@ class Row:
         FitError
             The simplex method found none.
         """
-        simplex = Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, self.upper)
+        upper = self.upper.copy()
+        if most is not None:
+            upper[self.r :] = np.minimum(upper[self.r :], most)
+        simplex = Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, upper)
         simplex.add(*self._asked(*self.containment(self.pool)))
         return float(cost @ simplex.solve()[self.r :])
 

@@ -124,6 +124,7 @@ class WorkingSet:
         self._reach: Array | None = None  # (2, n), in these scales of the rows
         self._reach_scales = np.empty(0)
         self._coupled_gap = np.inf
+        self._least_eigenvalue: float | None = None  # of the full weights, once it is needed
 
     def quadratic(self) -> Solution:
         """Solve (10).
@@ -587,6 +588,22 @@ class WorkingSet:
             before += row.q
         return Chosen(first, np.concatenate(members))
 
+    def _at_most(self, row: Row) -> Array:
+        """Largest scaled half-widths that the optimum of (10) with full weights can have, (q,) of the free ones.
+
+        Σ w' W w over the samples is at least λ Σ w_ii w_i², with λ the least eigenvalue of any W whose diagonal is
+        scaled to ones; and no product of two half-widths of a row is negative, so that each alone is bounded. What
+        the row is now, lifted over what it violates, is no less than the optimum on the samples held.
+        """
+        assert self.sums.coupled is not None
+        if self._least_eigenvalue is None:
+            self._least_eigenvalue = self.fleet.least_eigenvalue()
+        flat = np.concatenate([other.d + other.outside() * other.size_unit * other.scale for other in self.rows])
+        square = 4.0 * float(flat @ self.sums.coupled @ flat)  # some room for what the structure does not let be lifted
+        mine = slice(row.i * len(row.d), (row.i + 1) * len(row.d))
+        own = row.psi_columns.take(np.diagonal(self.sums.coupled)[mine]) * (row.unit_psi * row.scale) ** 2
+        return np.asarray(np.sqrt(square / (max(self._least_eigenvalue, 1e-300) * np.maximum(own, 1e-300))))
+
     def _weight(self, row: Row) -> float:
         """Sum of w_ii over the transitions, about."""
         assert self.sums.coupled is not None
@@ -601,7 +618,11 @@ class WorkingSet:
         return float(np.abs(self._coupled_slope) @ lifts) / self._coupled_value
 
     def _coupled_linear_gap(self) -> float:
-        """As `Row.linear_gap`; the rows meet in the objective alone."""
+        """As `Row.linear_gap`; the rows meet in the objective alone.
+
+        Unlike without full weights, the objective may fall as a half-width grows, by rounding at least: there the
+        linearisation has no minimum but for what the squared widths themselves allow (`_at_most`).
+        """
         assert self.sums.coupled is not None
         flat = np.concatenate([row.d for row in self.rows])
         slopes = (self.sums.coupled @ flat).reshape(len(self.rows), -1)
@@ -614,10 +635,12 @@ class WorkingSet:
             slope = row.psi_columns.take(own) * row.unit_psi * row.scale
             largest = float(np.abs(slope).max(initial=0.0))
             _, d = row.scaled()
-            if largest * (float(d.sum()) + 1.0) <= 1e-12 * value:  # nothing to gain
+            falls = bool((slope < 0.0).any())
+            if not falls and largest * (float(d.sum()) + 1.0) <= 1e-12 * value:  # nothing to gain
                 continue
             try:
-                above += float(slope @ d) - row.least_linear(slope / largest) * largest
+                most = self._at_most(row) if falls else np.full(row.q, np.inf)
+                above += float(slope @ d) - row.least_linear(slope / largest, most) * largest
             except FitError:
                 return np.inf
         return max(above, 0.0) / value
