@@ -95,7 +95,7 @@ class Node(node_module.EnvelopeMonitorNode):
         self.set_parameters([Parameter("model", value=str(path))])
         self.start()
         assert self.active, self._reason
-        for name, output in self._outputs.items():
+        for name, output in self.outputs.publishers.items():
             output.send = self._keeps(name)
             output.listeners = int(name not in silent)
             output.poll = lambda: None
@@ -463,12 +463,12 @@ def test_an_output_that_fails_is_reported_and_the_node_goes_on(ros: None, tmp_pa
     def fail(data: bytes) -> None:
         raise RuntimeError("the publisher is gone")
 
-    kept = node._outputs["upper"].send
+    kept = node.outputs.publishers["upper"].send
     for k, message in enumerate(stream(model, rng, 60, 0.0)):
         if k == 60:
-            node._outputs["upper"].send = fail
+            node.outputs.publishers["upper"].send = fail
         if k == 70:
-            node._outputs["upper"].send = kept
+            node.outputs.publishers["upper"].send = kept
         node.arrive(*message)
     assert node.failures.count == node.session.failures > 0
     assert node.session.verdicts > 45
@@ -493,7 +493,7 @@ def test_an_interrupt_while_something_is_sent_ends_the_process(ros: None, tmp_pa
     def interrupt(data: bytes) -> None:
         raise KeyboardInterrupt
 
-    node._outputs["upper"].send = interrupt
+    node.outputs.publishers["upper"].send = interrupt
     with pytest.raises(KeyboardInterrupt):
         node.arrive(*last)
     assert not node.failures.count

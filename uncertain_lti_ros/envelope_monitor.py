@@ -8,37 +8,29 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.compiled import why_not
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.arming import Condition
-from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.failures import Failures
 from uncertain_lti.monitor.journal import Journal
-from uncertain_lti.monitor.outputs import OUTPUTS, VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session
 from uncertain_lti.monitor.snapshot import Entry
-from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
 from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.diagnostics import Diagnostics, input_values
 from uncertain_lti_ros.messages import message_class
-from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
-from uncertain_lti_ros.polled_events import PolledEvents
 from uncertain_lti_ros.process import living, spare_the_middleware
+from uncertain_lti_ros.publishers import Outputs
 from uncertain_lti_ros.sessions import make_session
 from uncertain_lti_ros.settings import Settings
 from uncertain_lti_ros.snapshots import Snapshots
@@ -54,39 +46,12 @@ _POLL = 0.05  # s between two polls of the middleware: who listens, publishers t
 _TICK = 0.2  # s between two looks at what goes by time
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
 _NOTE = 0.05  # s between two looks for what the log should say
-_OUTPUT_DEPTH = 1000
 _LAST_WORDS = 1.0  # s that the end waits for readers of /diagnostics to have the last report
 
 _TRANSITIONS = {
     getattr(Transition, name): name.removeprefix("TRANSITION_").lower()
     for name in ("TRANSITION_CONFIGURE", "TRANSITION_CLEANUP", "TRANSITION_ACTIVATE", "TRANSITION_DEACTIVATE")
 }
-
-
-class _Publisher:
-    """One topic of the node, and how many listen to it; takes serialised messages."""
-
-    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
-        events = PublisherEventCallbacks(matched=self._matched)
-        self._node = node
-        self._publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
-        self._events = PolledEvents(node, self._publisher)
-        self.poll = self._events.poll
-        self.listeners = 0
-        # Past the check of the lifecycle state: the node publishes only while it is active.
-        self.send = self._publisher.handle.publish_raw
-
-    def _matched(self, event: Any) -> None:
-        self.listeners = event.current_count
-
-    def destroy(self) -> None:
-        """Stop publishing."""
-        self._events.destroy()
-        self._node.destroy_lifecycle_publisher(self._publisher)
-
-
-_Vector = tuple[_Publisher, Callable[[AnyVerdict], bytes]]
-"""A publisher, and what makes its message of a verdict."""
 
 
 def _failures_noted(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
@@ -115,11 +80,11 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._reason = ""  # why the last configure failed
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self._inputs: dict[str, MatchedSubscription] = {}
-        self._outputs: dict[str, _Publisher] = {}
         self._enable_problem = ""
         self._candidate: Session | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
-        self._published = self._looked = self._reported = time.monotonic()
+        self._looked = self._reported = time.monotonic()
+        self.outputs = Outputs(self, self._looked)
         self.failures = Failures(self.get_logger().error)
         self._clock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
         self._simulated = self._clock.ros_time_is_active
@@ -191,7 +156,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is not None and self.active:
             session.go_on_from(self.session)
         self.session = session
-        self._prepare_outputs()
+        self.outputs.prepare(self.session.model.state_names)
         self.snapshots.clear()
         if self.active:
             self._subscribe()
@@ -247,29 +212,12 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._report()
             return TransitionCallbackReturn.FAILURE
         self._reason = ""
-        qos = QoSProfile(depth=_OUTPUT_DEPTH)
-        beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=self.settings.real("heartbeat")))
-        for output in OUTPUTS:
-            kind = message_class(output.type)
-            self._outputs[output.name] = _Publisher(self, kind, output.name, beat if output is VIOLATION else qos)
-        self._violation = self._outputs[VIOLATION.name]
-        self._prepare_outputs()
+        self.outputs.open(self.settings.real("heartbeat"))
+        self.outputs.prepare(self.session.model.state_names)
         self.get_logger().info(f"configured with {Path(path).name}: {self.session.model}")
         if self.session.model.sampling.dt_median is None:
             self.get_logger().info("the model has no median step, so nothing is predicted")
         return super().on_configure(state)
-
-    def _prepare_outputs(self) -> None:
-        assert self.session is not None
-        names = self.session.model.state_names
-        encode = VerdictMessages(names, sendable).encode
-
-        def vectors(*when: str) -> list[_Vector]:
-            chosen = [output.name for output in OUTPUTS if output.position and output.when in when]
-            return [(self._outputs[name], encode[name]) for name in chosen]
-
-        self._vectors = vectors("message"), vectors("message", "judged")
-        self._predicted = vectors("predicted")
 
     @_failures_noted
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -300,8 +248,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
         self.get_logger().info(f"active: listening to {', '.join(topics)}")
         self.active = True
-        for output in self._outputs.values():
-            output.poll()
+        self.outputs.poll()
         self._beat()
         return result
 
@@ -380,9 +327,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _put_away(self) -> None:
         self._unsubscribe()
         self.snapshots.close(self.session)
-        for output in self._outputs.values():
-            output.destroy()
-        self._outputs.clear()
+        self.outputs.close()
         self.session = None
 
     def finish(self) -> None:
@@ -455,31 +400,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         if turned and not session.alarm:
             self.snapshots.alarm_over(now)
         if verdicts or opened or turned:
-            self._publish(session, verdicts, opened, now, turned)
-
-    def _publish(self, session: Session, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
-        """Publish what is listened to; turned: the alarm did, which is said in any case.
-
-        First everything is laid out, then all of it is sent in one go: threads of the middleware that are woken by
-        one message then find the others as well, and need not be woken again.
-        """
-        messages = []
-        for verdict in verdicts:
-            judged = verdict.judged
-            for publisher, encode in self._vectors[judged]:
-                if publisher.listeners:
-                    messages.append((publisher.send, encode(verdict)))
-            turned |= judged and self._violation.listeners > 0
-        if opened and any(publisher.listeners for publisher, _ in self._predicted):
-            expected = session.predict()
-            for publisher, encode in self._predicted:
-                if publisher.listeners and expected is not None:
-                    messages.append((publisher.send, encode(expected)))
-        if turned:
-            self._published = now
-            messages.append((self._violation.send, TRUE if session.alarm else FALSE))
-        for send, message in messages:
-            send(message)
+            self.outputs.publish(session, verdicts, opened, now, turned)
 
     def _arrival(self) -> int:
         """The time at which a message comes, ns; the clock's own call makes three objects."""
@@ -488,8 +409,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _beat(self) -> None:
         assert self.session is not None
-        self._published = time.monotonic()
-        self._violation.send(TRUE if self.session.alarm else FALSE)
+        self.outputs.send_alarm(self.session.alarm, time.monotonic())
 
     # --- heartbeat, graph, diagnostics ---
 
@@ -505,8 +425,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _on_poll(self) -> None:
         for subscription in self._inputs.values():
             subscription.poll()
-        for output in self._outputs.values():
-            output.poll()
+        self.outputs.poll()
         if any(s.look_soon for s in self._inputs.values()):
             self._look_around()
 
@@ -515,7 +434,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._simulated = self._clock.ros_time_is_active
 
     def _keep_beating(self) -> None:
-        if self.active and time.monotonic() - self._published >= self.settings.real("heartbeat") / 2:
+        if self.active and time.monotonic() - self.outputs.alarm_sent >= self.settings.real("heartbeat") / 2:
             self._beat()
 
     def _look_around(self) -> None:

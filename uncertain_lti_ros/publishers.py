@@ -1,0 +1,186 @@
+"""Publishers of the node's outputs: what is listened to is laid out, then sent in one go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile
+
+from uncertain_lti.monitor.envelope_monitor import Verdict
+from uncertain_lti.monitor.outputs import OUTPUTS, VIOLATION
+from uncertain_lti.monitor.session import Session
+from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
+from uncertain_lti_ros.messages import message_class
+from uncertain_lti_ros.outputs import sendable
+from uncertain_lti_ros.polled_events import PolledEvents
+
+_OUTPUT_DEPTH = 1000
+
+
+class OutputPublisher:
+    """One topic of the node, and how many listen to it; takes serialised messages.
+
+    Parameters
+    ----------
+    node : LifecycleNode
+        The node.
+    kind : type
+        Message class.
+    name : str
+        Of the topic, below the node's.
+    qos : QoSProfile
+        What is offered.
+
+    Attributes
+    ----------
+    listeners : int
+        Subscriptions at the last poll.
+    send : callable
+        Publishes the bytes of a message.
+    poll : callable
+        Takes up what has changed.
+    """
+
+    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
+        events = PublisherEventCallbacks(matched=self._matched)
+        self._node = node
+        self._publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
+        self._events = PolledEvents(node, self._publisher)
+        self.poll = self._events.poll
+        self.listeners = 0
+        # Past the check of the lifecycle state: the node publishes only while it is active.
+        self.send = self._publisher.handle.publish_raw
+
+    def _matched(self, event: Any) -> None:
+        self.listeners = event.current_count
+
+    def destroy(self) -> None:
+        """Stop publishing."""
+        self._events.destroy()
+        self._node.destroy_lifecycle_publisher(self._publisher)
+
+
+_Vector = tuple[OutputPublisher, Callable[[AnyVerdict], bytes]]
+"""A publisher, and what makes its message of a verdict."""
+
+
+class Outputs:
+    """The publishers of all `OUTPUTS`.
+
+    Parameters
+    ----------
+    node : LifecycleNode
+        The node.
+    now : float
+        Steady time, s.
+
+    Attributes
+    ----------
+    publishers : dict of str to OutputPublisher
+        By name of the output; empty while the node is not configured.
+    alarm_sent : float
+        When ~/violation was last published, steady time in s.
+    """
+
+    def __init__(self, node: LifecycleNode, now: float) -> None:
+        self._node = node
+        self.publishers: dict[str, OutputPublisher] = {}
+        self.alarm_sent = now
+
+    def open(self, heartbeat: float) -> None:
+        """Make the publishers.
+
+        Parameters
+        ----------
+        heartbeat : float
+            Deadline that ~/violation offers, s.
+        """
+        qos = QoSProfile(depth=_OUTPUT_DEPTH)
+        beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=heartbeat))
+        for output in OUTPUTS:
+            offered = beat if output is VIOLATION else qos
+            kind = message_class(output.type)
+            self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered)
+        self._violation = self.publishers[VIOLATION.name]
+
+    def prepare(self, names: Sequence[str]) -> None:
+        """Lay out the messages of a model.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Of its states.
+        """
+        encode = VerdictMessages(names, sendable).encode
+
+        def vectors(*when: str) -> list[_Vector]:
+            chosen = [output.name for output in OUTPUTS if output.position and output.when in when]
+            return [(self.publishers[name], encode[name]) for name in chosen]
+
+        self._vectors = vectors("message"), vectors("message", "judged")
+        self._predicted = vectors("predicted")
+
+    def poll(self) -> None:
+        """Ask who listens."""
+        for publisher in self.publishers.values():
+            publisher.poll()
+
+    def publish(self, session: Session, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
+        """Publish what is listened to.
+
+        First everything is laid out, then all of it is sent in one go: threads of the middleware that are woken by
+        one message then find the others as well, and need not be woken again.
+
+        Parameters
+        ----------
+        session : Session
+            Gives the alarm and the prediction.
+        verdicts : sequence of Verdict
+            On the clock messages that were decided.
+        opened : bool
+            A sample was opened, from which bounds can be predicted.
+        now : float
+            Steady time, s.
+        turned : bool
+            The alarm changed; it is published whoever listens.
+        """
+        messages = []
+        for verdict in verdicts:
+            judged = verdict.judged
+            for publisher, encode in self._vectors[judged]:
+                if publisher.listeners:
+                    messages.append((publisher.send, encode(verdict)))
+            turned |= judged and self._violation.listeners > 0
+        if opened and any(publisher.listeners for publisher, _ in self._predicted):
+            expected = session.predict()
+            for publisher, encode in self._predicted:
+                if publisher.listeners and expected is not None:
+                    messages.append((publisher.send, encode(expected)))
+        if turned:
+            self.alarm_sent = now
+            messages.append((self._violation.send, TRUE if session.alarm else FALSE))
+        for send, message in messages:
+            send(message)
+
+    def send_alarm(self, alarm: bool, now: float) -> None:
+        """Publish ~/violation.
+
+        Parameters
+        ----------
+        alarm : bool
+            Whether the alarm is raised.
+        now : float
+            Steady time, s.
+        """
+        self.alarm_sent = now
+        self._violation.send(TRUE if alarm else FALSE)
+
+    def close(self) -> None:
+        """Stop publishing."""
+        for publisher in self.publishers.values():
+            publisher.destroy()
+        self.publishers.clear()
