@@ -91,22 +91,22 @@ class Node(node_module.EnvelopeMonitorNode):
     def __init__(self, path: Path, silent: tuple[str, ...] = ()) -> None:
         super().__init__()
         self.sent: list[tuple[str, bytes]] = []
-        self._clock = Clock()
+        self.clock = Clock()
         self.set_parameters([Parameter("model", value=str(path))])
         self.start()
-        assert self.active, self._reason
+        assert self.active, self.reason
         for name, output in self.outputs.publishers.items():
             output.send = self._keeps(name)
             output.listeners = int(name not in silent)
             output.poll = lambda: None
-        self._on_tick()
+        self.tick()
 
     def _keeps(self, name: str) -> Callable[[bytes], None]:
         return lambda data: self.sent.append((name, data))
 
     def arrive(self, at_ns: int, topic: str, data: bytes) -> None:
-        self._clock.nanoseconds = at_ns
-        self._inputs[topic].arrive(data)
+        self.clock.nanoseconds = at_ns
+        self.inputs[topic].arrive(data)
 
     def standing(self) -> dict[str, Any]:
         """Everything that counts for what comes next, and every count."""
@@ -116,7 +116,7 @@ class Node(node_module.EnvelopeMonitorNode):
         return {
             "counters": session.sampler.counters,
             "received": session.received,
-            "received by": {topic: one.received for topic, one in self._inputs.items()},
+            "received by": {topic: one.received for topic, one in self.inputs.items()},
             "unreadable": session.unreadable,
             "future": session.future,
             "judged": (session.verdicts, session.violations, session.alarms, session.alarm, session.failures),
@@ -158,7 +158,7 @@ def end(nodes: list[Node]) -> None:
     for node in nodes:
         node.last_standing, node.verdicts, node.alarms = node.standing(), node.session.verdicts, node.session.alarms
         node.finish()
-        assert node._state_machine.current_state[1] == "finalized"
+        assert node.state_name == "finalized"
         node.destroy_node()
 
 
@@ -286,10 +286,10 @@ def played(path: Path, messages: Sequence[Any], pure: bool, silent: tuple[str, .
         found = []
         for k, message in enumerate(messages):
             if message is None:
-                node._on_tick()
+                node.tick()
             elif message == "reset":
                 node.session.reset()
-            elif message[1] in node._inputs:
+            elif message[1] in node.inputs:
                 node.arrive(*message)
             if k % 100 == 0:
                 found.append(node.standing())
@@ -561,9 +561,9 @@ def test_a_clock_that_fails_is_reported_and_the_sampler_starts_over(ros: None, t
     node = Node(tmp_path / "model.json")
     for k, message in enumerate(stream(model, rng, 60, 0.0)):
         if k == 60:
-            node._clock.now = lambda: 1 / 0
+            node.clock.now = lambda: 1 / 0
         node.arrive(*message)
-        node._clock = Clock()
+        node.clock = Clock()
     assert node.session.failures == node.failures.count == 1 and node.session.verdicts > 50
     end([node])
 

@@ -329,7 +329,7 @@ import os, sys
 os.environ["UNCERTAIN_LTI_PURE_PYTHON"] = "1"  # compiled code would judge most of the samples
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti_ros import envelope_monitor
-judge, report, count = EnvelopeMonitor.judge, envelope_monitor.EnvelopeMonitorNode._report, [0, 0]
+judge, report, count = EnvelopeMonitor.judge, envelope_monitor.EnvelopeMonitorNode.report, [0, 0]
 def judging(*args, **named):
     count[0] += 1
     if count[0] % 10 == 0:
@@ -343,7 +343,7 @@ def reporting(node):
         raise KeyError("every seventh")
     return report(node)
 EnvelopeMonitor.judge = judging
-envelope_monitor.EnvelopeMonitorNode._report = reporting
+envelope_monitor.EnvelopeMonitorNode.report = reporting
 sys.exit(envelope_monitor.main())
 """
     path = saved(model, tmp_path)

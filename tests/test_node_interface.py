@@ -147,13 +147,13 @@ def test_an_error_in_a_transition_leaves_a_node_that_can_be_configured(world: Wo
     code = """
 import sys
 from uncertain_lti_ros import envelope_monitor
-subscribe, count = envelope_monitor.EnvelopeMonitorNode._subscribe, [0]
+subscribe, count = envelope_monitor.EnvelopeMonitorNode.subscribe, [0]
 def subscribing(node):
     count[0] += 1
     if count[0] == 1:
         raise OSError("the first time")
     return subscribe(node)
-envelope_monitor.EnvelopeMonitorNode._subscribe = subscribing
+envelope_monitor.EnvelopeMonitorNode.subscribe = subscribing
 sys.exit(envelope_monitor.main())
 """
     diagnostics = world.diagnostics()

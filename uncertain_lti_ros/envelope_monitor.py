@@ -12,7 +12,7 @@ from pathlib import Path
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock
+from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -69,7 +69,12 @@ def _failures_noted(transition: Callable[..., TransitionCallbackReturn]) -> Call
 
 
 class EnvelopeMonitorNode(LifecycleNode):
-    """Managed node around `Session`; the page on the live node describes its topics, services and parameters."""
+    """Managed node around `Session`; the page on the live node describes its topics, services and parameters.
+
+    Public for tests and programs around it: `session` (None while not configured), `active` (verdicts are given),
+    `reason` (why the last configure failed), `clock`, `settings`, `inputs` by topic, `outputs`, `snapshots` and
+    `failures`.
+    """
 
     def __init__(self) -> None:
         super().__init__(NAME)
@@ -77,17 +82,17 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.settings = Settings(self)
         self.session: Session | None = None
         self.active = False
-        self._reason = ""  # why the last configure failed
+        self.reason = ""
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
-        self._inputs: dict[str, MatchedSubscription] = {}
+        self.inputs: dict[str, MatchedSubscription] = {}
         self._enable_problem = ""
         self._candidate: Session | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
         self._looked = self._reported = time.monotonic()
         self.outputs = Outputs(self, self._looked)
         self.failures = Failures(self.get_logger().error)
-        self._clock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
-        self._simulated = self._clock.ros_time_is_active
+        self.clock: ROSClock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
+        self._simulated = self.clock.ros_time_is_active
         self.snapshots = Snapshots(self, self.settings)
         self._journal = Journal(self._log)
         self._noted = 0.0
@@ -100,7 +105,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._on_have_set)
         tick = min(_TICK, self.settings.real("heartbeat") / 4, self.settings.real("diagnostics_period") / 2)
-        self.create_timer(tick, self._on_tick, clock=self._steady)
+        self.create_timer(tick, self.tick, clock=self._steady)
         self.create_timer(_POLL, self._on_poll, clock=self._steady)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
@@ -145,7 +150,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._journal.turned(self.session, (), time.monotonic(), ", as its rule has changed")
             self.get_logger().info(self.session.whole_rule_text())
             if self.active:
-                self._subscribe()
+                self.subscribe()
         elif isinstance(candidate, Session) and self.session is not None:
             self._swap(candidate)
         elif self.session is None and self._starts_itself:
@@ -159,12 +164,17 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.outputs.prepare(self.session.model.state_names)
         self.snapshots.clear()
         if self.active:
-            self._subscribe()
+            self.subscribe()
         name = Path(str(self.settings.value("model"))).name
         self.get_logger().info(f"model swapped: {name}: {session.model}; {session.whole_rule_text()}")
         self._journal.begin(session, time.monotonic())
 
     # --- lifecycle ---
+
+    @property
+    def state_name(self) -> str:
+        """The lifecycle state: unconfigured, inactive, active, finalized, or the transition that is under way."""
+        return str(self._state_machine.current_state[1])
 
     def start(self) -> None:
         """Configure and activate; where that fails the reason is logged and published on /diagnostics."""
@@ -179,7 +189,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         except RuntimeError:  # RCLError, which rclpy does not export
             number = request.transition.id
             asked = request.transition.label or _TRANSITIONS.get(number, str(number))
-            state = self._state_machine.current_state[1]
+            state = self.state_name
             there = ", ".join(transition[1] for transition in self._state_machine.available_transitions)
             self.get_logger().error(f"no transition {asked} from {state}; there are {there or 'none'}")
             response.success = False
@@ -206,12 +216,12 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.snapshots.open()
         except Exception as error:
             self.session = None
-            self._reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
+            self.reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
             then = "; the node starts as soon as its parameters are set right" if self._starts_itself else ""
-            self.get_logger().error(f"not configured: {self._reason}{then}")
-            self._report()
+            self.get_logger().error(f"not configured: {self.reason}{then}")
+            self.report()
             return TransitionCallbackReturn.FAILURE
-        self._reason = ""
+        self.reason = ""
         self.outputs.open(self.settings.real("heartbeat"))
         self.outputs.prepare(self.session.model.state_names)
         self.get_logger().info(f"configured with {Path(path).name}: {self.session.model}")
@@ -241,8 +251,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         assert self.session is not None
         result = super().on_activate(state)
         self.session.restart(time.monotonic())
-        self._simulated = self._clock.ros_time_is_active
-        self._subscribe()
+        self._simulated = self.clock.ros_time_is_active
+        self.subscribe()
         self._journal.begin(self.session, time.monotonic())
         resolved = {topic: self.resolve_topic_name(topic) for topic in self.session.types}
         topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
@@ -319,8 +329,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         TransitionCallbackReturn
             SUCCESS.
         """
-        self._reason = "a transition failed unexpectedly; see the log"
-        self.get_logger().error(self._reason)
+        self.reason = "a transition failed unexpectedly; see the log"
+        self.get_logger().error(self.reason)
         self._put_away()
         return TransitionCallbackReturn.SUCCESS
 
@@ -332,10 +342,10 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def finish(self) -> None:
         """Shut down in good order, at the end of the process."""
-        if self._state_machine.current_state[1] in ("unconfigured", "inactive", "active"):
+        if self.state_name in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
-        self._reason = ""
-        self._report()
+        self.reason = ""
+        self.report()
         self._diagnostics.wait(_LAST_WORDS)
 
     # --- what nobody thought of ---
@@ -354,25 +364,25 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     # --- messages ---
 
-    def _subscribe(self) -> None:
+    def subscribe(self) -> None:
         """Listen to exactly the topics wanted; what is listened to already goes on undisturbed."""
         assert self.session is not None
         types = self.session.types
-        for topic in list(self._inputs):
-            if self._inputs[topic].type_name != types.get(topic):
-                self._inputs.pop(topic).destroy()
+        for topic in list(self.inputs):
+            if self.inputs[topic].type_name != types.get(topic):
+                self.inputs.pop(topic).destroy()
         for topic, type_name in types.items():
-            if topic not in self._inputs:
-                self._inputs[topic] = MatchedSubscription(
+            if topic not in self.inputs:
+                self.inputs[topic] = MatchedSubscription(
                     self, topic, type_name, message_class(type_name), partial(self._on_message, topic),
                     self.settings.wish(), raw=True,
                 )  # fmt: skip
 
     def _unsubscribe(self) -> None:
         self.active = False
-        for subscription in self._inputs.values():
+        for subscription in self.inputs.values():
             subscription.destroy()
-        self._inputs.clear()
+        self.inputs.clear()
 
     def _on_message(self, topic: str, data: bytes) -> None:
         if not self.active or self.session is None:
@@ -404,7 +414,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _arrival(self) -> int:
         """The time at which a message comes, ns; the clock's own call makes three objects."""
-        nanoseconds: int = self._clock.now().nanoseconds if self._simulated else time.time_ns()
+        nanoseconds: int = self.clock.now().nanoseconds if self._simulated else time.time_ns()
         return nanoseconds
 
     def _beat(self) -> None:
@@ -413,7 +423,8 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     # --- heartbeat, graph, diagnostics ---
 
-    def _on_tick(self) -> None:
+    def tick(self) -> None:
+        """Do what goes by time: heartbeat, graph, diagnostics, snapshots and log."""
         self._look_at_clock()
         tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_snapshots, self._keep_journal
         for task in tasks:
@@ -423,15 +434,15 @@ class EnvelopeMonitorNode(LifecycleNode):
                 self.note_failure("between messages", error)
 
     def _on_poll(self) -> None:
-        for subscription in self._inputs.values():
+        for subscription in self.inputs.values():
             subscription.poll()
         self.outputs.poll()
-        if any(s.look_soon for s in self._inputs.values()):
+        if any(s.look_soon for s in self.inputs.values()):
             self._look_around()
 
     def _look_at_clock(self) -> None:
-        if self._simulated != self._clock.ros_time_is_active:
-            self._simulated = self._clock.ros_time_is_active
+        if self._simulated != self.clock.ros_time_is_active:
+            self._simulated = self.clock.ros_time_is_active
 
     def _keep_beating(self) -> None:
         if self.active and time.monotonic() - self.outputs.alarm_sent >= self.settings.real("heartbeat") / 2:
@@ -439,10 +450,10 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _look_around(self) -> None:
         now = time.monotonic()
-        if now - self._looked < _LOOK and not any(s.look_soon for s in self._inputs.values()):
+        if now - self._looked < _LOOK and not any(s.look_soon for s in self.inputs.values()):
             return
         self._looked = now
-        for subscription in self._inputs.values():
+        for subscription in self.inputs.values():
             subscription.look()
         self._find_enable_type()
 
@@ -457,7 +468,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             except UncertainLTIError as error:
                 self._enable_problem = f"parameter enable: {error}"
                 return
-            self._subscribe()
+            self.subscribe()
         self._enable_problem = ""
 
     def _keep_reporting(self) -> None:
@@ -469,16 +480,16 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.session.pass_over(now)
             self._note_told()
         else:
-            self._report()
+            self.report()
 
     def _keep_journal(self) -> None:
         now = time.monotonic()
         if self.session is None or not self.active or now - self._noted < _NOTE:
             return
         self._noted = now
-        problems = [problem for subscription in self._inputs.values() for problem in subscription.problems]
+        problems = [problem for subscription in self.inputs.values() for problem in subscription.problems]
         problems += self._lasting_problems()
-        publishers = {topic: subscription.publishers for topic, subscription in self._inputs.items()}
+        publishers = {topic: subscription.publishers for topic, subscription in self.inputs.items()}
         self._journal.look(self.session, now, self.settings.real("state_timeout"), publishers, problems)
 
     def _log(self, level: int, line: str) -> None:
@@ -494,35 +505,36 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _lasting_problems(self) -> list[str]:
         """The same where no topic of the model is concerned, and only what lasts."""
         problems = [self._enable_problem] if self._enable_problem else []
-        if self._clock.ros_time_is_active and not self._clock.now().nanoseconds:
+        if self.clock.ros_time_is_active and not self.clock.now().nanoseconds:
             problems.append("use_sim_time is true, and no time has come on /clock")
         return problems
 
     def _problems(self) -> list[str]:
         """What keeps messages from coming, beside silence, and what went wrong here since the last report."""
-        problems = self._diagnostics.problems(self._inputs) + self._lasting_problems()
+        problems = self._diagnostics.problems(self.inputs) + self._lasting_problems()
         return problems + self.snapshots.problems + self.failures.problems()
 
-    def _report(self) -> None:
+    def report(self) -> None:
+        """Publish diagnostics."""
         now = self._reported = time.monotonic()
         if self.session is not None and self.active:
             reports = self.session.report(now, self.settings.real("state_timeout"), self._problems())
-            extra = input_values(self._inputs)
+            extra = input_values(self.inputs)
             extra |= {"unexpected errors": str(self.failures.count), **self.snapshots.values}
             reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
         else:
-            state = self._state_machine.current_state[1]
-            message = f"{state}: {self._reason}" if self._reason else f"{state}: no verdicts are given"
-            level = ERROR if self._reason else STALE
+            state = self.state_name
+            message = f"{state}: {self.reason}" if self.reason else f"{state}: no verdicts are given"
+            level = ERROR if self.reason else STALE
             reports = [Report(level, "monitor", message, {"unexpected errors": str(self.failures.count)})]
             if self.session is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
         self._note_told()
-        self._diagnostics.publish(reports, self._clock.now().to_msg(), str(self.settings.value("model")))
+        self._diagnostics.publish(reports, self.clock.now().to_msg(), str(self.settings.value("model")))
 
     def _note_told(self) -> None:
         self.failures.reported()
-        self._diagnostics.reported(self._inputs)
+        self._diagnostics.reported(self.inputs)
 
     # --- services ---
 
@@ -568,13 +580,13 @@ class EnvelopeMonitorNode(LifecycleNode):
         response.success = self.active
         response.message = json.dumps(
             {
-                "state": self._state_machine.current_state[1],
-                "reason": self._reason,
+                "state": self.state_name,
+                "reason": self.reason,
                 "model": self.settings.value("model"),
-                "now_ns": self._clock.now().nanoseconds,
+                "now_ns": self.clock.now().nanoseconds,
                 "use_sim_time": self.settings.value("use_sim_time"),
-                "received": {s.topic: s.received for s in self._inputs.values()},
-                "lost": {s.topic: s.lost for s in self._inputs.values()},
+                "received": {s.topic: s.received for s in self.inputs.values()},
+                "lost": {s.topic: s.lost for s in self.inputs.values()},
                 "verdicts": session.verdicts if session else 0,
                 "violations": dict(zip(session.model.state_names, session.violations, strict=True)) if session else {},
                 "alarm": session.alarm if session else False,
