@@ -13,7 +13,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 
 BLOCKS = 10
-"""Parts that a single recording is cut into, unless told otherwise."""
+"""Parts that a single recording is cut into, by default."""
 
 
 def cut(transient: Transient, start: int, stop: int) -> Transient:

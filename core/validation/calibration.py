@@ -18,15 +18,15 @@ from uncertain_lti.validation.part import Part, by_unit, rising
 from uncertain_lti.validation.result import Validation, short_condition
 
 RULES = ((1, 1), (3, 5), (5, 10))
-"""(violations, window) tried unless told otherwise."""
+"""(violations, window) tried by default."""
 MARGINS = tuple(float(m) for m in np.geomspace(4.0, 0.5, 106))
 """Margins tried, from the largest: about 2 % apart."""
 FAULT_SIZE = 1.0
-"""The stated fault moves one state by so many mean widths more in every step."""
+"""Size of the reference fault: one state moves by this many mean widths more in every step."""
 BLIND = 0.5
-"""A rule that sees a smaller share of the stated faults on some state is warned of: it is quiet because it is deaf."""
+"""A rule that detects a smaller share of the reference faults on some state gets a warning: it is insensitive."""
 STARTS = 8
-"""Instants per left-out part at which the stated fault is put in, with either sign."""
+"""Instants per left-out part at which the reference fault is added, with either sign."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class Candidate:
     window : int
         n of the rule, in verdicts.
     margin : float or None
-        The smallest margin; None where none keeps to the target.
+        The smallest margin; None if none keeps to the target.
     alarms : int
         False alarms on the left-out parts at that margin.
     upper : float
         One-sided upper confidence limit of the false alarms per hour.
     detected : array (n,)
-        Share of the stated faults on each state that raise the alarm before the part ends.
+        Share of the reference faults on each state that raise the alarm before the part ends.
     delay : array (n,)
-        Median time to the alarm, s; inf where most are missed.
+        Median time to the alarm, s; inf if most are missed.
     """
 
     violations: int
@@ -67,7 +67,7 @@ class Calibration:
     Parameters
     ----------
     alarm_rule : AlarmRule or None
-        The choice; None where no rule can be shown to keep to the target.
+        The choice; None if no rule can be shown to keep to the target.
     target : float
         Target rate: false alarms per hour at most.
     confidence : float
@@ -81,7 +81,7 @@ class Calibration:
     words : str
         The outcome as a sentence.
     warning : str, default ""
-        What the chosen rule does not see; empty where it sees at least BLIND of the stated faults on every state.
+        What the chosen rule does not detect; empty if it detects at least BLIND of the reference faults on every state.
     """
 
     alarm_rule: AlarmRule | None
@@ -92,7 +92,6 @@ class Calibration:
     candidates: tuple[Candidate, ...]
     words: str
     warning: str = ""
-    """What the chosen rule does not see; empty where it sees at least BLIND of the stated faults on every state."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the model file.
@@ -133,13 +132,13 @@ def calibrate(
     rules: Sequence[tuple[int, int]] = RULES,
     confidence: float | None = None,
 ) -> Calibration:
-    """Find the rule and margin whose false alarms stay below a target, and which then see a stated fault soonest.
+    """Find the rule and margin whose false alarms stay below a target, and which then detect a reference fault first.
 
     For each rule, margins are tried from the largest down, as long as the upper confidence limit of the false alarms
     on the left-out parts stays at or below the target; going in a fixed order and stopping at the first failure, the
     confidence of one test holds for the whole search. The error is shared equally among the rules, so that choosing
-    among them costs no confidence. Chosen is the rule that detects the largest share of the stated faults, then the
-    one that does so soonest, then the one with the smallest margin.
+    among them costs no confidence. Chosen is the rule that detects the largest share of the reference faults, then the
+    one that does so first, then the one with the smallest margin.
 
     Parameters
     ----------
@@ -198,11 +197,11 @@ def calibrate(
         )
     )
     rule = AlarmRule(best.violations, best.window, best.margin)
-    return Calibration(rule, target, confidence, hours, needed, candidates, words, _deaf(best.detected, names))
+    return Calibration(rule, target, confidence, hours, needed, candidates, words, _insensitive(best.detected, names))
 
 
-def _deaf(detected: Array, names: Sequence[str]) -> str:
-    """Warning that a rule, which sees the shares `detected` (n,) of the stated faults, misses most on some states."""
+def _insensitive(detected: Array, names: Sequence[str]) -> str:
+    """Warning that a rule, which detects the shares `detected` (n,) of the reference faults, misses most on some."""
     missed = [f"{name} in {share:.0%}" for name, share in zip(names, detected, strict=True) if not share >= BLIND]
     if not missed:
         return ""
@@ -237,11 +236,11 @@ def _candidate(parts: Sequence[Part], m: int, n: int, target: float, confidence:
 
 
 def detection(parts: Sequence[Part], rule: AlarmRule, size: float = FAULT_SIZE) -> tuple[Array, Array]:
-    """Share of stated faults that raise the alarm, and the time to it.
+    """Share of reference faults that raise the alarm, and the time to it.
 
     The fault: from one verdict on, one state moves by `size` mean widths of its bounds more in every step than
-    recorded, in either direction, the step still starting from the measured state. It is put into the left-out parts at
-    STARTS instants each; one that is not seen before the part ends counts as missed (infinite time).
+    recorded, in either direction, the step still starting from the measured state. It is added to the left-out parts at
+    STARTS instants each; one that is not detected before the part ends counts as missed (infinite time).
 
     Parameters
     ----------

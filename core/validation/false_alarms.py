@@ -12,11 +12,11 @@ from uncertain_lti.validation.intervals import cluster_size, rate_interval
 from uncertain_lti.validation.part import Part, by_unit, rising, unit_numbers
 
 NEARBY = 0.75
-"""Down to this share of the margin, alarms are taken to come in clusters as they do at the margin."""
+"""Down to this share of the margin, alarms are assumed to cluster as they do at the margin."""
 
 
 def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> dict[str, Any]:
-    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to so many parts.
+    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to as many parts.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> d
 
 
 def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
-    """Alarms that come at once, where few or none are counted: those of the same rule at a smaller margin.
+    """Typical cluster of alarms, if few or none are counted: that of the same rule at a smaller margin.
 
     The margin is that at which three parts or groups alarm, but not below NEARBY times the rule's: far below, alarms
     are of another kind.
@@ -94,7 +94,7 @@ def peaks(parts: Sequence[Part], levels: Sequence[Array]) -> list[float]:
 
 
 def borrowed_margin(largest: Sequence[float], margin: float) -> float:
-    """The margin at which to see how many alarms come at once.
+    """The margin at which clusters of alarms are counted.
 
     Parameters
     ----------

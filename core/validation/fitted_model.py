@@ -33,7 +33,7 @@ def validate_model(
 ) -> Validation:
     """Validate a fitted model, or one from a file, with the recordings it was fitted to and the options it names.
 
-    The key by which its file says that the recordings are grouped, `fit --group`, counts unless groups or blocks are
+    The key by which its file says that the recordings are grouped, `fit --group`, applies unless groups or blocks are
     given.
 
     Parameters
@@ -47,7 +47,7 @@ def validate_model(
     gap : float, optional
         As in `validate`.
     groups : sequence or str, optional
-        As in `validate`; "none" leaves out single recordings all the same.
+        As in `validate`; "none" leaves out single recordings nevertheless.
     confidence : float, default 0.9
         As in `validate`.
     progress : callable, optional
@@ -61,7 +61,7 @@ def validate_model(
     Raises
     ------
     FitError
-        Beside those of `validate`: the model does not say how it was fitted, or the recordings do not give it again.
+        As of `validate`; or the model does not state how it was fitted, or a fit to the recordings gives another model.
     """
     if isinstance(groups, str) and groups == "none":
         groups = None
@@ -72,8 +72,8 @@ def validate_model(
     again = fit(transients, operating_point=model.operating_point, **_options(model))
     if not _same(again, model):
         raise FitError(
-            "these recordings do not give this model again, so what was left out of them would say nothing of it; "
-            "name the recordings it was fitted to, or fit it anew"
+            "these recordings do not give this model again, so what was left out of them would say nothing about it; "
+            "name the recordings it was fitted to, or fit it again"
         )
     return validate(
         transients,
@@ -144,12 +144,12 @@ def leave_out_with_fit(
             progress=progress,
             **_options(model),
         ).to_dict()
-    except FitError as error:  # too little is left when a part is left out: the fit itself stands
+    except FitError as error:  # too little is left when a part is left out: the fit itself is valid
         return {"not_done": str(error)}
 
 
 def _options(model: UncertainLTI) -> Mapping[str, Any]:
-    """Options of `fit` that a model says it was fitted with; see `validate_model`."""
+    """Options of `fit` with which a model was fitted; see `validate_model`."""
     facts = model.fit_summary
     for key in ("criterion", "additive"):
         if key not in facts:

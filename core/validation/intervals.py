@@ -46,7 +46,7 @@ def rate_interval(
     confidence : float
         Of the interval; with `one_sided`, of its upper limit alone.
     size : float, optional
-        Cluster size; at least that of `counts` is used. Counts that are all 0 tell none: give one seen elsewhere.
+        Cluster size; at least that of `counts` is used. Counts that are all 0 have none: give one estimated elsewhere.
     one_sided : bool, default False
         Whether the upper limit alone is wanted; the lower one is then 0.
 
@@ -55,7 +55,7 @@ def rate_interval(
     float
         Lower limit; 0 for fewer than two transients or no exposure.
     float
-        Upper limit; inf likewise.
+        Upper limit; inf on the same condition.
     """
     from scipy.special import gammainccinv, gammaincinv, ndtr, stdtrit
 

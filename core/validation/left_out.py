@@ -50,19 +50,19 @@ def validate(
     alarm_rule : AlarmRule, optional
         As in `fit`.
     blocks : int, optional
-        Cut every recording into so many contiguous blocks and leave out one block at a time. Default: whole recordings
-        where there are two or more, else BLOCKS blocks.
+        Cut every recording into this many contiguous blocks and leave out one block at a time. Default: whole
+        recordings if there are two or more, else BLOCKS blocks.
     gap : float, optional
         Time on both sides of a left-out block that is not fitted either, s, because it resembles the block. Default:
         three times the slowest time constant of the nominal model, at most half a block.
     groups : sequence or str, optional
         What the recordings have in common: one name (of a machine, a day, an operator) per recording, or a key of
         `groups.group_names`. A whole group is left out at a time, and the intervals count groups. Without it they
-        take every recording for independent of the others.
+        treat every recording as independent of the others.
     confidence : float, default 0.9
         Of every interval, 0.5 to below 1.
     full : UncertainLTI, optional
-        The fit to all recordings, where it is there already.
+        The fit to all recordings, if it is done already.
     progress : callable, optional
         Called with one line of text per fit.
     **options : object

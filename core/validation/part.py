@@ -31,7 +31,7 @@ class Part:
     narrowness : array (K, n)
         Mean half-width over half-width.
     starts : tuple of int
-        Positions at which the alarm starts anew: 0, and after every step back in time.
+        Positions at which the alarm restarts: 0, and after every step back in time.
     violations : array (n,) of int
         Violated verdicts of each state at margin 1.
     violated : int
@@ -97,7 +97,7 @@ class Part:
         Returns
         -------
         array (K,)
-            -inf until m verdicts are there.
+            -inf until there are m verdicts.
         """
         severity = self.severity if severity is None else severity
         level = np.empty(len(severity))
@@ -136,7 +136,7 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
     transient : Transient
         What was left out.
     name : str
-        What it is called.
+        Its name.
     group : str, default ""
         What was left out together with it.
 
@@ -222,14 +222,14 @@ def by_unit(parts: Sequence[Part], values: ArrayLike) -> Array:
 
 
 def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:
-    """Rising edges of an alarm that starts anew, lowered, at each of `starts`.
+    """Rising edges of an alarm that restarts, cleared, at each of `starts`.
 
     Parameters
     ----------
     raised : array (K,) of bool
         Whether the alarm is raised.
     starts : sequence of int
-        Positions at which it starts lowered.
+        Positions at which it restarts.
 
     Returns
     -------

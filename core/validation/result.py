@@ -20,7 +20,7 @@ from uncertain_lti.validation.part import Part, by_unit, unit_numbers
 from uncertain_lti.validation.scenario import scenario
 
 REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
-"""Alarm rules whose false alarms are counted beside the model's own."""
+"""Alarm rules whose false alarms are counted in addition to the model's own."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,7 +55,7 @@ class Validation:
 
     @property
     def what(self) -> str:
-        """What was left out at a time, and what every interval takes for independent: recording, block or group."""
+        """What was left out at a time, and what every interval treats as independent: recording, block or group."""
         return "group" if self.grouping else "recording" if self.kind == "transients" else "block"
 
     @property
@@ -71,7 +71,7 @@ class Validation:
         return f"Validation(left out one of {self.units} {of}: {inside}, {whole} whole)"
 
     def _repr_html_(self) -> str:
-        """Coverage beside widths, from `Validation.to_dict()`."""
+        """Coverage and widths, from `Validation.to_dict()`."""
         data = self.to_dict()
         rows = [
             [
@@ -97,7 +97,7 @@ class Validation:
         return html_table(repr(self), ("left out", "inside", "whole parts", "mean width", "fitted"), rows, below)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data: coverage beside widths, false alarms per hour with intervals, scenario bound in words.
+        """Plain data: coverage and widths, false alarms per hour with intervals, scenario bound in words.
 
         Returns
         -------
@@ -191,7 +191,7 @@ def short_condition(validation: Validation) -> str:
     Returns
     -------
     str
-        A clause to stand beside an interval.
+        A clause that follows an interval.
     """
     return f"if the {validation.what}s are independent"
 
@@ -213,7 +213,7 @@ def condition(validation: Validation) -> str:
     if v.kind == "blocks":
         return (
             f"every interval counts {plural(v.units, 'block')}, and holds for more of the same runs if the blocks are "
-            f"independent of one another; of another day, machine or operator it says nothing"
+            f"independent of one another; it says nothing about another day, machine or operator"
         )
     alike = "" if v.grouping else ", machines or operators"
     return (
@@ -274,7 +274,7 @@ def _notes(validation: Validation) -> list[str]:
     if v.hint:
         notes.insert(0, v.hint)
     if G < 6:
-        notes.append(f"{G} {what} say little: an interval from so few is wide, and rests on them being typical")
+        notes.append(f"{G} {what} say little: an interval from few {what} is wide, and assumes that they are typical")
     if count := len(v.model.fit_summary.get("discarded", [])):
         notes.append(
             f"every left-out fit may discard {count} transitions as well; in what is left out nothing is discarded, so "
@@ -290,6 +290,6 @@ def _notes(validation: Validation) -> list[str]:
     if judged and left > 0.01 * judged:
         notes.append(
             f"{left / judged:.1%} of the left-out verdicts lie outside the domain fitted without them, so the "
-            f"{what} do not repeat one another: nothing fitted vouches for the bounds there"
+            f"{what} do not repeat one another: the bounds there are not backed by any fitted sample"
         )
     return notes

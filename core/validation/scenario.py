@@ -13,7 +13,7 @@ from uncertain_lti.validation.intervals import discarding_bound, scenario_interv
 from uncertain_lti.validation.part import Part, by_unit, unit_numbers
 
 VOID = 0.9
-"""A bound on the probability of leaving the envelope that is above this says nothing."""
+"""A bound on the probability of leaving the envelope is reported only up to this."""
 
 
 def scenario(model: UncertainLTI, parts: Sequence[Part], what: str, confidence: float) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def scenario(model: UncertainLTI, parts: Sequence[Part], what: str, confidence: 
     Returns
     -------
     dict
-        `words`, and where there is a bound its `interval` and what was counted.
+        `words`, and if there is a bound its `interval` and what was counted.
     """
     G = int(unit_numbers(parts).max(initial=-1)) + 1
     discarded = _discarded(model)
