@@ -211,17 +211,12 @@ def describe(
 
 
 def _tied(model: UncertainLTI, problem: Problem, sums: Moments) -> list[str]:
-    """Blocks that share the elements of another, and what the blocks lack."""
+    """Blocks that share the elements of another."""
     columns = problem.columns
     if columns.regimes is None:
         return []
     tied = [r if data.tied_to is None else data.tied_to for r, data in enumerate(model.block_data)]
     messages = regimes.tied_words(columns.regimes.schedule, sums, columns, problem.p, tied, model.signals.signals)
-    if not columns.drift:
-        messages.append(
-            "the blocks have no drift c, which carries the steady state from knot to knot: --additive disturbance, or "
-            "both, gives them one"
-        )
     return messages
 
 

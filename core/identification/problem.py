@@ -218,7 +218,8 @@ class Columns:
         """For an `additive` option.
 
         With a constant Δt, Δt·dc + v is one number: v takes it and dc is 0, because v is the one that still
-        holds when another recording has another Δt.
+        holds when another recording has another Δt. With a schedule c is always unknown: it carries the steady state
+        from knot to knot.
 
         Parameters
         ----------
@@ -242,7 +243,8 @@ class Columns:
         if additive not in CHOICES:
             raise FitError(f"additive is {additive!r}; it must be {CHOICES_TEXT}")
         names = {"none": "", "disturbance": "c dc", "noise": "v", "both": "c v" if constant_dt else "c dc v"}
-        return cls(frozenset(names[additive].split()), regimes)
+        drift = () if regimes is None else ("c",)
+        return cls(frozenset((*names[additive].split(), *drift)), regimes)
 
 
 @dataclass(frozen=True)
