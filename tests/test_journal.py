@@ -207,7 +207,7 @@ def test_signals_without_a_value_are_named_in_the_reports() -> None:
     assert rig.session.report(rig.now, TIMEOUT)[0].level == OK
 
 
-def test_a_flapping_alarm_does_not_flood_the_log_and_its_state_is_told_in_the_end() -> None:
+def test_a_flapping_alarm_does_not_flood_the_log_and_each_is_named_or_counted() -> None:
     rig = Rig()
     rig.send(10)
     rig.lines.clear()
@@ -215,18 +215,27 @@ def test_a_flapping_alarm_does_not_flood_the_log_and_its_state_is_told_in_the_en
     for _ in range(300):
         rig.send(2, off=2.0)
         rig.send(8)
-    turned, minutes = 2 * rig.session.alarms, (rig.now - began) / 60
-    lines = rig.lines
-    assert turned > 500 and len(lines) <= 6 + 6 * minutes + 1
+    alarms, minutes = rig.session.alarms, (rig.now - began) / 60
     rig.wait(11.0)
-    lines += rig.lines
-    alarms = [line for line in lines if "alarm" in line]
-    assert re.search(r"the alarm is off \(it has turned \d+ times more since the last line\)", alarms[-1])
-    assert (
-        sum(int(n) for line in alarms for n in re.findall(r"turned (\d+) time", line))
-        + sum(line.startswith(("alarm,", "the alarm is over")) for line in alarms)
-        == turned
-    ), "every turn is told or counted"
+    lines = rig.lines
+    starts = [line for line in lines if line.startswith("alarm,")]
+    ends = [line for line in lines if line.startswith("the alarm is over after")]
+    assert alarms > 250 and len(starts) <= 6 + 6 * minutes + 2 and len(ends) <= len(starts)
+    assert len(starts) >= 7 and all(" above its bounds " in line for line in starts), "the later ones are named as well"
+    assert re.search(r"; it is over \(\d+ alarms before it are not logged\)$", starts[-1])
+    left_out = sum(int(n) for line in starts for n in re.findall(r"\((\d+) alarms? before it", line))
+    assert len(starts) + left_out == alarms, "every alarm is named or counted"
+
+
+def test_an_alarm_long_after_others_is_named_at_its_start() -> None:
+    rig = Rig()
+    rig.send(10)
+    for _ in range(4):
+        rig.send(3, off=2.0)
+        rig.send(10)
+    rig.lines.clear()
+    rig.send(3, off=2.0)
+    assert rig.session.alarm and [line[:6] for line in rig.lines] == ["alarm,"]
 
 
 def test_silence_of_each_input_and_its_return_are_told_once() -> None:

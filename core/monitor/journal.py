@@ -52,7 +52,9 @@ class Journal:
     def __init__(self, say: Callable[[int, str], None]) -> None:
         self._say = say
         self._matters: dict[str, _Matter] = {}
-        self._alarm, self._alarm_since, self._unsaid = False, 0.0, 0
+        self._alarm, self._alarm_since = False, 0.0
+        self._named = False  # whether the start of this alarm was logged
+        self._latest, self._unnamed = "", 0  # of alarms whose start was not: the line of the last one, their number
         self._counters: Counter[str] = Counter()
         self._unreadable: Counter[str] = Counter()
         self._ceased, self._judged = 0.0, False
@@ -68,7 +70,7 @@ class Journal:
         now : float
             Steady time, s.
         """
-        self._alarm, self._unsaid = session.alarm, 0
+        self._alarm, self._named, self._latest, self._unnamed = session.alarm, session.alarm, "", 0
         self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
         self._ceased, self._judged = now, False
         self._cause = ("", now)
@@ -80,7 +82,9 @@ class Journal:
         return self._matters[name]
 
     def turned(self, session: Session, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
-        """Log the alarm if it has turned.
+        """Log the alarm if it has turned: its start with the states that left their bounds, and its end if the start was.
+
+        Of many alarms some starts are left out; the next line, at most 10 s later, says how many and names the last.
 
         Parameters
         ----------
@@ -99,19 +103,29 @@ class Journal:
         if session.alarm:
             cause = next((v for v in verdicts if v.alarm and v.violated), session.last)
             left = f": {_left(session, cause)}" if cause is not None and cause.violated else ""
-            level, line = WARN, f"alarm, {session.rule_text()}{left}"
+            line = f"alarm, {session.rule_text()}{left}"
             line += "; it lasts until ~/reset" if session.rule.latch else ""
             self._alarm_since = now
-        else:
-            level, line = OK, f"the alarm is over after {now - self._alarm_since:.3g} s{why}"
-        if self._matter("alarm").may(now):
-            self._say(level, f"{line}{self._passed_over()}")
-        else:
-            self._unsaid += 1
+            self._named = self._matter("alarm").may(now)
+            if self._named:
+                self._say(WARN, f"{line}{self._left_out(self._unnamed)}")
+            else:
+                self._latest, self._unnamed = line, self._unnamed + 1
+        elif self._named:
+            self._say(OK, f"the alarm is over after {now - self._alarm_since:.3g} s{why}")
+            self._named = False
 
-    def _passed_over(self) -> str:
-        unsaid, self._unsaid = self._unsaid, 0
-        return f" (it has turned {plural(unsaid, 'time')} more since the last line)" if unsaid else ""
+    def _left_out(self, number: int) -> str:
+        """How many alarms no line names."""
+        self._unnamed = 0
+        return f" ({plural(number, 'alarm')} before it {'is' if number == 1 else 'are'} not logged)" if number else ""
+
+    def _catch_up(self, now: float) -> None:
+        """Name the last of the alarms that were left out, as soon as a line may be spent."""
+        if self._unnamed and self._matter("alarm").may(now):
+            over = "" if self._alarm else "; it is over"
+            self._say(WARN, f"{self._latest}{over}{self._left_out(self._unnamed - 1)}")
+            self._named = self._alarm
 
     def look(
         self, session: Session, now: float, timeout: float, publishers: Mapping[str, int], problems: Sequence[str]
@@ -132,10 +146,7 @@ class Journal:
             What keeps messages from coming, in words that stay the same while it lasts.
         """
         self.turned(session, (), now)
-        if self._unsaid and self._matter("alarm").may(now):
-            self._say(
-                WARN if self._alarm else OK, f"the alarm is {'on' if self._alarm else 'off'}{self._passed_over()}"
-            )
+        self._catch_up(now)
         matter = self._matter("problems")
         new = [problem for problem in problems if problem not in (matter.said or ())]
         if matter.becomes(tuple(problems) or None, now):
