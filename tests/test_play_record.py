@@ -501,3 +501,13 @@ def test_the_shipped_recordings_are_what_their_description_says() -> None:
         assert len(outside) == faulty - 1 or outside[faulty:].mean() > 0.5
     for name in ("leibov_fit", "leibov_check"):
         assert (ROOT / "bags" / f"{name}.mcap").stat().st_size < 1_000_000
+
+
+def test_two_demos_in_one_domain_say_so(world: World, tmp_path: Path) -> None:
+    """Each would hear the other's recording, and none of the live verdicts would be those of the offline check."""
+    other = world.node.create_publisher(JointState, "/envelope_monitor/flags", 10)
+    demo = world.start("demo", "-m", "uncertain_lti.cli.main", "demo", "--output", str(tmp_path / "out"))
+    assert demo.wait(60) == 2
+    assert "another envelope_monitor publishes /envelope_monitor/flags in ROS domain" in demo.output
+    assert "export ROS_DOMAIN_ID=" in demo.output
+    world.node.destroy_publisher(other)

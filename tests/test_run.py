@@ -3,8 +3,11 @@
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -188,3 +191,116 @@ def test_programs_hear_this_machine_alone_unless_told_otherwise(elsewhere, tmp_p
 
 def test_the_demo_writes_to_the_folder_of_the_caller(elsewhere, tmp_path):
     assert elsewhere("demo", "--rate", "9") == ["uncertain-lti", str(tmp_path / "some where"), "demo", "--rate", "9"]
+
+
+@pytest.fixture
+def slow(tmp_path):
+    """Shell text that is this interpreter, and takes a second to make an environment, which is noted in a file."""
+    bash, python = tmp_path / "bin" / "bash", Path(sys.executable).resolve()
+    maker = tmp_path / "make_environment.py"
+    maker.write_text(
+        f"import time\nopen({str(tmp_path / 'made')!r}, 'a').write('x')\ntime.sleep(1)\n"
+        + _ENVIRONMENT.format(bash=bash, python=python, programs=PROGRAMS)
+    )
+    return f'[[ "$1 $2" == "-m venv" ]] && exec "{python}" "{maker}" "$@"\n{this_python()}'
+
+
+def test_of_two_starts_at_once_one_installs_and_the_other_waits(run, slow, tmp_path):
+    with ThreadPoolExecutor(2) as both:
+        done = list(both.map(lambda _: run("setup", programs={"python3": slow}), range(2)))
+    assert [d.returncode for d in done] == [0, 0], done
+    assert (tmp_path / "made").read_text() == "x"
+    assert sum("another ./run is installing" in d.stdout for d in done) == 1
+    assert all("ready: .venv" in d.stdout for d in done)
+
+
+def test_a_start_from_the_environment_itself_does_not_use_what_it_removes(run, slow, tmp_path):
+    """`. .venv/bin/activate`, then ./run with something changed: the interpreter of .venv made .venv."""
+    pytest.importorskip("ensurepip", reason="this Python cannot make virtual environments")
+    checkout = tmp_path / "a checkout"
+    subprocess.run([Path(sys.executable).resolve(), "-m", "venv", "--without-pip", checkout / ".venv"], check=True)
+    inside = f'exec "{checkout}/.venv/bin/python" "$@"'
+    nowhere = {"PIP_INDEX_URL": "http://127.0.0.1:9", "PIP_RETRIES": "1"}
+    sentence = refusal(run("setup", programs={"python3": inside}, **nowhere))
+    assert "no package index can be reached" in sentence  # it came that far
+    assert (checkout / ".venv/bin/python").resolve().exists() and (checkout / ".venv/bin/pip").exists()
+
+
+def test_ctrl_c_while_installing_is_one_sentence_and_130(run, slow, tmp_path):
+    for name, text in {"python3": slow}.items():
+        (tmp_path / "bin" / name).write_text(f"#!{tmp_path / 'bin'}/bash\n{text}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    process = subprocess.Popen(
+        [tmp_path / "a checkout" / "run", "setup"],
+        env={"PATH": str(tmp_path / "bin"), "HOME": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 20
+    while not (tmp_path / "made").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=20)
+    ours = [line for line in said.splitlines() if line.startswith("./run:")]
+    assert process.returncode == 130, said
+    assert ours == ["./run: interrupted; .venv is not whole, and the next start makes it again."]
+    assert run("setup", programs={"python3": slow}).returncode == 0 and (tmp_path / "made").read_text() == "xx"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="it takes root to be somebody else")
+def test_a_checkout_of_somebody_else_is_a_sentence(run, tmp_path):
+    folder = Path(subprocess.check_output(["mktemp", "-d"], text=True).strip())
+    try:
+        shutil.copytree(tmp_path / "a checkout", folder, dirs_exist_ok=True)
+        folder.chmod(0o755)
+        done = subprocess.run(
+            [folder / "run", "setup"],
+            env={"PATH": f"{Path(sys.executable).resolve().parent}:/usr/bin:/bin", "HOME": "/"},
+            user=65534,
+            capture_output=True,
+            text=True,
+        )
+    finally:
+        shutil.rmtree(folder)
+    if "Python 3.11 or 3.12 is needed" in done.stderr:
+        pytest.skip("others cannot run this Python")
+    assert "/.venv cannot be written by" in refusal(done) and "copy the checkout" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["demo", "envelope_monitor", "turbofan"])
+def test_a_machine_without_loopback_is_a_sentence(run, tmp_path, command):
+    unshare = shutil.which("unshare")
+    if not unshare or subprocess.run([unshare, "-rn", "true"], capture_output=True).returncode:
+        pytest.skip("this user cannot be without a network")
+    done = subprocess.run(
+        [unshare, "-rn", tmp_path / "a checkout" / "run", command],
+        capture_output=True,
+        text=True,
+        env={"PATH": f"{Path(sys.executable).resolve().parent}:{os.environ['PATH']}"},
+    )
+    assert "the loopback interface of this machine is down" in refusal(done) and "ip link set lo up" in done.stderr
+
+
+def test_setup_takes_one_option(run):
+    assert "setup takes --monitor and nothing else, and not 'all'" in refusal(
+        run("setup", "all", programs={"python3": this_python()})
+    )
+
+
+def test_a_small_environment_for_robots_that_only_monitor(run, slow, tmp_path):
+    """Neither the recordings' nor the fit's packages: what is asked for is numpy, PyYAML, rclpy, and this alone."""
+    asked = tmp_path / "asked"
+    maker = tmp_path / "make_environment.py"
+    noting = f'''[[ $2 == pip ]] && printf "%s\\n" "$*" >>"{asked}"; [[ $2 == pip ]] || exec'''
+    maker.write_text(maker.read_text().replace("[[ $2 == pip ]] || exec", noting))
+    done = run("setup", "--monitor", programs={"python3": slow})
+    assert done.returncode == 0 and "ready: .venv-monitor" in done.stdout, done
+    first, second = asked.read_text().splitlines()
+    wanted = first.partition("version-check ")[2].split()
+    assert wanted[:2] == ["numpy", "PyYAML"] and [w.partition("==")[0] for w in wanted[2:]] == [
+        "ros-jazzy-common-interfaces",
+        "ros-rclpy[fastrtps]",
+    ]
+    assert second.endswith("--no-deps -e .") and not (tmp_path / "a checkout/.venv").exists()

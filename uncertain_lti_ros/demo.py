@@ -34,6 +34,7 @@ CHECK = "turbofan_fan_damage.mcap"
 SHOWN = ["fan_speed", "compressor_exit_total_pressure", "turbine_exit_total_pressure"]
 _FLAGS = "/envelope_monitor/flags"
 _PATIENCE = 20.0  # s for another process to do its next step
+_DISCOVERY = 1.5  # s in which the programs of a domain find each other
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     UncertainLTIError
-        A node does not answer.
+        A node does not answer, or another monitor runs in the same domain.
     KeyboardInterrupt
         A signal came.
     BagError
@@ -163,12 +164,14 @@ def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> di
     subscription = life.node.create_subscription(JointState, _FLAGS, take, QoSProfile(depth=1000))
     monitor = [sys.executable, "-m", "uncertain_lti_ros.envelope_monitor", "--ros-args", "-p", f"model:={model}"]
     player = [sys.executable, "-m", "uncertain_lti.cli.main", "play", str(bag), "--rate", str(rate)]
+    _refuse_others(life, 0)
     with _process([*monitor, "--log-level", "warn"]):
         _until(life, lambda: life.node.count_publishers(_FLAGS) > 0, "the envelope_monitor node did not start")
         with _process(player) as playing:
             shown, silent_since = 0, time.monotonic()
             while life.alive and len(flags) < len(expected):
                 before = len(flags)
+                _refuse_others(life, 1)
                 life.spin_once(0.1)
                 if len(flags) > before:
                     silent_since = time.monotonic()
@@ -185,6 +188,22 @@ def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> di
                 life.spin_once(0.1)
     life.node.destroy_subscription(subscription)
     return flags
+
+
+def _refuse_others(life: Life, own: int) -> None:
+    """Refuse to go on where another monitor publishes too: each would hear the other's recording."""
+    until = time.monotonic() + (0.0 if own else _DISCOVERY)
+    while life.alive:
+        if life.node.count_publishers(_FLAGS) > own:
+            domain = os.environ.get("ROS_DOMAIN_ID", "0")
+            raise UncertainLTIError(
+                f"another envelope_monitor publishes {_FLAGS} in ROS domain {domain}, perhaps of another demo, and "
+                f"each would hear the other's recording; end it, or choose another domain: export ROS_DOMAIN_ID="
+                f"{int(domain) % 100 + 1 if domain.isdigit() else 1}"
+            )
+        if time.monotonic() >= until:
+            return
+        life.spin_once(0.1)
 
 
 def _show(flags: dict[int, Any], since: int, names: list[str], start_ns: int) -> None:

@@ -82,7 +82,7 @@ class Journal:
         return self._matters[name]
 
     def turned(self, session: Session, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
-        """Log the alarm if it has turned: its start with the states that left their bounds, and its end if the start was.
+        """Log the alarm if it has turned: its start with the states that left their bounds, its end if the start was.
 
         Of many alarms some starts are left out; the next line, at most 10 s later, says how many and names the last.
 
