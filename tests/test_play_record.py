@@ -186,7 +186,7 @@ def test_recording_takes_the_quality_of_service_it_finds_and_writes_it_down(worl
     # and it is offered again, so that whoever comes late hears it as well
     world.node.destroy_publisher(lasting)
     player = world.command("play", output, "--topics", "/lasting", "--wait", 2)
-    player.says("nobody subscribes")
+    player.says("there is no subscriber")
     assert player.succeed()
 
 
@@ -336,7 +336,7 @@ def test_another_speed_without_stamps_is_warned_of(world: World, tmp_path: Path)
     bag = write(topics, [Message("/x", START_NS, float64(1.0))]).save(tmp_path / "in.mcap")
     quick = [bag, "--wait", "0.1", "--rate", "100"]
     said = world.command("play", *quick).succeed()
-    assert "no header stamps: /x; who goes by time of receipt sees steps 100 times as fast" in said
+    assert "no header stamps: /x; a node that uses the time of receipt sees steps 100 times as fast" in said
     for arguments in ([*quick, "--clock"], quick[:3], [*quick, "--topics", "/stamped"]):
         assert "no header stamps" not in world.command("play", *arguments).succeed()
 
@@ -356,7 +356,7 @@ def test_what_cannot_be_played_is_said(world: World, tmp_path: Path) -> None:
     assert "/foreign is not played: frost_interfaces/msg/UCommand: the Python package frost_interfaces" in said
     assert "/other is not played: std_msgs/msg/Float64 was recorded in another version" in said
     assert "/json is not played: its messages are in json" in said
-    assert "nobody subscribes to /good after 0.5 s" in said and "played 1 messages of 1 topics" in said
+    assert "there is no subscriber to /good after 0.5 s" in said and "played 1 messages of 1 topics" in said
     refused = [
         ([bag, "--topics", "/foreign"], "no topic of it can be played"),
         ([bag, "--topics", "/nowhere"], "there is no topic /nowhere; topics there: /foreign, /good"),

@@ -82,7 +82,7 @@ class Declared:
 
     @property
     def wanted(self) -> str:
-        """The type in words, with the range where there is one."""
+        """The type in words, with the range if there is one."""
         low, high = (f"{limit:.12g}" for limit in (self.low or 0.0, self.high or 0.0))
         limits = "" if self.low is None else f" from {low} to {high}"
         return f"{_TYPES[type(self.default)]}{limits}"
@@ -126,7 +126,7 @@ def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
             shown = repr(given) if isinstance(given, str) else _shown(given)
             remedy = f"for example -p {parameter.name}:={parameter.example}"
             if isinstance(parameter.default, str):
-                remedy = f"where it looks like something else, quote it twice: -p \"{parameter.name}:='{shown}'\""
+                remedy = f"if it looks like something else, quote it twice: -p \"{parameter.name}:='{shown}'\""
             elif isinstance(parameter.default, float) and type(given) is int:
                 remedy = f"write {float(given)}"
             raise ArgumentError(
@@ -243,7 +243,7 @@ def _refuse(word: str, after: Sequence[str], name: str) -> None:
         remedy = f"if it is the model file, write --ros-args -p model:={word}"
     else:
         remedy = "--help lists what there is"
-    raise ArgumentError(f"argument {word} stands for nothing here; {remedy}")
+    raise ArgumentError(f"argument {word} has no meaning here; {remedy}")
 
 
 def _hold_value(flag: str, value: str) -> None:
@@ -288,16 +288,16 @@ def in_words(error: Exception) -> str:
         return f"parameter file {value} cannot be read: {why}; it reads NODE: ros__parameters: NAME: VALUE"
     if form == _LEVEL:
         return f"{flag} {value} is no log level; choose debug, info, warn, error or fatal"
-    said = f"{flag} {value} cannot be read; write {form}"
+    text = f"{flag} {value} cannot be read; write {form}"
     if form == _PARAMETER:
-        return f"{said}, with a name of letters, digits, _ and . and a value as in YAML"
-    return f"{said}, with names of letters, digits, _ and /" + ", and a namespace from / on" * value.startswith("__ns")
+        return f"{text}, with a name of letters, digits, _ and . and a value as in YAML"
+    return f"{text}, with names of letters, digits, _ and /" + ", and a namespace from / on" * value.startswith("__ns")
 
 
 def hold_overrides(node: Node, args: Sequence[str]) -> None:
     """Refuse parameters that were given and that the node does not have; log what may be meant for others.
 
-    A name that stands in a file and is like none of this node's may be there for another node that shares the file.
+    A name in a file that resembles none of this node's may belong to another node that shares the file.
 
     Parameters
     ----------

@@ -132,7 +132,9 @@ def _bags() -> Path:
     for root in roots:
         if (root / "bags" / CHECK).is_file():
             return root / "bags"
-    raise BagError(f"bags/{CHECK} is not beside the package or in its share folder; run the demo from a checkout")
+    raise BagError(
+        f"bags/{CHECK} is neither in the folder of the package nor in its share folder; run the demo from a checkout"
+    )
 
 
 def _prefixes() -> Iterator[str]:
@@ -148,7 +150,7 @@ def _fault(bag: Path) -> tuple[float, str]:
         for record in make_reader(stream).iter_metadata():
             if "fault_at" in record.metadata:
                 return float(record.metadata["fault_at"].split()[0]), record.metadata["what happens"]
-    raise BagError(f"{bag}: its metadata does not say when a fault sets in; make it with bags/make.py")
+    raise BagError(f"{bag}: its metadata does not state when a fault begins; make it with bags/make.py")
 
 
 def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> dict[int, Any]:

@@ -1,4 +1,4 @@
-"""Diagnostics: reports of the node on /diagnostics, with what its subscriptions count."""
+"""Diagnostics: reports of the node on /diagnostics, with counts of its subscriptions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Diagnostics:
 
     @property
     def listeners(self) -> int:
-        """How many subscribe to the topic."""
+        """Number of subscriptions to the topic."""
         return int(self._publisher.get_subscription_count())
 
     def publish(self, reports: Sequence[Report], stamp: Any, model: str) -> None:
@@ -96,7 +96,7 @@ class Diagnostics:
         return problems
 
     def reported(self, inputs: Mapping[str, MatchedSubscription]) -> None:
-        """What these count so far is in a report.
+        """The counts so far have been reported.
 
         Parameters
         ----------

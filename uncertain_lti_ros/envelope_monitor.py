@@ -21,8 +21,8 @@ from std_srvs.srv import Trigger
 from uncertain_lti.base.compiled import why_not
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.arming import Condition
+from uncertain_lti.monitor.event_log import EventLog
 from uncertain_lti.monitor.failures import Failures
-from uncertain_lti.monitor.journal import Journal
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session
 from uncertain_lti.monitor.snapshot import Entry
 from uncertain_lti_ros.arguments import declare, run_node
@@ -43,10 +43,10 @@ _SUMMARY = (
     "(std_srvs/srv/Trigger) and those of a managed node."
 )
 _POLL = 0.05  # s between two polls of the middleware: who listens, publishers that changed
-_TICK = 0.2  # s between two looks at what goes by time
+_TICK = 0.2  # s between two runs of the periodic tasks
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
-_NOTE = 0.05  # s between two looks for what the log should say
-_LAST_WORDS = 1.0  # s that the end waits for readers of /diagnostics to have the last report
+_NOTE = 0.05  # s between two checks for changes to log
+_LAST_WORDS = 1.0  # s that the end waits until readers of /diagnostics have the last report
 
 _TRANSITIONS = {
     getattr(Transition, name): name.removeprefix("TRANSITION_").lower()
@@ -55,7 +55,7 @@ _TRANSITIONS = {
 
 
 def _failures_noted(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:
-    """A transition whose unforeseen errors are counted and logged; rclpy on its own passes over them in silence."""
+    """A transition whose unexpected errors are counted and logged; rclpy itself ignores them silently."""
 
     @wraps(transition)
     def noting(node: EnvelopeMonitorNode, state: LifecycleState) -> TransitionCallbackReturn:
@@ -94,7 +94,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.clock: ROSClock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
         self._simulated = self.clock.ros_time_is_active
         self.snapshots = Snapshots(self, self.settings)
-        self._journal = Journal(self._log)
+        self._event_log = EventLog(self._log)
         self._noted = 0.0
         self._diagnostics = Diagnostics(self, str(self.settings.value("hardware_id")))
         services = {
@@ -116,7 +116,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         return make_session(path, rule, self.settings, self.session.arming if self.session else None)
 
     def _on_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
-        """Make what the new values ask for, or say why not; it takes its place in `_on_have_set`."""
+        """Prepare what the new values require, or refuse them; `_on_have_set` puts it in place."""
         given = {p.name: p.value for p in parameters}
         changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
         self._candidate = None
@@ -133,7 +133,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._candidate = None
             self.get_logger().warning(f"parameters refused: {error}")
             return SetParametersResult(successful=False, reason=str(error))
-        except Exception as error:  # a file can be wrong in ways that nobody thought of
+        except Exception as error:  # a file can be wrong in unexpected ways
             self._candidate = None
             self.note_failure("while parameters were set", error)
             return SetParametersResult(successful=False, reason=f"unexpected: {error!r}")
@@ -147,7 +147,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             if candidate == self.session.rule:
                 return
             self.session.follow(candidate)
-            self._journal.turned(self.session, (), time.monotonic(), ", as its rule has changed")
+            self._event_log.turned(self.session, (), time.monotonic(), ", as its rule has changed")
             self.get_logger().info(self.session.whole_rule_text())
             if self.active:
                 self.subscribe()
@@ -157,7 +157,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.start()
 
     def _swap(self, session: Session) -> None:
-        """Put another model in place, between two messages."""
+        """Replace the model, between two messages."""
         if self.session is not None and self.active:
             session.go_on_from(self.session)
         self.session = session
@@ -167,7 +167,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.subscribe()
         name = Path(str(self.settings.value("model"))).name
         self.get_logger().info(f"model swapped: {name}: {session.model}; {session.whole_rule_text()}")
-        self._journal.begin(session, time.monotonic())
+        self._event_log.begin(session, time.monotonic())
 
     # --- lifecycle ---
 
@@ -177,13 +177,13 @@ class EnvelopeMonitorNode(LifecycleNode):
         return str(self._state_machine.current_state[1])
 
     def start(self) -> None:
-        """Configure and activate; where that fails the reason is logged and published on /diagnostics."""
+        """Configure and activate; if that fails the reason is logged and published on /diagnostics."""
         self._starts_itself = True
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self._starts_itself = self.trigger_activate() != TransitionCallbackReturn.SUCCESS
 
     def _on_change_state(self, request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
-        """Refuse what the state does not allow; rclpy on its own raises, which would end the process."""
+        """Refuse what the state does not allow; rclpy itself raises, which would end the process."""
         try:
             return self._change_state(request, response)
         except RuntimeError:  # RCLError, which rclpy does not export
@@ -207,11 +207,11 @@ class EnvelopeMonitorNode(LifecycleNode):
         Returns
         -------
         TransitionCallbackReturn
-            FAILURE where the model or a parameter cannot be used.
+            FAILURE if the model or a parameter cannot be used.
         """
         path = str(self.settings.value("model"))
         try:
-            self.settings.wish()
+            self.settings.requested_qos()
             self.session = self._make_session(path, self.settings.rule({}))
             self.snapshots.open()
         except Exception as error:
@@ -246,14 +246,14 @@ class EnvelopeMonitorNode(LifecycleNode):
         Raises
         ------
         ModelError
-            A parameter of the quality of service is set to a word that is none.
+            A parameter of the quality of service has an unknown value.
         """
         assert self.session is not None
         result = super().on_activate(state)
         self.session.restart(time.monotonic())
         self._simulated = self.clock.ros_time_is_active
         self.subscribe()
-        self._journal.begin(self.session, time.monotonic())
+        self._event_log.begin(self.session, time.monotonic())
         resolved = {topic: self.resolve_topic_name(topic) for topic in self.session.types}
         topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
         self.get_logger().info(f"active: listening to {', '.join(topics)}")
@@ -264,7 +264,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @_failures_noted
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop listening; no heartbeat comes from now on.
+        """Stop listening; no heartbeat is published from now on.
 
         Parameters
         ----------
@@ -295,12 +295,12 @@ class EnvelopeMonitorNode(LifecycleNode):
             Of the node's own cleanup.
         """
         result = super().on_cleanup(state)
-        self._put_away()
+        self._release()
         return result
 
     @_failures_noted
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Put everything away.
+        """Release all resources.
 
         Parameters
         ----------
@@ -313,11 +313,11 @@ class EnvelopeMonitorNode(LifecycleNode):
             Of the node's own shutdown.
         """
         result = super().on_shutdown(state)
-        self._put_away()
+        self._release()
         return result
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Put everything away; the node can be configured again.
+        """Release all resources; the node can be configured again.
 
         Parameters
         ----------
@@ -331,27 +331,27 @@ class EnvelopeMonitorNode(LifecycleNode):
         """
         self.reason = "a transition failed unexpectedly; see the log"
         self.get_logger().error(self.reason)
-        self._put_away()
+        self._release()
         return TransitionCallbackReturn.SUCCESS
 
-    def _put_away(self) -> None:
+    def _release(self) -> None:
         self._unsubscribe()
         self.snapshots.close(self.session)
         self.outputs.close()
         self.session = None
 
     def finish(self) -> None:
-        """Shut down in good order, at the end of the process."""
+        """Shut down properly, at the end of the process."""
         if self.state_name in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
         self.reason = ""
         self.report()
         self._diagnostics.wait(_LAST_WORDS)
 
-    # --- what nobody thought of ---
+    # --- unexpected errors ---
 
     def note_failure(self, where: str, error: Exception) -> None:
-        """Count an error that nobody foresaw, log it, and put it into the next diagnostics; the node goes on.
+        """Count an unexpected error, log it, and put it into the next diagnostics; the node goes on.
 
         Parameters
         ----------
@@ -365,7 +365,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- messages ---
 
     def subscribe(self) -> None:
-        """Listen to exactly the topics wanted; what is listened to already goes on undisturbed."""
+        """Subscribe to exactly the topics needed; existing subscriptions to them are kept."""
         assert self.session is not None
         types = self.session.types
         for topic in list(self.inputs):
@@ -375,7 +375,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             if topic not in self.inputs:
                 self.inputs[topic] = MatchedSubscription(
                     self, topic, type_name, message_class(type_name), partial(self._on_message, topic),
-                    self.settings.wish(), raw=True,
+                    self.settings.requested_qos(), raw=True,
                 )  # fmt: skip
 
     def _unsubscribe(self) -> None:
@@ -404,7 +404,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         verdicts, opened = session.take(topic, arrival, data, now)
         turned = session.alarm != alarm
         if turned:
-            self._journal.turned(session, verdicts, now)
+            self._event_log.turned(session, verdicts, now)
         if self.snapshots.recent is not None:
             self.snapshots.add(Entry(now, arrival, topic, data, verdicts, session.alarm), session.alarms > alarms)
         if turned and not session.alarm:
@@ -413,7 +413,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.outputs.publish(session, verdicts, opened, now, turned)
 
     def _arrival(self) -> int:
-        """The time at which a message comes, ns; the clock's own call makes three objects."""
+        """Time of receipt, ns; the clock's own call makes three objects."""
         nanoseconds: int = self.clock.now().nanoseconds if self._simulated else time.time_ns()
         return nanoseconds
 
@@ -424,9 +424,9 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- heartbeat, graph, diagnostics ---
 
     def tick(self) -> None:
-        """Do what goes by time: heartbeat, graph, diagnostics, snapshots and log."""
+        """Run the periodic tasks: heartbeat, graph, diagnostics, snapshots and log."""
         self._look_at_clock()
-        tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_snapshots, self._keep_journal
+        tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_snapshots, self._log_events
         for task in tasks:
             try:
                 task()
@@ -478,11 +478,11 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is not None and self.active and not self._diagnostics.listeners:
             self._reported = now
             self.session.pass_over(now)
-            self._note_told()
+            self._mark_reported()
         else:
             self.report()
 
-    def _keep_journal(self) -> None:
+    def _log_events(self) -> None:
         now = time.monotonic()
         if self.session is None or not self.active or now - self._noted < _NOTE:
             return
@@ -490,7 +490,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         problems = [problem for subscription in self.inputs.values() for problem in subscription.problems]
         problems += self._lasting_problems()
         publishers = {topic: subscription.publishers for topic, subscription in self.inputs.items()}
-        self._journal.look(self.session, now, self.settings.real("state_timeout"), publishers, problems)
+        self._event_log.look(self.session, now, self.settings.real("state_timeout"), publishers, problems)
 
     def _log(self, level: int, line: str) -> None:
         if level == WARN:
@@ -503,14 +503,14 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.snapshots.write_due(self.session)
 
     def _lasting_problems(self) -> list[str]:
-        """The same where no topic of the model is concerned, and only what lasts."""
+        """Problems that last and concern no topic of the model."""
         problems = [self._enable_problem] if self._enable_problem else []
         if self.clock.ros_time_is_active and not self.clock.now().nanoseconds:
             problems.append("use_sim_time is true, and no time has come on /clock")
         return problems
 
     def _problems(self) -> list[str]:
-        """What keeps messages from coming, beside silence, and what went wrong here since the last report."""
+        """Why messages are missing, other than silence, and what went wrong in the node since the last report."""
         problems = self._diagnostics.problems(self.inputs) + self._lasting_problems()
         return problems + self.snapshots.problems + self.failures.problems()
 
@@ -529,10 +529,10 @@ class EnvelopeMonitorNode(LifecycleNode):
             reports = [Report(level, "monitor", message, {"unexpected errors": str(self.failures.count)})]
             if self.session is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
-        self._note_told()
+        self._mark_reported()
         self._diagnostics.publish(reports, self.clock.now().to_msg(), str(self.settings.value("model")))
 
-    def _note_told(self) -> None:
+    def _mark_reported(self) -> None:
         self.failures.reported()
         self._diagnostics.reported(self.inputs)
 
@@ -541,7 +541,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _serve(
         self, serve: Callable[[Trigger.Response], None], _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        """Answer a call; what is refused is told, and what nobody foresaw as well."""
+        """Answer a call; a refusal and an unexpected error are reported in the answer."""
         try:
             serve(response)
         except UncertainLTIError as error:
@@ -557,7 +557,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             raise ModelError("the node is not active, so there is no alarm to reset")
         response.message = "the alarm is reset" if self.session.alarm else "there was no alarm; its window is empty now"
         self.session.reset()
-        self._journal.turned(self.session, (), time.monotonic(), ", by ~/reset")
+        self._event_log.turned(self.session, (), time.monotonic(), ", by ~/reset")
         self._beat()
         response.success = True
 
@@ -575,7 +575,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         response.success = True
 
     def _on_status(self, response: Trigger.Response) -> None:
-        """Counters as JSON; success says whether verdicts are given."""
+        """Counters as JSON; success: verdicts are given."""
         session = self.session
         response.success = self.active
         response.message = json.dumps(

@@ -123,7 +123,7 @@ def full_name(type_name: str) -> str:
 def definition(type_name: str) -> str:
     """Definition of an installed type and of all it uses, as MCAP's schema encoding `ros2msg` wants it.
 
-    Constants and default values are not in it: a class does not tell them, and no reader of messages needs them.
+    Constants and default values are not in it: a class does not hold them, and no reader of messages needs them.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from uncertain_lti_ros.arguments import Declared
 from uncertain_lti_ros.subscriptions import DEPTH, DURABILITY, RELIABILITY
 
-_ANEW = "Changing it starts the alarm anew, unless it is latched."
+_RESTARTS = "Changing it restarts the alarm, unless it is latched."
 RULE = ("violations", "window", "margin", "masked", "enable", "enable_type", "grace", "latch")
 """Parameters that make up the alarm rule."""
 PARAMETERS = (
@@ -13,33 +13,33 @@ PARAMETERS = (
     Declared("autostart", True, "Configure and activate without being asked.", fixed=True),
     Declared(
         "violations", 0,
-        f"Alarm while this many of the last `window` verdicts are violations; 0: as the model says. {_ANEW}",
+        f"Alarm while this many of the last `window` verdicts are violations; 0: that of the model. {_RESTARTS}",
         low=0, high=10**6,
     ),
-    Declared("window", 0, f"Verdicts that the alarm looks at; 0: as the model says. {_ANEW}", low=0, high=10**6),
+    Declared("window", 0, f"Verdicts that the alarm looks at; 0: that of the model. {_RESTARTS}", low=0, high=10**6),
     Declared(
         "margin", 0.0,
-        f"Factor on the half-widths of the bounds that are judged; 0: as the model says. {_ANEW}",
+        f"Factor on the half-widths of the bounds that are judged; 0: that of the model. {_RESTARTS}",
         low=0.0, high=1e6,
     ),
     Declared(
         "masked", "",
         f"States, separated by commas, whose violations do not count for the alarm; they are judged and published "
-        f"all the same. {_ANEW}",
+        f"all the same. {_RESTARTS}",
     ),
     Declared(
         "enable", "",
         f"No alarm unless this holds: TOPIC FIELD OPERATOR NUMBER, for example '/engine/mode data == 3', with "
-        f"== != < <= > >=. Empty: alarms always count. {_ANEW}",
+        f"== != < <= > >=. Empty: alarms always count. {_RESTARTS}",
     ),
     Declared(
         "enable_type", "",
-        f"Message type of the topic in `enable`; empty: as the model or the graph tells. {_ANEW}",
+        f"Message type of the topic in `enable`; empty: that of the model or of the graph. {_RESTARTS}",
     ),
     Declared(
         "grace", 0.0,
         f"No alarm this long, in s of the samples' own time, after the first sample, after time jumped back, and "
-        f"after `enable` began to hold. {_ANEW}",
+        f"after `enable` began to hold. {_RESTARTS}",
         low=0.0, high=86400.0,
     ),
     Declared("latch", False, "An alarm lasts until ~/reset is called, also one that is on when this is set."),

@@ -1,4 +1,4 @@
-"""`plant`: the published engine as a node, drawn anew inside its intervals at each step."""
+"""`plant`: the published engine as a node, drawn at random inside its intervals at each step."""
 
 from __future__ import annotations
 
@@ -153,5 +153,5 @@ def main(args: list[str] | None = None) -> int:
         with living(Plant, args) as life:
             return run(life)
 
-    summary = SUMMARY.format("the published engine, drawn anew inside its intervals,", STATE_TOPIC, CONTROL_TOPIC)
+    summary = SUMMARY.format("the published engine, drawn at random inside its intervals,", STATE_TOPIC, CONTROL_TOPIC)
     return run_node("plant", summary, PARAMETERS, started, args)

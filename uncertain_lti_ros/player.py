@@ -106,8 +106,8 @@ def run(args: argparse.Namespace) -> int:
         unstamped = [topic for topic in played if "header" not in live_fields(bag.topics[topic].type)]
         if unstamped and not args.clock and args.rate not in (None, 1.0):
             say(
-                f"no header stamps: {', '.join(unstamped)}; who goes by time of receipt sees steps {args.rate:g} times "
-                f"as fast; play with --clock, and start the listeners with use_sim_time"
+                f"no header stamps: {', '.join(unstamped)}; a node that uses the time of receipt sees steps "
+                f"{args.rate:g} times as fast; play with --clock, and start the listeners with use_sim_time"
             )
         _wait(life, played, args.wait)
         messages = (m for m in bag.raw_messages(list(played)) if m.channel.counted)
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _offer(node: Node, bag: Bag, topics: list[str] | None, clock: bool) -> dict[str, _Played]:
-    """Publishers of what can be played; says of each other topic why it cannot."""
+    """Publishers of what can be played; reports for each other topic why it cannot."""
     asked = list(bag.topics) if topics is None else list(dict.fromkeys(topics))
     for topic in asked:
         if topic not in bag.topics:
@@ -194,7 +194,7 @@ def _crowd(bag: Bag, played: dict[str, _Played]) -> float:
 
 
 def _wait(life: Life, played: dict[str, _Played], limit: float) -> None:
-    """Wait until every subscription that the graph shows is connected, and no new one has come for a while."""
+    """Wait until every subscription that the graph shows is connected, and no new one appears for a while."""
     began = changed = time.monotonic()
     connected: dict[str, int] = {}
     while life.alive:
@@ -212,9 +212,9 @@ def _wait(life: Life, played: dict[str, _Played], limit: float) -> None:
         return
     unmet = [t for t in played if wanted[t] > counts[t]]
     if not any(wanted.values()):
-        say(f"nobody subscribes to {', '.join(played)} after {limit:g} s; playing all the same")
+        say(f"there is no subscriber to {', '.join(played)} after {limit:g} s; playing nevertheless")
     elif unmet:
-        say(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing all the same")
+        say(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
 
 
 def when_due(
@@ -270,7 +270,10 @@ def _paced(
         progress.show(f"{sent} of {total} messages")
     progress.clear()
     if behind > 1.0 and life.alive:
-        say(f"fell behind the asked rate by up to {behind:.1f} s, to keep messages at least {1e3 / crowd:.2g} ms apart")
+        say(
+            f"fell behind the requested rate by up to {behind:.1f} s, to keep messages at least "
+            f"{1e3 / crowd:.2g} ms apart"
+        )
 
 
 def _unconfirmed(life: Life, played: dict[str, _Played]) -> list[str]:
@@ -332,7 +335,7 @@ class _Follower:
         self._ask()
 
     def received(self, topic: str) -> int | None:
-        """Messages it has taken from a topic; None where it does not listen."""
+        """Messages it has received on a topic; None if it does not subscribe."""
         count: int | None = self.status.get("received", {}).get(topic)
         return count
 

@@ -1,4 +1,4 @@
-"""How every process here lives: rclpy started, one executor, an end by signal with everything put away."""
+"""How every process here runs: rclpy started, one executor, and an orderly end by signal."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from rclpy.task import Future
 
 from uncertain_lti_ros.arguments import ArgumentError, hold_overrides, in_words
 
-_PATIENCE = 0.1  # s that a signal waits at most
-_SPELL = 30.0  # s between two looks at whether rclpy has been shut down by somebody else
-_RESPITE = 0.01  # s of rest after an error, which may come again at once
+_LATENCY = 0.1  # s that a signal waits at most
+_SPIN = 30.0  # s between two checks whether rclpy has been shut down from elsewhere
+_PAUSE = 0.01  # s after an error, which may occur again at once
 
 
 class Life:
     """One node on one executor; `alive` turns false on SIGINT and SIGTERM.
 
     The events executor keeps messages in order of arrival; without a time limit its calls keep a core busy and
-    deliver nothing in some releases, so it is driven by timed calls. Where it is absent the default executor takes
-    its place, which delivers messages that arrive together in order of subscription. The multi-threaded one
+    deliver nothing in some releases, so it is driven by timed calls. If it is absent the default executor
+    is used, which delivers messages that arrive together in order of subscription. The multi-threaded one
     loses messages and is not used.
 
     Parameters
@@ -38,7 +38,7 @@ class Life:
     node : Node
         The node.
     stop : list of int
-        Signals that have come; the list is filled in elsewhere.
+        Signals received; the list is filled in elsewhere.
     """
 
     def __init__(self, node: Node, stop: list[int]) -> None:
@@ -57,28 +57,28 @@ class Life:
 
     @property
     def alive(self) -> bool:
-        """No signal has come and nobody has shut rclpy down."""
+        """No signal was received and rclpy is not shut down."""
         return not self._stop and rclpy.ok()
 
     @property
     def signal(self) -> int | None:
-        """The first signal that came; None while none has."""
+        """The first signal received; None before."""
         return self._stop[0] if self._stop else None
 
-    def spin_once(self, seconds: float = _PATIENCE) -> None:
-        """Wait for work, and do what is there.
+    def spin_once(self, seconds: float = _LATENCY) -> None:
+        """Wait for work, and do it.
 
         Parameters
         ----------
         seconds : float, optional
             How long at most, s; never longer than the default.
         """
-        self.executor.spin_once(timeout_sec=min(seconds, _PATIENCE))
+        self.executor.spin_once(timeout_sec=min(seconds, _LATENCY))
 
     def spin(self, note: Callable[[str, Exception], None]) -> None:
         """Work until the end; an error that a callback lets through is noted, and the work goes on.
 
-        The node must have a timer: a signal is seen when Python comes to run.
+        The node must have a timer: a signal is handled only when Python runs.
 
         Parameters
         ----------
@@ -88,24 +88,24 @@ class Life:
         while self.alive:
             self._end = Future(executor=self.executor)
             try:
-                # As `spin_once`, for as many callbacks as there are: the way back here costs 8 µs for each. And
-                # seldom: in some releases each of these calls costs 32 bytes that never come back.
-                self.executor.spin_until_future_complete(self._end, timeout_sec=_SPELL)
+                # As `spin_once`, for as many callbacks as there are: each return to here costs 8 µs. And
+                # rarely: in some releases each of these calls leaks 32 bytes.
+                self.executor.spin_until_future_complete(self._end, timeout_sec=_SPIN)
             except InvalidHandle:
-                pass  # an event came for a subscription that is being replaced; nobody wants it
+                pass  # an event of a subscription that is being replaced; it is not needed
             except Exception as error:
                 if self.alive:
                     note("in the executor", error)
-                    time.sleep(_RESPITE)
+                    time.sleep(_PAUSE)
 
     def end(self) -> None:
-        """Come back from `spin` as soon as may be: a signal has come."""
+        """Return from `spin` as soon as possible: a signal was received."""
         if self._end is not None and not self._end.done():
             self._end.set_result(None)
 
 
 def spare_the_middleware() -> None:
-    """Have Fast DDS wake its threads seldom; before rclpy starts. A profile of the user's own goes before."""
+    """Have Fast DDS wake its threads rarely; call it before rclpy starts. A profile of the user takes precedence."""
     given = any(os.environ.get(name) for name in ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"))
     if given or Path("DEFAULT_FASTRTPS_PROFILES.xml").exists() or Path("DEFAULT_FASTDDS_PROFILES.xml").exists():
         return
@@ -116,7 +116,7 @@ def spare_the_middleware() -> None:
 
 @contextmanager
 def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
-    """Start rclpy on these ROS arguments, make the node, and put all away at the end.
+    """Start rclpy with these ROS arguments, make the node, and destroy both at the end.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-        # Who was told to end is often told twice, by the terminal and by what started it.
+        # A process often gets the signal twice, from the terminal and from its parent.
         for name, handler in before.items():
             signal.signal(name, signal.SIG_IGN if stop else handler)
 

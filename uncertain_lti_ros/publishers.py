@@ -1,4 +1,4 @@
-"""Publishers of the node's outputs: what is listened to is laid out, then sent in one go."""
+"""Publishers of the node's outputs: messages are laid out for topics with subscribers, then sent together."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class OutputPublisher:
     send : callable
         Publishes the bytes of a message.
     poll : callable
-        Takes up what has changed.
+        Reads the events of the middleware.
     """
 
     def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
@@ -125,15 +125,15 @@ class Outputs:
         self._predicted = vectors("predicted")
 
     def poll(self) -> None:
-        """Ask who listens."""
+        """Update the numbers of listeners."""
         for publisher in self.publishers.values():
             publisher.poll()
 
     def publish(self, session: Session, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
-        """Publish what is listened to.
+        """Publish on the topics that have subscribers.
 
-        First everything is laid out, then all of it is sent in one go: threads of the middleware that are woken by
-        one message then find the others as well, and need not be woken again.
+        First all messages are laid out, then all are sent together: threads of the middleware that are woken by
+        one message then find the others too, and need not be woken again.
 
         Parameters
         ----------
@@ -146,7 +146,7 @@ class Outputs:
         now : float
             Steady time, s.
         turned : bool
-            The alarm changed; it is published whoever listens.
+            The alarm changed; it is published in any case.
         """
         messages = []
         for verdict in verdicts:

@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--wait", type=seconds, metavar="S", help="give up when a topic is not there after S seconds")
     parser.add_argument(
         "--note", action="append", default=[], type=_note, metavar="NAME=TEXT",
-        help="write this to the file as well, in a metadata record; may be given several times",
+        help="write this to the file too, in a metadata record; may be given several times",
     )  # fmt: skip
     parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
 

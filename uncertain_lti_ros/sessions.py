@@ -48,7 +48,7 @@ def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | Non
     ModelError
         There is no such file, it is no model, or the rule does not fit it.
     SignalError
-        A field is not in its type, or the model does not say how samples are cut.
+        A field is not in its type, or the model does not state how samples are cut.
     """
     if not path:
         raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")

@@ -9,7 +9,7 @@ from rclpy.node import Node
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.monitor.session import Rule
 from uncertain_lti_ros.parameters import RULE
-from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, Wish
+from uncertain_lti_ros.subscriptions import DURABILITY, RELIABILITY, RequestedQos
 
 MIB = 1 << 20
 """Bytes; parameters of size are in MiB."""
@@ -62,7 +62,7 @@ class Settings:
         float
             In the parameter's own unit.
         """
-        if name not in self._reals:  # to ask rclpy takes 10 µs
+        if name not in self._reals:  # a call of rclpy takes 10 µs
             self._reals[name] = float(self._node.get_parameter(name).value)
         return self._reals[name]
 
@@ -87,7 +87,7 @@ class Settings:
         self.largest_message = self.size("largest_message")
 
     def rule(self, changes: dict[str, Any]) -> Rule:
-        """The alarm rule that the parameters ask for.
+        """The alarm rule that the parameters define.
 
         Parameters
         ----------
@@ -101,18 +101,18 @@ class Settings:
         """
         return Rule(**{name: changes.get(name, self.value(name)) for name in RULE})
 
-    def wish(self) -> Wish:
-        """The quality of service that the parameters ask for.
+    def requested_qos(self) -> RequestedQos:
+        """The quality of service that the parameters request.
 
         Returns
         -------
-        Wish
+        RequestedQos
             Of every subscription to a topic of the model.
 
         Raises
         ------
         ModelError
-            A parameter of the quality of service is set to a word that is none.
+            A parameter of the quality of service has an unknown value.
         """
         chosen: dict[str, Any] = {}
         for name, known in (("reliability", RELIABILITY), ("durability", DURABILITY)):
@@ -120,7 +120,7 @@ class Settings:
             if text != "match" and text not in known:
                 raise ModelError(f"parameter qos.{name} is {text!r}; choose match, {' or '.join(known)}")
             chosen[name] = known.get(text)
-        return Wish(self.value("qos.depth"), **chosen)
+        return RequestedQos(self.value("qos.depth"), **chosen)
 
     def check_snapshots(self, on_alarm: bool) -> None:
         """Refuse snapshots on an alarm without a folder for them.
@@ -128,7 +128,7 @@ class Settings:
         Parameters
         ----------
         on_alarm : bool
-            Whether alarms ask for snapshots.
+            Whether alarms trigger snapshots.
 
         Raises
         ------

@@ -101,11 +101,11 @@ class Snapshots:
         self._alarmed = now
 
     def _is_first_alarm(self, now: float) -> bool:
-        """There was none for as long as a snapshot goes back: one that flaps must not drive out the first file."""
+        """No alarm for as long as a snapshot goes back: one that flaps must not replace the first file."""
         return now - self._alarmed >= self._settings.real("snapshot.seconds")
 
     def write_due(self, session: Session) -> None:
-        """Begin to write the snapshot of an alarm, if its time has come.
+        """Begin to write the snapshot of an alarm, if it is due.
 
         Parameters
         ----------
@@ -132,17 +132,17 @@ class Snapshots:
         Parameters
         ----------
         session : Session, optional
-            The session, where there is one.
+            The session, if there is one.
 
         Returns
         -------
         str
-            What became of it, a sentence.
+            The outcome, a sentence.
 
         Raises
         ------
         ModelError
-            There is no folder, nothing to write, or writing failed; says why.
+            There is no folder, nothing to write, or writing failed; states the reason.
         """
         if self._album is None or session is None:
             if self._settings.value("snapshot.folder"):
@@ -169,12 +169,12 @@ class Snapshots:
 
     @property
     def last(self) -> str:
-        """Path of the last file; empty where there is none."""
+        """Path of the last file; empty if there is none."""
         return self._album.last if self._album else ""
 
     @property
     def values(self) -> dict[str, str]:
-        """What diagnostics say of the files; nothing while there is no folder."""
+        """Values about the files for diagnostics; none while there is no folder."""
         return {} if self._album is None else {"snapshots": str(self._album.written), "last snapshot": self._album.last}
 
     @property

@@ -16,16 +16,16 @@ from uncertain_lti_ros.messages import full_name
 from uncertain_lti_ros.polled_events import PolledEvents
 
 DEPTH = 1000
-"""Messages kept until they are taken: the graph does not tell how deep the publishers' queues are."""
+"""Messages kept until they are taken: the graph does not show the depth of the publishers' queues."""
 RELIABILITY = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
 DURABILITY = {"volatile": DurabilityPolicy.VOLATILE, "transient_local": DurabilityPolicy.TRANSIENT_LOCAL}
 _NEVER_NS = 2**62
-"""A deadline from here on is none."""
+"""A deadline of this or more means none."""
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What a user asks of subscriptions.
+class RequestedQos:
+    """Quality of service that a user requests for subscriptions.
 
     Parameters
     ----------
@@ -42,8 +42,8 @@ class Wish:
     durability: DurabilityPolicy | None = None
 
 
-def choose_qos(offers: Iterable[QoSProfile], wish: Wish, history: bool = True) -> QoSProfile:
-    """The quality of service that hears the publishers.
+def choose_qos(offers: Iterable[QoSProfile], requested: RequestedQos, history: bool = True) -> QoSProfile:
+    """The quality of service that is compatible with the publishers.
 
     Reliable only if every publisher is, transient local only if every publisher is; without any, reliable and volatile.
     The deadline is the longest that publishers offer, and none where one of them offers none.
@@ -52,10 +52,10 @@ def choose_qos(offers: Iterable[QoSProfile], wish: Wish, history: bool = True) -
     ----------
     offers : iterable of QoSProfile
         Of the publishers.
-    wish : Wish
-        Goes before what they offer.
+    requested : RequestedQos
+        Takes precedence over what they offer.
     history : bool, default True
-        Whether messages sent before may still be asked for; where some have come, that would repeat them.
+        Whether messages sent before may be requested; if some were received, that would repeat them.
 
     Returns
     -------
@@ -70,15 +70,16 @@ def choose_qos(offers: Iterable[QoSProfile], wish: Wish, history: bool = True) -
     return QoSProfile(
         deadline=Duration(nanoseconds=max(deadlines)) if promised else Duration(),
         history=HistoryPolicy.KEEP_LAST,
-        depth=wish.depth,
-        reliability=wish.reliability or (ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
-        durability=wish.durability
+        depth=requested.depth,
+        reliability=requested.reliability
+        or (ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
+        durability=requested.durability
         or (DurabilityPolicy.TRANSIENT_LOCAL if lasting and history else DurabilityPolicy.VOLATILE),
     )
 
 
 def incompatible(asked: QoSProfile, offered: QoSProfile) -> list[str]:
-    """What a publisher does not offer of what is asked, in words.
+    """What is requested and a publisher does not offer, in words.
 
     Parameters
     ----------
@@ -101,12 +102,12 @@ def incompatible(asked: QoSProfile, offered: QoSProfile) -> list[str]:
 
 
 def _policies(qos: QoSProfile) -> tuple[Any, ...]:
-    """What publishers and subscribers must agree on."""
+    """What must be compatible between publishers and subscribers."""
     return qos.reliability, qos.durability, qos.deadline.nanoseconds % _NEVER_NS
 
 
 class MatchedSubscription:
-    """Subscription to one topic whose QoS is held against the graph by `look`.
+    """Subscription to one topic whose QoS `look` compares with the graph.
 
     Parameters
     ----------
@@ -120,15 +121,15 @@ class MatchedSubscription:
         Class of the type.
     callback : callable
         Takes the message, or its bytes when raw.
-    wish : Wish, optional
-        What the user asks.
+    requested : RequestedQos, optional
+        What the user requests.
     raw : bool, default False
         Whether the callback takes bytes.
 
     Attributes
     ----------
     received, lost, late : int
-        Messages that came, those that the middleware says were lost, and deadlines missed by publishers.
+        Messages received, those that the middleware reports as lost, and deadlines missed by publishers.
     publishers : int
         Publishers of this type that the graph knows.
     problems : list of str
@@ -142,11 +143,11 @@ class MatchedSubscription:
         type_name: str,
         message_class: Any,
         callback: Callable[[Any], None],
-        wish: Wish = Wish(),
+        requested: RequestedQos = RequestedQos(),
         raw: bool = False,
     ) -> None:
         self._node, self._asked_topic, self.type_name = node, topic, full_name(type_name)
-        self._class, self._callback, self._wish, self._raw = message_class, callback, wish, raw
+        self._class, self._callback, self._requested, self._raw = message_class, callback, requested, raw
         self.topic: str = node.resolve_topic_name(topic)
         self.received = self.lost = self.late = self.publishers = 0
         self.problems: list[str] = []
@@ -161,16 +162,16 @@ class MatchedSubscription:
         return self._qos
 
     def look(self) -> None:
-        """Compare the subscription with what publishers offer now, and make another where it must change."""
+        """Compare the subscription with what publishers offer now, and replace it if it must change."""
         self.look_soon = False
         infos = self._node.get_publishers_info_by_topic(self._asked_topic)
         offers = [i.qos_profile for i in infos if i.topic_type == self.type_name]
         self.publishers = len(offers)
         if self._subscription is None:
-            self._subscribe(choose_qos(offers, self._wish))
+            self._subscribe(choose_qos(offers, self._requested))
         elif offers:  # when the last publisher leaves, the next one is likely to offer the same
             lasting = self._qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-            qos = choose_qos(offers, self._wish, history=lasting or not self.received)
+            qos = choose_qos(offers, self._requested, history=lasting or not self.received)
             if _policies(qos) != _policies(self._qos):
                 self.destroy()
                 self._subscribe(qos)
@@ -191,7 +192,7 @@ class MatchedSubscription:
             self._subscription = self._events = None
 
     def poll(self) -> None:
-        """See what the middleware has to say: publishers that came or left, messages lost, deadlines missed."""
+        """Read the events of the middleware: publishers that came or left, messages lost, deadlines missed."""
         if self._events is not None:
             self._events.poll()
 

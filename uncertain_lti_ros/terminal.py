@@ -9,12 +9,12 @@ _hushed = False
 
 
 def hush(wanted: bool) -> None:
-    """From here on say nothing to the person who waits, or speak again.
+    """Suppress messages to the terminal from here on, or allow them again.
 
     Parameters
     ----------
     wanted : bool
-        Whether to say nothing.
+        Whether to suppress them.
     """
     global _hushed
     _hushed = wanted

@@ -93,7 +93,7 @@ class AlarmWindow:
 
 
 def raised(violated: NDArray[np.bool_], rule: AlarmRule) -> NDArray[np.bool_]:
-    """What `AlarmWindow` says after each of many verdicts, from a cleared alarm.
+    """The alarm of `AlarmWindow` after each of many verdicts, from a cleared alarm.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ class Condition:
         return cls(match["topic"], path, match["operator"], value)
 
     def holds(self, value: float) -> bool | None:
-        """Whether it holds; None where the value is not a number.
+        """Whether it holds; None if the value is not a number.
 
         Parameters
         ----------
@@ -105,12 +105,12 @@ class Arming:
         No alarm this long, ns, in the samples' own time, after the first sample, after time jumped back, and after the
         condition began to hold.
     value : float or None
-        What the condition's field said last, where that is known already.
+        The last value of the condition, if it is known already.
 
     Attributes
     ----------
     value : float or None
-        What the condition's field said last; None while nothing has come.
+        The last value of the condition; None while none was received.
     on : bool or None
         Whether the condition holds; None while nothing, or nothing that is a number, is known. Without a condition
         True.
@@ -182,7 +182,7 @@ class Arming:
         return t_ns >= self._from
 
     def why_off(self) -> str:
-        """What keeps alarms off, in words; empty where they are on.
+        """Why alarms do not count, in words; empty if they do.
 
         Returns
         -------

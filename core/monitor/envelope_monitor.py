@@ -34,16 +34,16 @@ from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 
 NUMBERS = ("flags", "lower", "upper", "state", "utilisation")
-"""What a verdict says of each state."""
+"""Numbers of a verdict, for each state."""
 _OF_JUDGEMENT = {"lower": LOWER, "upper": UPPER, "utilisation": UTILISATION, "flags": FLAGS}
 
 
 class Verdict:
-    """What the monitor says of one clock message.
+    """Verdict on one clock message.
 
     Numbers of each state, n each, are computed when they are asked for, by `numbers`, by `packed`, or as a new array by
-    the attribute of that name: a live monitor makes one verdict per message, and often nobody asks for more than the
-    alarm. They are `flags` (0 contained, 1 violated, NaN no verdict), `lower`, `upper` and `state` (the bounds that
+    the attribute of that name: a live monitor makes one verdict per message, and often only the alarm is
+    needed. They are `flags` (0 contained, 1 violated, NaN no verdict), `lower`, `upper` and `state` (the bounds that
     were judged and the sample, recorded units) and `utilisation` ((x_next - centre) / half, with half before the
     margin); NaN where there is no verdict.
 
@@ -54,7 +54,7 @@ class Verdict:
     alarm : bool
         The alarm after this verdict.
     judgement : Judgement or None
-        None where there is no verdict.
+        None if there is no verdict.
     status : Status, optional
         In place of that of the step, where the monitor gives no verdict on it.
     """
@@ -193,7 +193,7 @@ class Verdicts:
     lower : array (N+1, n)
         Lower bounds, recorded units; NaN without a verdict.
     upper : array (N+1, n)
-        Upper bounds, likewise.
+        Upper bounds, recorded units; NaN without a verdict.
     utilisation : array (N+1, n)
         (x_next - centre) / half, with half before the margin.
     judged : array (N+1,) of bool
@@ -251,7 +251,7 @@ class Verdicts:
         return html_table(repr(self), ("state", "violations", "inside", "mean width", "largest", "first"), rows)
 
     def statuses(self) -> list[Status]:
-        """What became of each sample.
+        """Status of each sample.
 
         Returns
         -------
@@ -282,7 +282,7 @@ class EnvelopeMonitor:
 
     A sample is contained when lower <= x_next <= upper in the normalised quantities, nothing else (Leibov (2006),
     eqs. (8)(9)). The alarm looks at the last `window` verdicts (messages without a verdict do not count) and
-    starts anew when time jumps back. A step shorter than half of, or longer than twice, those that the model was
+    starts over when time jumps back. A step shorter than half of, or longer than twice, those that the model was
     fitted to has no verdict.
 
     Parameters
@@ -317,12 +317,12 @@ class EnvelopeMonitor:
         margin: float | None = None,
         masked: Sequence[str] = (),
     ) -> None:
-        said = model.alarm_rule
+        rule = model.alarm_rule
         self.model = model
         self.rule = AlarmRule(
-            said.violations if violations is None else violations,
-            said.window if window is None else window,
-            said.margin if margin is None else margin,
+            rule.violations if violations is None else violations,
+            rule.window if window is None else window,
+            rule.margin if margin is None else margin,
         )
         names = model.state_names
         for name in masked:
@@ -378,7 +378,7 @@ class EnvelopeMonitor:
         return verdict.lower, verdict.upper
 
     def expect(self, t_ns: int, z: Sequence[float], dt: float) -> Verdict:
-        """`predict` as a verdict that counts nowhere.
+        """`predict` as a verdict, not counted for the alarm.
 
         Parameters
         ----------
@@ -397,7 +397,7 @@ class EnvelopeMonitor:
         return self.look(Step(Status.OK, t_ns, 0, dt, z, z[: self.model.n]))
 
     def look(self, step: Step) -> Verdict:
-        """Verdict on a complete step that counts nowhere.
+        """Verdict on a complete step, not counted for the alarm.
 
         Parameters
         ----------
@@ -497,7 +497,7 @@ class EnvelopeMonitor:
         resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
         for start, stop in zip([0, *resets], [*resets, count], strict=True):
             after = raised(violated[start:stop][judged[start:stop]], self.rule)
-            held = np.concatenate([[False], after])  # without a verdict the last one stands
+            held = np.concatenate([[False], after])  # without a verdict the alarm stays as it was
             alarm[start:stop] = held[np.cumsum(judged[start:stop])]
         return Verdicts(
             transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,

@@ -10,7 +10,7 @@ _LOGGED = 5.0  # s between two log entries on unexpected errors
 
 
 class Failures:
-    """Errors that nobody foresaw: how many there were, and the last one.
+    """Unexpected errors: their number, and the last one.
 
     Parameters
     ----------

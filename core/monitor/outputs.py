@@ -26,7 +26,7 @@ class Output:
     when : {"message", "judged", "predicted"}
         For every clock message, for those with a verdict, or for the prediction after an open sample.
     text : str
-        What it says, for the reference (Markdown).
+        Its meaning, for the reference (Markdown).
     position : str
         The number of a verdict that `position` holds, one of `envelope_monitor.NUMBERS`; empty without one.
     velocity : str

@@ -1,4 +1,4 @@
-"""Session: one model on live messages; takes messages, returns verdicts and health, and needs no rclpy."""
+"""Session: one model on live messages; takes messages, returns verdicts and reports, and needs no rclpy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
 
 @dataclass(frozen=True)
 class Rule:
-    """Alarm rule as the parameters give it; 0 means what the model says.
+    """Alarm rule as the parameters give it; 0 means that of the model.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Rule:
     enable : str, default ""
         See `Condition`; empty for none.
     enable_type : str, default ""
-        Message type of its topic; empty where the model or the graph tells.
+        Message type of its topic; empty for that of the model or of the graph.
     grace : float, default 0.0
         Time of grace, s.
     latch : bool, default False
@@ -239,7 +239,7 @@ class Session:
     ModelError
         The rule does not fit.
     SignalError
-        The model does not say how samples are cut.
+        The model does not state how samples are cut.
     """
 
     def __init__(
@@ -293,8 +293,8 @@ class Session:
     def follow(self, rule: Rule) -> None:
         """Judge by another alarm rule from now on.
 
-        The alarm starts cleared, and one that is raised is latched where the rule says so. A rule equal to the one in
-        force changes nothing.
+        The alarm starts cleared, and one that is raised is latched if the rule asks for it. A rule equal to the
+        present one changes nothing.
 
         Parameters
         ----------
@@ -321,14 +321,14 @@ class Session:
         self.enable_topic = condition.topic if condition else ""
 
     def go_on_from(self, other: Session) -> None:
-        """Keep what the session before knows: what is in force on topics that both read alike, and a latched alarm.
+        """Keep what the previous session knows: the last values of topics that both read alike, and a latched alarm.
 
-        States start anew; controls would not come again where they are sent on a change only.
+        States start over; controls would not arrive again if they are sent on a change only.
 
         Parameters
         ----------
         other : Session
-            The session before.
+            The previous session.
         """
         mine, theirs = self.model.signals, other.model.signals
         for topic in self.types:
@@ -418,16 +418,16 @@ class Session:
 
     @property
     def alarm(self) -> bool:
-        """What ~/violation says."""
+        """The alarm, as published on ~/violation."""
         return self.monitor.alarm or self.latched
 
     def reset(self) -> None:
-        """End a latched alarm, and forget the verdicts that the alarm looks at."""
+        """End a latched alarm, and forget the verdicts in its window."""
         self.monitor.reset()
         self.latched = False
 
     def failed(self) -> None:
-        """Something unexpected happened between messages: what was half done must not be joined to what follows."""
+        """Start over after an unexpected error: what was half done must not be joined to what follows."""
         latched, counters = self.latched, self.sampler.counters
         self._start()
         self.latched, self.sampler.counters = latched, counters
@@ -464,7 +464,7 @@ class Session:
             stamp_ns, values = self._readers[topic].read(data)
         except UnreadableError as error:
             self._note_unreadable(topic, error)
-            return _NOTHING, False  # as in a recording: it is left out, and what was in force stays so
+            return _NOTHING, False  # as in a recording: it is left out, and the values before it are kept
         if stamp_ns is not None and stamp_ns > arrival_ns + _FUTURE_NS:
             self.future[topic] += 1
         sampler = self.sampler
@@ -533,7 +533,7 @@ class Session:
         Returns
         -------
         Verdict or None
-            Its `lower` and `upper` are the bounds; None where there are none.
+            Its `lower` and `upper` are the bounds; None if there are none.
         """
         dt, latest = self.model.sampling.dt_median, self.sampler.latest()
         if dt is None or latest is None:
@@ -543,11 +543,11 @@ class Session:
 
     @property
     def late(self) -> int:
-        """Messages that came after the sample they belonged to was closed."""
+        """Messages that arrived after their sample was closed."""
         return sum(self.sampler.counters.of(LATE).values())
 
     def heard(self, topic: str) -> float | None:
-        """When the last message of a topic came.
+        """When the last message of a topic arrived.
 
         Parameters
         ----------

@@ -17,13 +17,13 @@ from uncertain_lti.monitor.outputs import FLAG_TYPE, RECORDED
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
 from uncertain_lti.recordings.mcap_writer import McapWriter
 
-_OVERHEAD = 800  # bytes that one kept message takes beside its data, a verdict on it included
+_OVERHEAD = 800  # bytes that one kept message takes besides its data, a verdict on it included
 _PER_STATE = 200  # and for each state of a verdict
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One message as it came, and what it led to.
+    """One message as received, with the verdicts and the alarm after it.
 
     Parameters
     ----------
@@ -50,9 +50,9 @@ class Entry:
 
 
 class Recent:
-    """The messages of the last seconds that fit into some bytes; the oldest go first.
+    """The messages of the last seconds, bounded in bytes; the oldest are dropped first.
 
-    Of each topic the last message before these is kept as well: it is what was in force when they begin.
+    Of each topic the last message before these is kept as well: its values hold when they begin.
 
     Parameters
     ----------
@@ -160,9 +160,9 @@ class Scene:
             }
             log_time = 0
             for entry in self.entries:
-                log_time = max(log_time, entry.arrival_ns)  # a clock that is set back must not reorder what came
+                log_time = max(log_time, entry.arrival_ns)  # a clock that is set back must not reorder messages
                 if entry.topic not in inputs:
-                    continue  # of the model before
+                    continue  # of the previous model
                 writer.message(inputs[entry.topic], log_time, entry.data)
                 count += 1
                 for verdict in entry.verdicts:
@@ -182,7 +182,7 @@ class Scene:
 
 
 class Album:
-    """Snapshot files in one folder, bounded in number and in bytes; written one at a time, beside the node's work.
+    """Snapshot files in one folder, bounded in number and in bytes; written one at a time, in a thread of their own.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ class Album:
     written : int
         Files written so far.
     last, problem : str
-        Path of the last file, and why the last attempt failed; empty where there was none, or it did not.
+        Path of the last file, and why the last attempt failed; empty if there was none, or it did not.
 
     Raises
     ------
@@ -245,12 +245,12 @@ class Album:
         Returns
         -------
         str
-            What became of it, a sentence.
+            The outcome, a sentence.
 
         Raises
         ------
         ModelError
-            A file is being written, nothing has come yet, or writing failed; says why.
+            A file is being written, no message was received yet, or writing failed; states the reason.
         """
         if self.busy:
             raise ModelError("a snapshot is being written; ask again in a moment")
@@ -287,7 +287,7 @@ class Album:
         except (OSError, UncertainLTIError) as error:
             why = error.strerror if isinstance(error, OSError) else str(error)
             self.problem = f"snapshot {path}: not written: {why}"
-        except Exception as error:  # the node goes on, and says so
+        except Exception as error:  # the node goes on, and reports it
             self.problem = f"snapshot {path}: not written: {error!r}"
         finally:
             with suppress(OSError):

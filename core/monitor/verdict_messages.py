@@ -70,11 +70,11 @@ class NamedVector:
         self._names = self.template[_ENCAPSULATION + _STAMP.size : self.position]
         self._between = self.template[self.position + width : self.velocity]
         self._end = self.template[self.velocity + width * velocities :]
-        # Several vectors bear the same stamp one after another.
+        # Several vectors have the same stamp one after another.
         self._t_ns, self._head = 0, self._headed(0)
 
     def __call__(self, t_ns: int, position: bytes, velocity: bytes = b"") -> bytes:
-        """The message; position, and velocity where there is one, as little-endian doubles, all of them."""
+        """The message; position, and velocity if there is one, as little-endian doubles, all of them."""
         if t_ns != self._t_ns:
             self._t_ns, self._head = t_ns, self._headed(t_ns)
         return b"".join((self._head, position, self._between, velocity, self._end))
@@ -86,7 +86,7 @@ class NamedVector:
 
 
 class AnyVerdict(Protocol):
-    """What messages take from a verdict; `Verdict` is one."""
+    """What messages need of a verdict; `Verdict` is one."""
 
     @property
     def t_ns(self) -> int:

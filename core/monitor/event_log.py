@@ -1,4 +1,4 @@
-"""What the node's log says while it watches: each change once, and few lines where something keeps changing."""
+"""Event log of a session: each change is logged once, at a limited rate if it keeps changing."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.session import OK, WARN, WHY, Session
 from uncertain_lti.sampling.status import Status
 
-_BURST, _REFILL = 6, 10.0  # lines on one matter at once, and s until there is one more
+_BURST, _REFILL = 6, 10.0  # lines on one subject at once, and s until one more is allowed
 _SHOWN = 5  # states that one line names
 
 
 class _Matter:
-    """Something that changes, and what was last said of it."""
+    """Something that changes, and its value in the last line logged."""
 
-    def __init__(self, said: Any) -> None:
-        self.said = said
+    def __init__(self, logged: Any) -> None:
+        self.logged = logged
         self._lines, self._at = float(_BURST), -math.inf
 
     def may(self, now: float) -> bool:
-        """Whether a line may be spent now; spends it."""
+        """Whether a line may be logged now; counts it."""
         self._lines = min(_BURST, self._lines + (now - self._at) / _REFILL)
         self._at = now
         if self._lines < 1.0:
@@ -33,24 +33,24 @@ class _Matter:
         return True
 
     def becomes(self, value: Any, now: float) -> bool:
-        """Whether this is new and may be said; where it may not be, it stays new."""
-        if value == self.said or not self.may(now):
+        """Whether this is new and may be logged; otherwise it stays new."""
+        if value == self.logged or not self.may(now):
             return False
-        self.said = value
+        self.logged = value
         return True
 
 
-class Journal:
-    """Alarms with the states that left their bounds, verdicts that begin and cease, inputs that fall silent.
+class EventLog:
+    """Logs alarms with the states that left their bounds, verdicts that begin and cease, inputs that fall silent.
 
     Parameters
     ----------
-    say : callable
+    log : callable
         Takes a level of `session` (WARN for the alarm, OK for all else) and a line.
     """
 
-    def __init__(self, say: Callable[[int, str], None]) -> None:
-        self._say = say
+    def __init__(self, log: Callable[[int, str], None]) -> None:
+        self._log = log
         self._matters: dict[str, _Matter] = {}
         self._alarm, self._alarm_since = False, 0.0
         self._named = False  # whether the start of this alarm was logged
@@ -58,7 +58,7 @@ class Journal:
         self._counters: Counter[str] = Counter()
         self._unreadable: Counter[str] = Counter()
         self._ceased, self._judged = 0.0, False
-        self._cause = ("", 0.0)  # of no verdicts, and since when it is this one
+        self._cause = ("", 0.0)  # why there are no verdicts, and since when
 
     def begin(self, session: Session, now: float) -> None:
         """A session starts, with no sample.
@@ -82,20 +82,20 @@ class Journal:
         return self._matters[name]
 
     def turned(self, session: Session, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
-        """Log the alarm if it has turned: its start with the states that left their bounds, its end if the start was.
+        """Log the alarm if it has changed: its start with the states that left their bounds, its end if the start was.
 
-        Of many alarms some starts are left out; the next line, at most 10 s later, says how many and names the last.
+        Of many alarms some starts are left out; the next line, at most 10 s later, counts them and names the last.
 
         Parameters
         ----------
         session : Session
             The session.
         verdicts : iterable of Verdict
-            Those that may have turned it.
+            Those that may have changed it.
         now : float
             Steady time, s.
         why : str, default ""
-            What else turned it, with the blank in front.
+            What else changed it, with a blank in front.
         """
         if session.alarm == self._alarm:
             return
@@ -108,11 +108,11 @@ class Journal:
             self._alarm_since = now
             self._named = self._matter("alarm").may(now)
             if self._named:
-                self._say(WARN, f"{line}{self._left_out(self._unnamed)}")
+                self._log(WARN, f"{line}{self._left_out(self._unnamed)}")
             else:
                 self._latest, self._unnamed = line, self._unnamed + 1
         elif self._named:
-            self._say(OK, f"the alarm is over after {now - self._alarm_since:.3g} s{why}")
+            self._log(OK, f"the alarm is over after {now - self._alarm_since:.3g} s{why}")
             self._named = False
 
     def _left_out(self, number: int) -> str:
@@ -121,16 +121,16 @@ class Journal:
         return f" ({plural(number, 'alarm')} before it {'is' if number == 1 else 'are'} not logged)" if number else ""
 
     def _catch_up(self, now: float) -> None:
-        """Name the last of the alarms that were left out, as soon as a line may be spent."""
+        """Name the last of the alarms that were left out, as soon as a line may be logged."""
         if self._unnamed and self._matter("alarm").may(now):
             over = "" if self._alarm else "; it is over"
-            self._say(WARN, f"{self._latest}{over}{self._left_out(self._unnamed - 1)}")
+            self._log(WARN, f"{self._latest}{over}{self._left_out(self._unnamed - 1)}")
             self._named = self._alarm
 
     def look(
         self, session: Session, now: float, timeout: float, publishers: Mapping[str, int], problems: Sequence[str]
     ) -> None:
-        """Log what has changed since the last look.
+        """Log what has changed since the last call.
 
         Parameters
         ----------
@@ -143,18 +143,18 @@ class Journal:
         publishers : mapping of str to int
             Topic -> number of publishers.
         problems : sequence of str
-            What keeps messages from coming, in words that stay the same while it lasts.
+            Why messages are missing, in words that stay the same while it lasts.
         """
         self.turned(session, (), now)
         self._catch_up(now)
         matter = self._matter("problems")
-        new = [problem for problem in problems if problem not in (matter.said or ())]
+        new = [problem for problem in problems if problem not in (matter.logged or ())]
         if matter.becomes(tuple(problems) or None, now):
             for problem in new[:_SHOWN]:
-                self._say(OK, problem)
+                self._log(OK, problem)
         if self._matter("arming").becomes(session.arming.on, now):
             condition = session.arming.condition or "there is no condition any more"
-            self._say(OK, session.arming.why_off() or f"alarms count from now on: {condition}")
+            self._log(OK, session.arming.why_off() or f"alarms count from now on: {condition}")
         for topic in session.types:
             if topic != session.sampler.clock:
                 self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0))
@@ -163,13 +163,13 @@ class Journal:
     def _look_at_topic(self, session: Session, topic: str, now: float, timeout: float, publishers: int) -> None:
         heard = session.heard(topic)
         if heard is None:
-            return  # the line on verdicts says so
+            return  # the line on verdicts has it
         held = session.held(topic)
         age = now - heard
         silent = age > max(timeout, held) or (age > timeout and math.isinf(held) and not publishers)
         if self._matter(f"silence {topic}").becomes(silent or None, now):
             held_on = " and no publisher any more; its last values are held" if math.isinf(held) else ""
-            self._say(OK, f"no message on {topic} for {age:.1f} s{held_on}" if silent else f"messages on {topic} again")
+            self._log(OK, f"no message on {topic} for {age:.1f} s{held_on}" if silent else f"messages on {topic} again")
 
     def _look_at_verdicts(self, session: Session, now: float, timeout: float) -> None:
         without = session.without_verdict(now)
@@ -177,25 +177,25 @@ class Journal:
         if session.verdicts and without <= timeout:
             if matter.becomes("", now):
                 again = f"judging again, after {now - without - self._ceased:.1f} s without a verdict"
-                self._say(OK, again if self._judged else self._judging(session))
+                self._log(OK, again if self._judged else self._judging(session))
                 self._judged = True
             self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
             self._ceased = now - without
         elif without > timeout:
-            why = self._why(session, now, timeout) or matter.said or "no two samples have come one after the other"
+            why = self._why(session, now, timeout) or matter.logged or "no two samples have come one after the other"
             if why != self._cause[0]:
                 self._cause = (why, now)
-            # another cause than was told may be that of the moment in which messages come again
-            lasting = not matter.said or now - self._cause[1] >= timeout
+            # another cause than the one logged may be that of the moment in which messages arrive again
+            lasting = not matter.logged or now - self._cause[1] >= timeout
             if lasting and matter.becomes(why, now):
-                self._say(OK, f"no verdict {f'for {without:.1f} s' if session.verdicts else 'yet'}: {why}")
+                self._log(OK, f"no verdict {f'for {without:.1f} s' if session.verdicts else 'yet'}: {why}")
 
     def _judging(self, session: Session) -> str:
         text = f"judging {', '.join(session.model.state_names)}; alarm when {session.rule_text()}"
         return f"{text}; masked: {', '.join(session.monitor.masked)}" if session.monitor.masked else text
 
     def _why(self, session: Session, now: float, timeout: float) -> str:
-        """What keeps verdicts from being given, without numbers that change from one look to the next; or nothing."""
+        """Why there are no verdicts, without numbers that change from one call to the next; or nothing."""
         never = [topic for topic in session.types if session.heard(topic) is None]
         found = [f"nothing received on {', '.join(never)}"] if never else []
         clock = session.sampler.clock

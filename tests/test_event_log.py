@@ -20,7 +20,7 @@ from rclpy.serialization import deserialize_message
 from ros_processes import World, open_world
 from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, Plant, by_hand, joint_state, saved, vector
 
-from uncertain_lti.monitor.journal import Journal
+from uncertain_lti.monitor.event_log import EventLog
 from uncertain_lti.monitor.session import OK, STALE, WARN, Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
@@ -30,7 +30,7 @@ STEP = STEP_NS * 1e-9
 
 
 class Rig:
-    """A session fed by hand, and what its journal says; time goes on by one step with every sample."""
+    """A session fed by hand, and its event log; time goes on by one step with every sample."""
 
     def __init__(self, **rule: Any) -> None:
         model = self.model = by_hand(alarm_rule=AlarmRule(2, 5))
@@ -46,14 +46,14 @@ class Rig:
 
         types = topic_types(model, "by hand", live_fields)
         self.session = Session(model, Rule(**rule), types, live_fields, reader, self.now)
-        self.journal = Journal(lambda level, line: self.said.append((level, line)))
-        self.journal.begin(self.session, self.now)
+        self.event_log = EventLog(lambda level, line: self.said.append((level, line)))
+        self.event_log.begin(self.session, self.now)
 
     def take(self, topic: str, data: bytes) -> None:
         before = self.session.alarm
         verdicts, _ = self.session.take(topic, time.time_ns(), data, self.now)
         if self.session.alarm != before:
-            self.journal.turned(self.session, verdicts, self.now)
+            self.event_log.turned(self.session, verdicts, self.now)
 
     def send(self, samples: int, off: float = 0.0, control: bool = True, state: bool = True) -> None:
         point = self.model.operating_point
@@ -67,11 +67,11 @@ class Rig:
             self.wait(STEP)
 
     def wait(self, seconds: float) -> None:
-        """Time goes by, and the journal looks as often as the node does."""
+        """Time passes, and the event log is updated as often as by the node."""
         for _ in range(max(1, round(seconds / 0.1))):
             self.now += min(seconds, 0.1)
             self.t_ns += round(min(seconds, 0.1) * 1e9)
-            self.journal.look(self.session, self.now, TIMEOUT, self.publishers, self.problems)
+            self.event_log.look(self.session, self.now, TIMEOUT, self.publishers, self.problems)
 
     @property
     def lines(self) -> list[str]:
