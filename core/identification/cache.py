@@ -68,7 +68,7 @@ class DiskPartition:
         Raises
         ------
         FitError
-            The file is shorter than its facts say.
+            The file is shorter than its facts state.
         """
         first = self.p + self.q
         lines = first + self.n + 1
@@ -106,7 +106,7 @@ class CacheWriter:
     Parameters
     ----------
     folder : path
-        Made where it is not there; a cache in it is replaced.
+        Made if it does not exist; a cache in it is replaced.
 
     Raises
     ------
@@ -161,7 +161,7 @@ class CacheWriter:
             self._write(self._waiting - self._waiting % BLOCK)
 
     def _write(self, size: int) -> None:
-        """Write the first transitions that wait, so many of them, in blocks."""
+        """Write this many of the first waiting transitions, in blocks."""
         whole = np.hstack(self._pending)
         try:
             for start in range(0, size, BLOCK):

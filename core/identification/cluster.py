@@ -16,7 +16,7 @@ T = TypeVar("T")
 class DaskFleet(Fleet):
     """Partitions that workers make and keep; a pass sends the candidate and brings back the few samples that matter.
 
-    A partition is the result of a pure task, so a worker that is lost costs the time to make its partitions anew.
+    A partition is the result of a pure task, so a worker that is lost costs the time to make its partitions again.
 
     Parameters
     ----------

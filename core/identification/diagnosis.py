@@ -20,7 +20,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 
 LOOKED_AT, STRETCHES = 20_000, 20
-"""At most so many transitions, in so many stretches, are looked at for what shows in any of them."""
+"""Transitions, and stretches, that are examined at most for what shows in any of them."""
 FAST = 0.7
 """|eigenvalue| x dt above which a step of forward Euler is long for the mode."""
 NEARLY = 0.5
@@ -145,7 +145,7 @@ def describe(
     few: Carriers | None = None,
     discarded: int | None = None,
 ) -> tuple[int, list[str]]:
-    """Rank, and what the user must be told of a fitted model and of the recordings it was fitted to.
+    """Rank, and messages to the user on a fitted model and the recordings it was fitted to.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ def _recordings(
     place: Callable[[Sequence[int]], str],
     broken: bool,
 ) -> tuple[list[str], set[int]]:
-    """What the recordings themselves say (excitation, sensors, topics), and the states that lack another state.
+    """Messages on the recordings (excitation, sensors, topics), and the states that lack another state.
 
     broken: some numbers are no movement; what the jumps do to the residuals comes from them.
     """
@@ -366,7 +366,7 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
 
 
 def _at_steps(problem: Problem, indices: Sequence[int]) -> list[int]:
-    """Columns of controls that seldom change, and do so at most of these transitions."""
+    """Columns of controls that rarely change, and do so at most of these transitions."""
     found = []
     for j in range(problem.n, problem.p):
         changes = np.flatnonzero(np.diff(problem.z[:, j]) != 0) + 1
@@ -379,7 +379,7 @@ def _at_steps(problem: Problem, indices: Sequence[int]) -> list[int]:
 
 
 def _noise_like(known: Memory, problem: Problem, states: Sequence[str], follow: Collection[int]) -> list[str]:
-    """States whose next sample cannot be told from those before."""
+    """States whose next sample cannot be predicted from those before."""
     moving = np.ptp(problem.z[:, : problem.n], axis=0) > 0
     like = [i for i in range(problem.n) if moving[i] and known.like_noise(i) and i not in follow]
     if not like:
@@ -394,10 +394,10 @@ def _noise_like(known: Memory, problem: Problem, states: Sequence[str], follow: 
 
 
 def _slow(model: UncertainLTI, known: Memory, apart: bool, hidden: bool) -> list[str]:
-    """Modes that a step of forward Euler is too long for, where the recordings bear them out.
+    """Modes that a step of forward Euler is too long for, if the recordings confirm them.
 
-    apart: the columns can be told apart, so that the eigenvalues mean something; hidden: a state is missing, so that
-    what looks like noise may be a mode of which one sample does not tell.
+    apart: the columns can be separated, so that the eigenvalues mean something; hidden: a state is missing, so that
+    what looks like noise may be a mode that one sample does not show.
     """
     dt = model.sampling.dt_median
     if dt is None:

@@ -73,7 +73,7 @@ def direct_search(
     transients : sequence of Transient
         With one SignalMap, whose operating point is used.
     rounds : int, default 200
-        At most so many per row.
+        Largest number per row.
     improvement : float, default 0.0001
         A row ends when a round lowers it by less than this share.
     tolerance : float, default 0.001

@@ -19,7 +19,7 @@ from uncertain_lti.identification.working_set import WorkingSet
 _ACTIVE = 1e-7
 """Slack, in scaled units, below which a sample carries the envelope."""
 FEW, FEW_SHARE = 12, 0.005
-"""At most so many transitions, and such a share of all, are few."""
+"""Largest number of transitions, and largest share of all, that count as few."""
 MUCH, ENOUGH = 2.0, 1.2
 """Mean width with the few over that without them, from which on they are worth a word; what is left of the latter."""
 LARGEST, MOST_ELEMENTS = 200_000, 300
@@ -104,7 +104,7 @@ def choose_discards(
 def carriers(problem: Problem, structure: Structure | None) -> Carriers | None:
     """The few transitions that make the envelope of some state much wider than the others need: what discards choose.
 
-    By criterion (10), which tells it in a moment. None where there are none such, where the problem is large, or where
+    By criterion (10), which is fast. None if there are none such, if the problem is large, or if
     its weights couple the rows.
 
     Parameters
@@ -200,7 +200,7 @@ def _gains(engine: WorkingSet, row: Row) -> dict[int, float]:
 
 
 def _linear_gains(row: Row) -> dict[int, float]:
-    """Fall of δ of (11) likewise, by one programme whose rows are let go of in turn.
+    """Fall of δ of (11) in the same way, by one programme whose rows are released in turn.
 
     δ falls only without a sample that has a price (a dual variable) in the optimum: without another one the same
     prices prove the same δ. The simplex method goes on from the optimum before, so each takes a few pivots.

@@ -1,4 +1,4 @@
-"""Whether the recordings move every signal enough, both ways and independently, to tell its effect from the others'."""
+"""Excitation: whether the recordings move every signal enough, both ways and independently of the others."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ COLLINEAR = 1e-3
 MOST_GROUPS, MOST_NAMES = 3, 6
 """Combinations of signals that are named, and names in a sentence."""
 DETERMINED = 4.0
-"""A control's effect on some state must be so many standard errors, or it cannot be told from the noise."""
+"""Standard errors that a control's effect on some state must have to be distinguished from the noise."""
 FEW = 10
 """A control that leaves its usual value in fewer transitions is not identifiable."""
 ONE_SIDED = 0.05
 """A control that goes less than this share of its range to one side of its steady value is one-sided."""
 FED_BACK = 0.9
-"""Share of a control's changes that the states explain, from which on they are said to."""
+"""Share of a control's changes explained by the states, from which on that is reported."""
 
 
 def collinear(
     problem: Problem, moments: Moments, names: Sequence[str], limit: float, past: Collection[int] = ()
 ) -> list[str]:
-    """Signals that nearly move together, and the recording that would tell them apart.
+    """Signals that nearly move together, and the recording that would separate them.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def collinear(
 
 
 def rare(problem: Problem, names: Sequence[str]) -> dict[int, str]:
-    """Controls, by column, that stand at one value in all but a few transitions.
+    """Controls, by column, that have one value in all but a few transitions.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def one_sided(problem: Problem, names: Sequence[str], known: Collection[int] = (
         if j in known:
             continue
         low, high = float(problem.z[:, j].min()), float(problem.z[:, j].max())
-        if low == high:  # said to be constant elsewhere
+        if low == high:  # reported as constant elsewhere
             continue
         reach = max(high, -low)
         side = "below" if low > -ONE_SIDED * reach else "above" if high < ONE_SIDED * reach else None
@@ -210,9 +210,9 @@ def _certainty(gram: Array, cross: Array, total: Array, count: int) -> Array:
 
 
 def fed_back(problem: Problem, names: Sequence[str], past: Collection[int] = ()) -> list[str]:
-    """Controls whose changes follow from the states: closed-loop recordings, or inputs too regular to tell.
+    """Controls whose changes follow from the states: closed-loop recordings, or inputs too regular to separate.
 
-    u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} where a feedback sets u_k; an input that somebody steps
+    u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} if a feedback sets u_k; an input that a person steps
     at will is not.
 
     Parameters
@@ -256,7 +256,7 @@ def fed_back(problem: Problem, names: Sequence[str], past: Collection[int] = ())
 def unexplained(gram: Array, cross: Array, total: Array) -> Array:
     """Sum of squares of each target that its least-squares fit on some regressors leaves.
 
-    Shares below 1e-11 are not told apart, which no decision here needs.
+    Shares below 1e-11 are not distinguished, which no decision here needs.
 
     Parameters
     ----------

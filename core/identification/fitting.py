@@ -74,7 +74,7 @@ def fit(
         couple the rows in (10); (11) uses the diagonal. Default ones.
     additive : {"none", "disturbance", "noise", "both"}, optional
         Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise). Default:
-        what the signals file says, else none.
+        that of the signals file, else none.
     operating_point : OperatingPoint, optional
         Steady state and scales; default: those of the transients' signals, or values used as they are.
     transient_weights : sequence of float, optional
@@ -87,11 +87,11 @@ def fit(
         Of a scheduled (piecewise-linear) model. A mapping has one or two signals, a state, a control or a further
         scheduling signal, each with its knots in recorded units, with `Modes`, or with how many knots: then from the
         least to the greatest recorded value, the inner ones where they shrink the largest residuals most. Default:
-        what the signals file says, else one block. With a schedule the drift c is always unknown: it carries the
+        that of the signals file, else one block. With a schedule the drift c is always unknown: it moves the
         steady state from knot to knot.
     discard : int or float, default 0
         Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
-        their effect on the objective and listed in `model.fit_summary["discarded"]`, beside the widths with them.
+        their effect on the objective and listed in `model.fit_summary["discarded"]`, next to the widths with them.
     method : {"working-set", "cvxpy"}
         cvxpy states the whole problem as written (OSQP, HiGHS); slow, without tie-breaks, for comparison.
     describe_data : bool, default True
@@ -494,7 +494,7 @@ def _common_signals(transients: Sequence[Transient]) -> SignalMap:
 
 
 def _field(name: str, otherwise: str) -> str:
-    """The name of a column where it reads as a field path."""
+    """The name of a column if it is a field path."""
     try:
         FieldPath(name)
     except SignalError:

@@ -43,7 +43,7 @@ class Fleet:
 
     @classmethod
     def of(cls, problem: Problem) -> Fleet:
-        """A problem in memory, in as many parts as there are cores where it is large.
+        """A problem in memory, in as many parts as there are cores if it is large.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class Fleet:
         Returns
         -------
         Occupancy or None
-            None if the transitions are too few to say where there were none.
+            None if the transitions are too few to state where there were none.
         """
         cells, stride = cells_for(self.N), -(-self.N // _LOOKED_AT)
         if not cells:

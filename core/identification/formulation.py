@@ -30,7 +30,7 @@ def solve(problem: Problem, criterion: str, solver: str | None = None, **options
     theta : array (r, n)
         Nominal elements, one column per row of the model, 1/s.
     d : array (q, n)
-        Half-widths likewise.
+        Half-widths of the same shape.
     objective : array
         (1,), the value of (10), or (n,), δ of every row of (11). Ties are not broken.
 

@@ -18,7 +18,7 @@ _OWN = 0.3
 
 @dataclass(frozen=True)
 class Memory:
-    """What a state's own past says of its next sample.
+    """How well a state's own past predicts its next sample.
 
     Parameters
     ----------
@@ -78,10 +78,10 @@ def predicted(X: Array, U: Array, after: Array) -> Array:
 
 
 def memory(problem: Problem) -> Memory:
-    """What a problem's own samples say of its states' memory.
+    """Memory of the states, estimated from a problem's own samples.
 
     Noise on a measured state makes least squares believe that it decays within a step. The sample before, as an
-    instrument, carries the state and none of that noise; a mode is fast where both ways say so of a state that is
+    instrument, carries the state and none of that noise; a mode is fast if both ways agree for a state that is
     predicted at all.
 
     Parameters

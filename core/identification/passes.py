@@ -177,7 +177,7 @@ def _gram(a: Array, b: Array) -> Array:
 
 
 def _product(matrix: Array, columns: Array) -> Array:
-    """matrix (s, r) @ columns (r, K), on one thread where it is narrow."""
+    """matrix (s, r) @ columns (r, K), on one thread if it is narrow."""
     count = columns.shape[1]
     width = max(_SINGLE_THREADED // matrix.size, 512)
     whole = count - count % width
@@ -402,7 +402,7 @@ class Candidate:
     theta : array (r, n)
         Nominal elements, one column per row of the model, 1/s.
     d : array (q, n)
-        Half-widths likewise.
+        Half-widths of the same shape.
     size_unit : array (q,), or (q, n) of each row
         The size of a sample is size_unit·ψ.
     scale : array (n,)
@@ -434,7 +434,7 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     """Samples whose slack is below the reach, per row: one pass.
 
     The slack of a sample is its distance from leaving the bounds (8)(9), or from being wider than (11) allows, in
-    scaled units; negative where it is outside. Where more than `most` samples of a row qualify, those of least slack
+    scaled units; negative if it is outside. If more than `most` samples of a row qualify, those of least slack
     are returned, and the reach is the least slack of the others.
 
     Parameters
@@ -569,7 +569,7 @@ def _near(candidate: Candidate, block: Block, columns: Columns, chosen: Index, r
 
 
 def _least(near: _Near, rows: int, most: int, reach: Array) -> tuple[list[Index], Array]:
-    """Positions of the samples of least slack, at most so many per row, and below which slack none is missing."""
+    """Positions of the samples of least slack, at most this many per row, and the slack below which none is missing."""
     each, reach = [], reach.copy()
     for i in range(rows):
         own = np.flatnonzero(near.row == i)

@@ -107,7 +107,7 @@ def lacking(gram: Array, visits: NDArray[np.intp], columns: Columns, p: int) -> 
     count, unknowns = len(visits), columns.unknowns(p)
     parts = gram.reshape(count, len(gram) // count, count, -1)
     whole = _rank(parts.sum(axis=(0, 2)))
-    # within a mode its signal is constant, and cannot be told from a drift or from another such signal
+    # within a mode its signal is constant, and cannot be separated from a drift or from another such signal
     modes = [k for k, axis in enumerate(schedule.axes) if axis.modes and positions[k] < p]
     reasons = []
     for r, index in enumerate(schedule.indices):
@@ -132,7 +132,7 @@ def _rank(gram: Array) -> int:
 
 
 def block_data(sums: Moments, tied: Sequence[int]) -> tuple[BlockData, ...]:
-    """What the model file says of each block.
+    """Facts on each block, for the model file.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def scheduled_by(
     Parameters
     ----------
     schedule : Schedule, mapping or None
-        As `fit` takes it; None for what the signals file says.
+        As `fit` takes it; None for that of the signals file.
     signals : SignalMap
         With the operating point.
     data : callable, optional
@@ -334,7 +334,7 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
         trials = [
             (*_left(some, row, sorted([*knots, s]), stride), s) for s in seen if least < s < most and s not in knots
         ]
-        # an end that is seldom reached need not keep the others from knots of their own
+        # an end that is rarely reached need not keep the others from knots of their own
         trials = [trial for trial in trials if trial[0] <= 2]
         if not trials:
             raise FitError(
@@ -355,7 +355,7 @@ def _range(problem: Problem, row: int) -> tuple[float, float]:
 def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tuple[int, float]:
     """How many blocks would lack data, and the sum over the states of the logarithm of the largest residual.
 
-    each: transitions that one of the problem stands for. A block between the ends that lacks data counts as many.
+    each: transitions that one of the problem represents. A block between the ends that lacks data counts as many.
     """
     regimes = Regimes(Schedule((Axis("s", knots=tuple(knots)),)), (row,))
     columns = replace(problem.columns, regimes=regimes)

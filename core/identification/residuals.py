@@ -28,9 +28,9 @@ _CLIP = 5.0
 _MOST_PRODUCTS = 12
 """Signals up to which all products of two are tried as curves; beyond, squares and magnitudes alone."""
 FEW, MOST = 12, 0.5
-"""At most so many transitions that hold more than this share of the squared residual dominate it."""
+"""Up to this many transitions that hold more than this share of the squared residual dominate it."""
 OUTLYING = 10.0
-"""Each of them is so many times as large as the others' root mean square."""
+"""Each of them is this many times as large as the others' root mean square."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Residuals:
     gain : array (n,)
         Root mean square over that with the state's own value one sample earlier as well; ones if none is correlated.
     curved : array (n,)
-        Root mean square over that with squares, products and magnitudes of the same sample as well; likewise.
+        Root mean square over that with squares, products and magnitudes of the same sample as well; as above.
     """
 
     correlation: Array
@@ -178,7 +178,7 @@ def missing(known: Residuals, signals: Sequence[Signal], states: Collection[int]
     signals : sequence of Signal
         States, then controls.
     states : collection of int
-        Of which it is said.
+        That the message is about.
 
     Returns
     -------

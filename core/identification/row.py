@@ -18,7 +18,7 @@ from uncertain_lti.identification.solvers import FEASIBLE, Sense, Simplex, dual_
 TOLERANCE = 1e-11
 """Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
 TIE_BREAK = 1e-8
-"""Weight of the squared distance of the centre beside the squared half-widths.
+"""Weight of the squared distance of the centre relative to the squared half-widths.
 
 |rate - centre| <= half-width for every sample, so the sum of squared distances is at most that of squared half-widths,
 and the optimum of the sum is within TIE_BREAK (relative) of the optimum of (10) alone, with the centre that the stated
@@ -29,20 +29,20 @@ ROUGH = 1e-4
 LEAST = 1e-9
 """Widths below this share of the steps themselves are rounding, and so is their distance from the optimum."""
 COLLINEAR = 1e-11
-"""Relative singular value of the columns below which a direction has no effect that arithmetic could tell."""
+"""Relative singular value of the columns below which the effect of a direction is lost in rounding."""
 _EPS = float(np.finfo(np.float64).eps)
 WIDTH_SLACK = 1e-9
 """Relative room above δ of (11) in which its ties are broken; a solver needs some."""
 BOUNDED_TIE_BREAK = 1e-5
 """The same as TIE_BREAK among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
 REGULARISATION = 1e-4
-"""Weight of the squared widths beside δ in (11), for a solver of strictly convex programmes.
+"""Weight of the squared widths relative to δ in (11), for a solver of strictly convex programmes.
 
 With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
 of the squared widths. Whether it was is seen from the optimum of δ alone, at the end.
 """
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
-JOIN = 48  # samples that join a working set per round, at least; more where there are many unknowns
+JOIN = 48  # samples that join a working set per round, at least; more if there are many unknowns
 
 
 class InfeasibleError(FitError):
@@ -190,7 +190,7 @@ class Row:
         self.refined = False
         self.width: Array = np.empty(0)
         self.kept: float | None = None  # violation, in units of the size, of an answer of before that was good
-        self.width_unit = 1.0  # of δ and `width`, beside scale: of order one in refined coordinates
+        self.width_unit = 1.0  # of δ and `width`, in addition to scale: of order one in refined coordinates
         self.tolerance = TOLERANCE
         self._coordinates(float(sums.rate_scale[i]))
         self.samples = Samples.join([], len(sums.low))
@@ -239,7 +239,7 @@ class Row:
         self.plain, self.plain_linear, _ = plain
         self.gram, self.linear, self.known = plain if sums.gram is None else self._gram(sums.gram[i], sums.count)
         self.basis: Array | None = None  # scaled θ = basis η, in refined coordinates
-        self.asked: Array = np.empty((0, self.r))  # asked η >= asked_limits: what the structure says of θ there
+        self.asked: Array = np.empty((0, self.r))  # asked η >= asked_limits: constraints of the structure on θ there
         self.asked_limits: Array = np.empty(0)
 
     def _scales(self, gram: Array, which: int) -> Array:
@@ -255,7 +255,7 @@ class Row:
 
         The elements are sought as differences from the least squares over the samples held, in units of the residual
         instead of the step, along directions of equal effect instead of columns. A solver's tolerance is then one on
-        the envelope. It costs a decomposition, so rows are refined only where it matters.
+        the envelope. It costs a decomposition, so rows are refined only if it matters.
         """
         samples, pool, limit = self.samples, self.pool, self.limit
         theta, d, before = self.theta, self.d, self.limit_unit
@@ -465,7 +465,7 @@ class Row:
         Returns
         -------
         bool
-            False where there is none to join.
+            False if there is none to join.
         """
         slack = self.slack()
         slack[self.pool] = np.inf
@@ -691,7 +691,7 @@ class Row:
     def duality_gap(self) -> float:
         """How far the squared widths of this row are above the optimum at most, relative to it, by the dual objective.
 
-        The programme that is solved has the tie-break and the ridge beside the squared widths; both are bounded. inf
+        The programme that is solved adds the tie-break and the ridge to the squared widths; both are bounded. inf
         where the columns are so collinear that the ridge is not.
 
         Returns
@@ -868,7 +868,7 @@ class Row:
     def linear_gap(self) -> float:
         """As `duality_gap`, by the simplex method.
 
-        (10) is convex, so its optimum is no less than what its linearisation here says of any elements that contain
+        (10) is convex, so its optimum is no less than its linearisation here at any elements that contain
         the working set. It needs neither multipliers nor a Hessian that can be inverted.
 
         Returns
@@ -989,7 +989,7 @@ class Row:
         -------
         (int, float, int) or None
             Index of the sample, its distance from the bounds at best, normalised, and how many others it contradicts:
-            0 if it could not be contained alone either. None where there is none.
+            0 if it could not be contained alone either. None if there is none.
 
         Raises
         ------

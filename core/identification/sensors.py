@@ -1,4 +1,4 @@
-"""What the recorded values say of the sensors and topics they came from: quantised, frozen, held, stale, late."""
+"""Faults of sensors and topics that show in the recorded values: quantised, frozen, held, stale, late."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from uncertain_lti.signals.signal_map import Signal
 LONGEST_DELAY = 10
 """Delays of a control that are tried, samples."""
 FROZEN = 25
-"""A value that stands still for so many samples while the others move may be frozen."""
+"""Samples for which a value does not change while the others move, from which on it may be frozen."""
 UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
 """|log(step / median)| of an uneven step, and by how much a constant one must explain them better; see `jittering`."""
 STANDS_FOR_NONE, CHANGES_SIGN, WRAPS, JITTERS = (
@@ -36,7 +36,7 @@ STALE = 0.01
 
 
 def coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[str]:
-    """Signals in which a number stands for no value.
+    """Signals in which a number means "no value".
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def jittering(problem: Problem, signals: Sequence[Signal], speed: float, clock: 
         States, then controls.
     speed : float
         |eigenvalue| x Δt of the fastest mode; from SLOW_STEP on a step hardly depends on its length, and nothing is
-        said.
+        reported.
     clock : str, optional
         Topic whose stamps these are.
 
@@ -210,7 +210,7 @@ def quantised(problem: Problem, signals: Sequence[Signal]) -> list[str]:
             continue
         gaps = np.diff(levels)
         step = float(gaps.min())
-        # levels lie on a grid: what a rounding sensor gives, and nothing else does with so many samples
+        # levels lie on a grid: as of a rounding sensor, and of nothing else with this many samples
         if step < 1e-6 or np.abs(gaps / step - np.rint(gaps / step)).max() > 0.02:
             continue
         move = float(np.sqrt(np.mean((problem.x_next[:, i] - x) ** 2))) / span
@@ -249,7 +249,7 @@ def held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
             continue
         fresh = np.unique(problem.x_next[instants, i])
         period = float(np.median(np.diff(instants)))
-        # a rounding sensor repeats few values; a machine at rest stands still in few, long stretches
+        # a rounding sensor repeats few values; a machine at rest is constant in few, long stretches
         if period >= 2 and len(fresh) > 0.5 * len(instants):
             messages.append(
                 f"'{signal.name}' repeats its last value in {1 - len(instants) / problem.N:.0%} of the steps and is "
@@ -260,7 +260,7 @@ def held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 
 
 def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Transient]) -> list[str]:
-    """States that stand at exactly one value for long while the other signals move.
+    """States that keep exactly one value for long while the other signals move.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Tra
     spread = np.ptp(problem.z_columns, axis=1)
     for i, signal in enumerate(signals[: problem.n]):
         still = problem.x_next[:, i] == problem.z[:, i]
-        if still.all() or still.mean() > 0.5:  # held, quantised, or at rest most of the time: said elsewhere
+        if still.all() or still.mean() > 0.5:  # held, quantised, or at rest most of the time: reported elsewhere
             continue
         joined = np.concatenate([[False], still, [False]])
         joined[1:-1][1:] &= np.concatenate([[True], (problem.source[1:] == problem.source[:-1])])[1:]
@@ -408,7 +408,7 @@ def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int
     x : array (n, N)
         States.
     u : array (lags + 1, m, N)
-        Controls so many samples before.
+        Controls this many samples before.
     increment : array (n, N)
         What the states change by in a step.
     dt : array (N,)
@@ -445,7 +445,7 @@ def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int
         # 5 % less unexplained, and far more than chance: N log-likelihood units per row
         if not (0 < best < longest and gain > 0.05 and gain * N > 50):  # at the end of what is tried it is no optimum
             continue
-        # beside a late control the present one says nothing; where it does, the late one stands for past states
+        # next to a late control the present one adds nothing; if it does, the late one represents past states
         if scores[best] - score([[*undelayed, first + best - 1]])[0] < 0.3 * gain:
             found[j] = (best, float(1 - np.exp(-gain / n / 2)))
     return found

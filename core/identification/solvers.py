@@ -30,7 +30,7 @@ class Answer:
         Who found it.
     active : array of int, or None
         Of [bounds of ξ; rows of G]: 0 not active, 1 at the upper, 3 at the lower bound (DAQP's words); None where the
-        solver does not say.
+        solver does not report it.
     """
 
     xi: Array

@@ -31,7 +31,7 @@ class Structure:
     lower : mapping of str to ArrayLike, optional
         Lower bounds by the same names; NaN for none. A sign constraint is a bound of 0. Half-widths are never below 0.
     upper : mapping of str to ArrayLike, optional
-        Upper bounds likewise.
+        Upper bounds of the same shape.
     blocks : int, optional
         Of a scheduled model whose blocks differ in what is known of them: every array has a first axis of that
         length. Default: what is known holds for every block, however many there are.
@@ -119,7 +119,7 @@ class Structure:
         """From the list under `structure:` in a signals file.
 
         Each rule names elements by `state` (the row; `*` for all) and `from` (a state, a control, `drift`, `noise` or
-        `*` for every state and control), and says `nominal` and/or `half_width`: a number, or {min: a, max: b}.
+        `*` for every state and control), and gives `nominal` and/or `half_width`: a number, or {min: a, max: b}.
         A later rule overrides an earlier one.
 
         Of a scheduled model, `knot` names the knot or mode that a rule holds for, by its number from 1 on (a list of

@@ -181,7 +181,7 @@ class WorkingSet:
             self._settle_or_refine(row, Row.solve_quadratic, polish=True)
 
     def _settle_or_refine(self, row: Row, solve: Callable[[Row], str], polish: bool = False) -> None:
-        """Settle a row, in refined coordinates where it does not settle in those of its steps."""
+        """Settle a row, in refined coordinates if it does not settle in those of its steps."""
         if not row.refined:
             try:
                 self._settle([row], solve, polish)
@@ -264,7 +264,7 @@ class WorkingSet:
                 if row.exact:
                     row.limit = None if row.limit is None else float(deltas[row.i]) / row.limit_unit
                     self._settle_or_refine(row, Row.solve_linear)
-                if row.limit is None:  # nothing unknown: the widths are what the structure says
+                if row.limit is None:  # nothing unknown: the structure fixes the widths
                     row.limit = float((row.width * row.half).max(initial=0.0))
                 deltas[row.i] = row.limit * row.limit_unit
                 row.limit *= 1.0 + WIDTH_SLACK
@@ -282,7 +282,7 @@ class WorkingSet:
                 if above and not row.exact:
                     row.exact = True
                     again.append(row)
-        if again:  # the weight beside δ was too large for these rows
+        if again:  # the weight relative to δ was too large for these rows
             settle(again)
             self._prove(settle)
         again = [
