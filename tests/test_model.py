@@ -20,6 +20,7 @@ from hypothesis.extra import numpy as hnp
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
+from uncertain_lti.model import file
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import FORMATS
@@ -371,6 +372,17 @@ def test_a_model_fitted_to_arrays_has_a_file_too(tmp_path: Path) -> None:
     assert (loaded.n, loaded.m, loaded.state_names) == (2, 0, ("x1", "x2"))
     assert loaded.bounds(np.ones(2), np.ones(0), 0.1)[0].shape == (2,)
     assert not loaded.domain.outside(np.full(2, 1e300), np.ones(0))
+
+
+def test_a_term_that_format_1_lacks_is_written_only_if_a_model_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new row of the table of terms leaves the files of all other models as they are."""
+    model = leibov2006()
+    before = file.structure(model)
+    monkeypatch.setattr(file, "ARRAYS", (*file.ARRAYS, "r"))
+    monkeypatch.setattr(model, "r", np.zeros(model.n), raising=False)
+    assert file.structure(model) == before and before["format"] == FORMATS[0]
+    monkeypatch.setattr(model, "r", np.full(model.n, 0.5))
+    assert file.structure(model) == {**before, "format": FORMATS[1], "r": [0.5] * model.n}
 
 
 def test_numbers_that_json_lacks_become_null_and_the_rest_is_refused(tmp_path: Path) -> None:

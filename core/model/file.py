@@ -27,6 +27,7 @@ from uncertain_lti.signals.table_layout import TableLayout
 FORMATS = ("uncertain-lti/1", "uncertain-lti/2")
 """Formats of model files, oldest first; the oldest that holds a model is written."""
 MAX_FILE_BYTES = 64 * 2**20
+_IN_EVERY_FILE = ("A", "B", "dA", "dB", "c", "dc", "v")  # the arrays of format 1; others are written if they are not 0
 _SCHEDULING = ("name", "topic", "type", "field", "unit", "steady", "scale", "max_hold")
 _IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
 _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
@@ -57,19 +58,21 @@ def structure(model: Any) -> dict[str, Any]:
         for s in model.signals.controls
     ]
     s = model.sampling
+    arrays = [name for name in ARRAYS if name in _IN_EVERY_FILE or getattr(model, name).any()]
     scheduled = model.schedule is not None
+    newer = scheduled or model.domain.measure is not None or model.signals.table is not None
     regimes: dict[str, Any] = {}
     if scheduled:
         regimes["schedule"] = model.schedule.to_list()
         if model.signals.scheduling:
             regimes["scheduling"] = [{key: getattr(s, key) for key in _SCHEDULING} for s in model.signals.scheduling]
         regimes["blocks"] = [
-            {name: getattr(model, name)[r].tolist() for name in ARRAYS}
+            {name: getattr(model, name)[r].tolist() for name in arrays}
             | {"transitions": facts.transitions, "tied_to": facts.tied_to}
             for r, facts in enumerate(model.block_data)
         ]
     return {
-        "format": FORMATS[scheduled or model.domain.measure is not None or model.signals.table is not None],
+        "format": FORMATS[newer or len(arrays) > len(_IN_EVERY_FILE)],
         "states": states,
         "controls": controls,
         "sampling": {
@@ -84,7 +87,7 @@ def structure(model: Any) -> dict[str, Any]:
             "max_skew": s.max_skew,
         }
         | ({} if model.signals.table is None else {"table": model.signals.table.to_dict()}),
-        **(regimes if scheduled else {name: getattr(model, name).tolist() for name in ARRAYS}),
+        **(regimes if scheduled else {name: getattr(model, name).tolist() for name in arrays}),
         "domain": {
             name: [v if math.isfinite(v) else None for v in getattr(model.domain, name).tolist()]
             for name in ("x_min", "x_max", "u_min", "u_max")
