@@ -112,7 +112,7 @@ setup(
     extras_require=extras,
     entry_points={
         "console_scripts": [
-            "uncertain-lti = uncertain_lti.cli.main:main",
+            "uncertain-lti = uncertain_lti.cli.program:main",
             "envelope_monitor = uncertain_lti_ros.programs:envelope_monitor",
             "plant = uncertain_lti_ros.programs:plant",
             "turbofan = uncertain_lti_ros.programs:turbofan",

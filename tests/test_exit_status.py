@@ -21,6 +21,8 @@ from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.sampling.reading import read_transients
 from uncertain_lti.signals.signal_map import SignalMap
 
+ROOT = Path(__file__).resolve().parents[1]
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -65,6 +67,17 @@ def test_output_that_cannot_be_written(folder, what):
     assert done.returncode == 2
     assert "cannot be written" in done.stderr and "Traceback" not in done.stderr
     assert "Exception ignored" not in done.stderr
+
+
+@pytest.mark.parametrize("module", ["uncertain_lti.base.english", "uncertain_lti.cli.check", "argparse"])
+def test_a_damaged_installation_is_no_alarm(module):
+    start = "from uncertain_lti.cli.program import main"
+    broken = f"import sys; {start}; sys.modules[{module!r}] = None; sys.exit(main())"
+    done = subprocess.run([sys.executable, "-c", broken, "--help"], text=True, capture_output=True, timeout=300)
+    assert done.returncode == 70 and "the installation is damaged" in done.stderr
+    whole = subprocess.run([sys.executable, "-c", f"import sys; {start}; sys.exit(main())", "--help"], timeout=300)
+    assert whole.returncode == 0
+    assert "uncertain-lti = uncertain_lti.cli.program:main" in (ROOT / "setup.py").read_text()
 
 
 def test_nobody_reads_what_is_said(folder):

@@ -85,6 +85,82 @@ def test_odd_messages_read_alike_live_and_from_recordings() -> None:
             assert recorded == ((5_000_000_007, struct.pack("<d", 1.5)) if what in READ else None), what
 
 
+def made(kind: str, *values: object) -> bytes:
+    """A message of the middleware with these values in its fields, in order."""
+    from rclpy.serialization import serialize_message
+
+    from uncertain_lti_ros.messages import message_class
+
+    message = message_class(kind)()
+    for name, value in zip(message.get_fields_and_field_types(), values, strict=False):
+        setattr(message, name, value)
+    return bytes(serialize_message(message))
+
+
+def read_alike(kind: str, path: str, data: bytes, before: list[bytes]) -> float | None:
+    """What live and a recording read of a message, which must be the same; None where both refuse it."""
+    from uncertain_lti.recordings.message_reader import UnreadableError
+    from uncertain_lti.signals.field_path import FieldPath
+
+    make_reader, fields, decoder = fuzz.middleware()
+    live = make_reader(kind, [FieldPath(path)], fields, decoder(kind))
+    for one in before:
+        live.read(one)
+    recorded = fuzz.read_recorded(kind, [FieldPath(path)], [*before, data])
+    try:
+        _, (value,) = live.read(data)
+    except UnreadableError as error:
+        assert recorded is None, (data.hex(), recorded, str(error))
+        return None
+    assert recorded is not None and recorded[1] == struct.pack("<d", value), (data.hex(), recorded, value)
+    return float(value)
+
+
+def test_a_cut_message_is_refused_live_and_of_recordings() -> None:
+    """Also where the middleware takes the bytes that are missing for zeros."""
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    from geometry_msgs.msg import Point32, Polygon
+    from std_msgs.msg import Header
+
+    polygon = Polygon(points=[Point32(x=1.0), Point32(x=2.0)])
+    whole = {
+        ("shape_msgs/msg/SolidPrimitive", "type"): made("shape_msgs/msg/SolidPrimitive", 1, [0.5, 0.25], polygon),
+        ("sensor_msgs/msg/JointState", "position[0]"): made(
+            "sensor_msgs/msg/JointState", Header(), ["a"], *[[1.5]] * 3
+        ),
+    }
+    for (kind, path), data in whole.items():
+        for before in ([], [data] * 2):
+            assert read_alike(kind, path, data, before) is not None
+            for size in range(4, len(data)):
+                assert read_alike(kind, path, data[:size], before) is None, size
+
+
+@pytest.mark.parametrize(
+    "kind, path", [("std_msgs/msg/Byte", "data"), ("diagnostic_msgs/msg/DiagnosticStatus", "level")]
+)
+def test_a_byte_is_a_number_live_as_of_recordings(kind: str, path: str) -> None:
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    data = made(kind, b"\7")
+    assert read_alike(kind, path, data, []) == read_alike(kind, path, data, [data] * 2) == 7.0
+
+
+@pytest.mark.parametrize("path", ["present", "voltage"])
+def test_a_truth_value_of_2_is_refused_live_and_of_recordings(path: str) -> None:
+    """Wanted or not, whether messages like it are known or not."""
+    pytest.importorskip("rclpy", reason="rclpy is not installed")
+    from std_msgs.msg import Header
+
+    kind = "sensor_msgs/msg/BatteryState"
+    true, false = (made(kind, Header(frame_id="b"), *[1.5] * 7, 1, 1, 1, present) for present in (True, False))
+    (at,) = (i for i in range(len(true)) if true[i] != false[i])
+    for before in ([], [true] * 3, [false] * 3, [true, false] * 3):
+        assert read_alike(kind, path, true, before) == (1.0 if path == "present" else 1.5)
+        assert read_alike(kind, path, false, before) == (0.0 if path == "present" else 1.5)
+        for odd in (2, 255):
+            assert read_alike(kind, path, true[:at] + bytes([odd]) + true[at + 1 :], before) is None
+
+
 @pytest.mark.parametrize("start", [b"\0\1\0\0", BIG, b"\0\3\0\0"])
 def test_bytes_that_rclpy_leaves_behind_cost_no_layout(start: bytes) -> None:
     """Also where the sequences that they are reserved for are not always empty."""

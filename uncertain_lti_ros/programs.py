@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+import traceback
 from importlib import import_module
 
-_BAD_USAGE, _INTERRUPTED = 2, 130
+_BAD_USAGE, _FAULT, _INTERRUPTED = 2, 70, 130
 
 
 def envelope_monitor() -> int:
@@ -53,4 +54,16 @@ def _run(name: str) -> int:
         return _BAD_USAGE
     except KeyboardInterrupt:
         return _INTERRUPTED
-    return int(main())
+    except Exception:
+        return _fault(name)
+    try:
+        return int(main())
+    except Exception:
+        return _fault(name)
+
+
+def _fault(name: str) -> int:
+    """Print what nobody expected; a traceback alone would end with 1, which means an alarm elsewhere."""
+    traceback.print_exc()
+    print(f"{name}: this is a fault of the program; please report it with the lines above", file=sys.stderr)
+    return _FAULT

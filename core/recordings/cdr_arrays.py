@@ -115,8 +115,10 @@ class _Shape:
         self.segments = [_Segment(8, 0)]
         self._fix(-ENCAPSULATION, b"\xff\xff")
         for role, at, start, end, size in walk.pieces:
-            if role is Role.NUMBERS:
-                self._go_to(start, size)
+            if role in (Role.NUMBERS, Role.TRUTHS):
+                place = self._go_to(start, size)
+                if role is Role.TRUTHS:
+                    self._fix(place, b"\xfe" * (end - start))
                 self._end_at(end)
                 continue
             place = self._go_to(at, 4)

@@ -39,6 +39,10 @@ class UnfitError(Exception):
     """A message, or a type, that only the decoder can read."""
 
 
+class CutError(UnfitError):
+    """A message that ends before its definition does."""
+
+
 # --- what is wanted of a message ----------------------------------------------------------------------------
 
 
@@ -127,6 +131,7 @@ class Role(Enum):
     """What a stretch of a message holds."""
 
     NUMBERS = "numbers"
+    TRUTHS = "truth values, each of which is 0 or 1"
     COUNT = "the length of a sequence, whose elements follow"
     SEQUENCE = "a sequence of numbers that no path looks into, with its length"
     TEXT = "a string with its length"
@@ -157,7 +162,7 @@ class Piece(NamedTuple):
     @property
     def has_length(self) -> bool:
         """Whether a length stands before the content."""
-        return self.role is not Role.NUMBERS
+        return self.role not in (Role.NUMBERS, Role.TRUTHS)
 
 
 class Number(NamedTuple):
@@ -229,6 +234,11 @@ class Walk:
         left = len(self._data) - self._at
         return left if left > PADDING + self.reserved else 0
 
+    @property
+    def untrue(self) -> bool:
+        """Whether a truth value is neither 0 nor 1: the middleware refuses such a message."""
+        return any(max(self._data[p.start : p.end]) > 1 for p in self.pieces if p.role is Role.TRUTHS)
+
     def message(self, type_name: str, wanted: Wanted | None = None) -> None:
         """Walk a message, or one inside.
 
@@ -271,7 +281,7 @@ class Walk:
             raise UnfitError
         if kind.array is None:
             count, elements = 1, {0: here} if here else {}
-        elif kind.array == 0 and plain and here is None:
+        elif kind.array == 0 and plain and here is None and code != "?":
             self._sized(Role.SEQUENCE, SIZES[code])
             return
         else:
@@ -304,7 +314,8 @@ class Walk:
     def _numbers(self, code: str, count: int, elements: dict[int, Wanted]) -> None:
         size = SIZES[code]
         start = self._at + (ENCAPSULATION - self._at) % size
-        self._add(Piece(Role.NUMBERS, start, start, start + count * size, size))
+        role = Role.TRUTHS if code == "?" else Role.NUMBERS
+        self._add(Piece(role, start, start, start + count * size, size))
         for i, each in elements.items():
             self.numbers += [Number(start + i * size, code, goal) for goal in each.goals]
 
@@ -314,7 +325,7 @@ class Walk:
         start = at + 4
         count = int.from_bytes(self._data[at:start], self._endian)
         if count > len(self._data):
-            raise UnfitError
+            raise CutError
         self.reserved += RESERVED * (size == 8 and not count)
         if role is Role.COUNT:
             self._add(Piece(role, at, start, start, size))
@@ -325,7 +336,7 @@ class Walk:
 
     def _add(self, piece: Piece) -> None:
         if piece.end > len(self._data):
-            raise UnfitError
+            raise CutError
         _bounded(len(self.pieces))
         self.pieces.append(piece)
         self._at = piece.end

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.recordings.cdr_layout import SIZES, STAMP, Role, UnfitError, Walk, Wanted, wanted
+from uncertain_lti.recordings.cdr_layout import SIZES, STAMP, CutError, Role, UnfitError, Walk, Wanted, wanted
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
@@ -100,12 +100,17 @@ class MessageReader:
         except Exception as error:  # what the middleware raises is not stated anywhere
             raise UnreadableError(f"cannot be decoded: {error}") from None
         learn = self._wanted is not None and self._budget >= _LAYOUT
-        walk = self._walk(data, self._wanted if learn else None)
-        if walk and walk.excess:
+        try:
+            walk = self._walk(data, self._wanted if learn else None)
+        except CutError:  # some of which the middleware fills up with zeros
+            raise UnreadableError(f"is cut: it ends before a {self.type_name} does") from None
+        if walk is not None and walk.excess:
             raise UnreadableError(
                 f"is {walk.excess} bytes longer than a {self.type_name}; "
                 f"its publisher may have another version of that type"
             )
+        if walk is not None and walk.untrue:
+            raise UnreadableError("holds a truth value that is neither 0 nor 1")
         try:
             stamp, values = header_stamp_ns(message), [path.read(message) for path in self._paths]
         except _SHAPED_ODDLY as error:
@@ -116,17 +121,19 @@ class MessageReader:
         return stamp, values
 
     def _walk(self, data: bytes, wanted: Wanted | None) -> Walk | None:
-        """The message walked; None where it cannot be."""
+        """The message walked; None where it cannot be. Raises CutError if it is cut."""
         try:
             walk = Walk(data, self._fields)
             walk.message(self.type_name, wanted)
+        except CutError:
+            raise
         except (UnfitError, SignalError):
             return None
         return walk
 
     def _learn(self, walk: Walk, data: bytes, stamp: int | None, values: list[float]) -> None:
-        if walk.odd or walk.repeated or any(number.code == "?" for number in walk.numbers):
-            return  # the middleware refuses a truth value of 2
+        if walk.odd or walk.repeated:
+            return
         layout = _Layout(walk, data, self._paths)
         found = layout.read(data)
         if found is not None and found[0] == stamp and _same(found[1], values):
@@ -144,8 +151,9 @@ class _Layout:
 
     def __init__(self, walk: Walk, data: bytes, paths: Sequence[FieldPath]) -> None:
         self._size = len(data)
-        lengths = [(p.at, (p.end if p.role is Role.NAME else p.at + 4) - p.at) for p in walk.pieces if p.has_length]
-        self._shape = _shape(data, [(0, 2), *lengths])
+        lengths = [(p.at, p.end if p.role is Role.NAME else p.at + 4, 0xFF) for p in walk.pieces if p.has_length]
+        truths = [(p.start, p.end, 0xFE) for p in walk.pieces if p.role is Role.TRUTHS]
+        self._shape = _shape(data, [(0, 2, 0xFF), *lengths, *truths])
         numbers = sorted(walk.numbers, key=lambda number: number.goal)  # the stamp is the first
         places = [(number.at, number.code) for number in numbers]
         order = sorted(set(places))
@@ -199,22 +207,24 @@ def _struct(order: str, places: Sequence[tuple[int, str]]) -> struct.Struct:
     return struct.Struct(text)
 
 
-def _shape(data: bytes, places: list[tuple[int, int]]) -> list[tuple[int, int, int, int]]:
-    """(start, stop, mask, value) of the stretches that hold these places; padding between them is not compared."""
-    stretches: list[tuple[int, int, list[tuple[int, int]]]] = []
-    for start, size in sorted(places):
-        stop = start + size
+def _shape(data: bytes, places: list[tuple[int, int, int]]) -> list[tuple[int, int, int, int]]:
+    """(start, stop, mask, value) of the stretches that hold these places (start, stop, bits of each byte that count).
+
+    Padding between them is not compared.
+    """
+    stretches: list[tuple[int, int, list[tuple[int, int, int]]]] = []
+    for start, stop, bits in sorted(places):
         if stretches and start - stretches[-1][1] < _NEAR:
             begin, _, parts = stretches[-1]
-            parts.append((start, stop))
+            parts.append((start, stop, bits))
             stretches[-1] = begin, stop, parts
         else:
-            stretches.append((start, stop, [(start, stop)]))
+            stretches.append((start, stop, [(start, stop, bits)]))
     found = []
     for begin, end, parts in stretches:
         mask = bytearray(end - begin)
-        for start, stop in parts:
-            mask[start - begin : stop - begin] = b"\xff" * (stop - start)
+        for start, stop, bits in parts:
+            mask[start - begin : stop - begin] = bytes([bits]) * (stop - start)
         number = int.from_bytes(mask, "little")
         found.append((begin, end, number, int.from_bytes(data[begin:end], "little") & number))
     return found

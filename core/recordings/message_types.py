@@ -96,7 +96,7 @@ class Definition:
                 data = _plain(data)
                 odd = _OddText(self, data)
                 message = odd.message(self.type_name)
-                if self._may_end(data, odd.left):
+                if self._may_end(data, odd.left) and not self._untrue(data):
                     return message
             except Exception:  # not that alone
                 pass
@@ -131,6 +131,8 @@ class Definition:
             raise BagError(_one_line(error)) from None
         if not fits:
             raise BagError(f"it is {left} bytes longer than its definition" if left > 0 else "it is cut")
+        if self._untrue(data):
+            raise BagError("it holds a truth value that is neither 0 nor 1")
         return message
 
     def from_ros1(self, data: bytes) -> bytes:
@@ -182,6 +184,22 @@ class Definition:
         except UnfitError:
             return False
         return left > 0 and not walk.excess
+
+    def _untrue(self, data: bytes) -> bool:
+        """Whether a truth value is neither 0 nor 1, as far as the message can be walked."""
+        if not self._truths:
+            return False
+        walk = Walk(data, self.fields)
+        try:
+            walk.message(self.type_name)
+        except UnfitError:
+            return False
+        return walk.untrue
+
+    @functools.cached_property
+    def _truths(self) -> bool:
+        """Whether there may be truth values in a message."""
+        return any(field.type_name == "bool" for name in self.types for field in self.fields(name).values())
 
     @functools.cached_property
     def _texts(self) -> Mapping[str, list[tuple[str, FieldType]]]:

@@ -11,7 +11,7 @@ from typing import Any
 from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.signals.field_types import FieldType, TypeFields
-from uncertain_lti.signals.functions import FUNCTIONS, FieldFunction
+from uncertain_lti.signals.functions import FUNCTIONS, FieldFunction, as_number
 from uncertain_lti.signals.paths import numeric_paths
 
 _STEP = re.compile(
@@ -122,7 +122,7 @@ class FieldPath:
                 if index < 0 or index >= len(value):
                     return math.nan
                 value = value[index]
-        return self.function.of(value) if self.function else float(value)
+        return self.function.of(value) if self.function else as_number(value)
 
     def _find_name(self, names: Sequence[str], wanted: str) -> int:
         index = self._name_index  # names seldom move between messages

@@ -84,7 +84,7 @@ class FieldFunction(NamedTuple):
         """
         names = self.takes.required + self.takes.optional
         if self.takes.array and not hasattr(value, names[0]):
-            return self.of_parts(*(float(v) for v in value))
+            return self.of_parts(*(as_number(v) for v in value))
         return self.of_parts(*(getattr(value, name) for name in names if hasattr(value, name)))
 
     def of_parts(self, *parts: Any) -> float:
@@ -102,6 +102,22 @@ class FieldFunction(NamedTuple):
         """
         arguments, size = self.terms(*parts)
         return self.number(*arguments) if size > 0.0 else math.nan
+
+
+def as_number(value: Any) -> float:
+    """A number of a decoded message.
+
+    Parameters
+    ----------
+    value : object
+        As the decoder has it; rclpy has a `byte` as bytes.
+
+    Returns
+    -------
+    float
+        The number.
+    """
+    return float(value[0] if isinstance(value, bytes) else value)
 
 
 def _roll(x: Any, y: Any, z: Any, w: Any) -> tuple[tuple[Any, ...], Any]:
