@@ -66,6 +66,7 @@ extras = {
     "frames": ["pandas"],
     # Parquet, Feather and .mat files; CSV and .npz take numpy alone.
     "tables": ["pyarrow", "scipy"],
+    "completion": ["shtab"],
     "plots": ["matplotlib", "pillow"],
     # To and from python-control; MATLAB files take scipy alone.
     "control": ["control", "scipy"],

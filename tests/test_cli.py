@@ -1,16 +1,21 @@
 """The commands: what they print, what they return, and one sentence for bad input."""
 
+import io
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_writer import Topic, ramp, write
 from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
+from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli.main import main
 from uncertain_lti.plants.leibov import STATE_TOPIC
 
@@ -296,3 +301,111 @@ def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, capsys):
     main(["report", str(path), str(folder / "run.mcap"), "--json"])
     (happened,) = json.loads(capsys.readouterr().out)["happened"]
     assert happened["state"] == "unknown" and "nothing vouches" in happened["text"]
+
+
+def test_a_model_is_written_over_with_force_alone(folder, capsys):
+    assert fitted(folder, "--additive", "noise") == 0
+    before = (folder / "m.model.json").read_bytes()
+    capsys.readouterr()
+    another = ["fit", str(folder / "run.mcap"), "--signals", str(folder / "signals.yaml"), "--additive", "both"]
+    another += ["--output", str(folder / "m.model.json")]
+    said = refused(capsys, another)
+    assert "a model is there already; choose another name, or write over it with --force" in said
+    assert (folder / "m.model.json").read_bytes() == before
+    assert main([*another, "--force"]) == 0
+    assert (folder / "m.model.json").read_bytes() != before
+    shutil.copy(folder / "m.model.json", folder / "other.model.json")
+    capsys.readouterr()
+    validate = ["validate", str(folder / "m.model.json"), "--output"]
+    assert "with --force" in refused(capsys, [*validate, str(folder / "other.model.json")])
+    assert main([*validate, str(folder / "other.model.json"), "--force"]) == 0
+    assert main([*validate, str(folder / "m.model.json")]) == 0  # the model itself gets its validation
+
+
+def test_of_several_recordings_one_that_lacks_a_topic_keeps_none_from_being_checked(folder, tmp_path, capsys):
+    assert fitted(folder, "--additive", "noise") == 0
+    other = write([Topic("/elsewhere")], ramp("/elsewhere", range(3))).save(tmp_path / "other.mcap")
+    run, model = str(folder / "run.mcap"), str(folder / "m.model.json")
+    capsys.readouterr()
+    shutil.copy(run, tmp_path / "again.mcap")
+    assert main(["check", model, run, str(other), str(tmp_path / "again.mcap")]) == 2
+    said = capsys.readouterr()
+    assert said.out.count(" verdicts, ") == 2
+    assert "other.mcap: there is no topic /engine/" in said.err and "1 of 3 recordings not checked" in said.err
+    assert main(["check", model, str(other), run, "--json"]) == 2
+    data = json.loads(capsys.readouterr().out)
+    assert data["outcome"] == "unknown" and len(data["recordings"]) == 1
+    assert [r["recording"] for r in data["not_checked"]] == [str(other)]
+    assert "1 of 3" not in refused(capsys, ["check", model, str(other)])
+
+
+def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
+    """Three messages within a microsecond, twice a second."""
+    times = [k * 500_000_000 + j * 300 for k in range(20) for j in range(3)]
+    path = write([Topic("/a")], ramp("/a", times)).save(tmp_path / "a.mcap")
+    assert main(["topics", str(path)]) == 0
+    assert re.search(r"/a .* 60 +6\.\d+ in bursts ", capsys.readouterr().out)
+    assert main(["topics", str(path), "--json"]) == 0
+    (topic,) = json.loads(capsys.readouterr().out)["topics"]
+    assert topic["bursts"] and topic["rate"] == pytest.approx(60 / 9.5, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["fit", "a.mcap", "--signls", "s.yaml", "--output", "m"], "there is no --signls (is --signals meant?)"),
+        (["check", "m", "a.mcap", "--jsn"], "unrecognized arguments: --jsn (is --json meant?)"),
+        (["chek", "m"], "(is check meant?)"),
+    ],
+)
+def test_a_near_miss_names_one_option(words, said, capsys):
+    with pytest.raises(SystemExit):
+        main(words)
+    error = capsys.readouterr().err
+    assert said in error and " or --" not in error.rpartition("error: ")[2]
+
+
+def test_what_is_proposed_and_written_as_json(folder, tmp_path, capsys):
+    assert fitted(folder, "--additive", "noise") == 0
+    capsys.readouterr()
+    assert main(["init", str(folder / "run.mcap"), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert {"name", "topic", "field"} <= set(data["states"][0]) and data["text"].startswith("# Proposed by")
+    layout = tmp_path / "l.json"
+    assert main(["layout", str(folder / "m.model.json"), "--foxglove", str(layout), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["layouts"] == [str(layout)]
+
+
+def test_an_alarm_is_red_where_colours_are_wanted(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    for environment, coloured in (({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)):
+        screen = Terminal()
+        with monkeypatch.context() as patch:
+            patch.delenv("NO_COLOR", raising=False)
+            patch.setenv("TERM", "xterm")
+            for name, value in environment.items():
+                patch.setenv(name, value)
+            patch.setattr(sys, "stdout", screen)
+            Progress().say("bag: 3 verdicts\nALARM: raised 9 times")
+        lines = screen.getvalue().splitlines()
+        assert lines[0] == "bag: 3 verdicts" and ("\x1b[1;31mALARM" in lines[1]) == coloured
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion(shell, tmp_path, capsys):
+    pytest.importorskip("shtab", reason="shtab, of the extra completion, is not installed")
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert "--criterion" in script and "validate" in script
+    if shutil.which(shell):
+        (tmp_path / "script").write_text(script)
+        assert subprocess.run([shell, "-n", tmp_path / "script"], check=False).returncode == 0
+    if shell == "bash":
+        ask = "COMP_WORDS=(uncertain-lti fit --crit); COMP_CWORD=2; _shtab_uncertain_lti; echo ${COMPREPLY[@]}"
+        done = subprocess.run(
+            ["bash", "-c", f"source {tmp_path}/script; {ask}"], capture_output=True, text=True, check=False
+        )
+        assert done.stdout.split() == ["--criterion"]

@@ -636,7 +636,7 @@ def test_structure_rules_of_a_signals_file():
         [
             {"state": "p", "from": "*", "nominal": 0, "half_width": 0},
             {"state": "p", "from": "v", "nominal": 1},
-            {"state": "v", "from": "f", "nominal": {"min": 0}, "half_width": {"max": 2.5}},
+            {"state": "v", "from": "f", "nominal": {"min": "0.0e0"}, "half_width": {"max": 2.5}},  # YAML 1.1: text
             {"state": "*", "from": "noise", "half_width": 0.1},
         ],
         *names,

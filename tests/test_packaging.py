@@ -196,6 +196,7 @@ def test_package_xml_covers_what_is_imported(package):
         "isal",
         "pandas",
         "pyarrow",
+        "shtab",
         "cython",
     }  # data frames are handed in by who has pandas
     missing = {n: p for n, p in outside.items() if n not in optional and ROSDEP_KEY.get(n, n) not in keys}

@@ -44,7 +44,7 @@ def long_run(tmp_path_factory):
 
 def fit_arguments(folder, output="m.model.json"):
     files = [str(folder / "run.mcap"), "--signals", str(folder / "signals.yaml")]
-    return ["fit", *files, "--output", str(folder / output), "--additive", "noise"]
+    return ["fit", *files, "--output", str(folder / output), "--additive", "noise", "--force"]
 
 
 def on_a_terminal(command):

@@ -87,7 +87,7 @@ def shortlist(names: Sequence[str], limit: int) -> str:
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
-def meant(word: object, known: Iterable[str]) -> str:
+def meant(word: object, known: Iterable[str], most: int = 3) -> str:
     """(is X meant?), with the known names that are near to a word, or nothing.
 
     Parameters
@@ -96,14 +96,16 @@ def meant(word: object, known: Iterable[str]) -> str:
         What was written; compared as text, without regard to case.
     known : iterable of str
         The names that exist.
+    most : int, default 3
+        Names at most.
 
     Returns
     -------
     str
-        ` (is X meant?)` with up to three names near to the word, or an empty text.
+        ` (is X meant?)` with the names near to the word, or an empty text.
     """
     names = {name.lower(): name for name in sorted(known)}
-    near = difflib.get_close_matches(str(word).lower(), names, n=3, cutoff=0.7)
+    near = difflib.get_close_matches(str(word).lower(), names, n=most, cutoff=0.7)
     return f" (is {' or '.join(names[n] for n in near)} meant?)" if near else ""
 
 

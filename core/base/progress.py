@@ -96,9 +96,9 @@ class Progress:
         if any(not bar.disable for bar in self._bars):
             from tqdm import tqdm
 
-            tqdm.write(_lines(text), file=sys.stdout)
+            tqdm.write(_coloured(_lines(text)), file=sys.stdout)
         else:
-            print(_lines(text))
+            print(_coloured(_lines(text)))
 
     def detail(self, text: str) -> None:
         """A line for who asked to see the work.
@@ -203,6 +203,14 @@ class Progress:
             tqdm.write(text, file=self._stream)
         else:
             print(text, file=self._stream, flush=True)
+
+
+def _coloured(text: str) -> str:
+    """Lines of an alarm in red, on a terminal that has colours and whose user has not refused them (no-color.org)."""
+    refused = os.environ.get("NO_COLOR") or os.environ.get("TERM", "dumb") == "dumb"
+    if refused or sys.stdout is None or not sys.stdout.isatty():
+        return text
+    return "\n".join(f"\x1b[1;31m{line}\x1b[0m" if line.startswith("ALARM") else line for line in text.split("\n"))
 
 
 def _lines(text: str) -> str:

@@ -6,7 +6,19 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, print_json, print_notes, print_summary
+from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.cli.command import (
+    ALARM,
+    BAD_INPUT,
+    DONE,
+    SILENT,
+    Command,
+    complain,
+    load_model,
+    print_json,
+    print_notes,
+    print_summary,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,6 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Check each recording and return whether the alarm was raised.
 
+    Of several recordings one that cannot be checked does not keep the others from it.
+
     Parameters
     ----------
     options : argparse.Namespace
@@ -44,12 +58,12 @@ def run(options: argparse.Namespace) -> int:
     Returns
     -------
     int
-        Exit status: 1 if the alarm was raised, else 0.
+        Exit status: 1 if the alarm was raised, else 2 if a recording could not be checked, else 0.
 
     Raises
     ------
     UncertainLTIError
-        The model or a recording cannot be read, or a copy cannot be written.
+        The model or the only recording cannot be read, or a copy cannot be written.
     """
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.base.english import plural
@@ -67,8 +81,17 @@ def run(options: argparse.Namespace) -> int:
 
         copies = targets(options.write, bags)
     results = []
+    refused: list[dict[str, str]] = []
     for bag, copy in zip(bags, copies, strict=True):
-        transient, decisions = read_as_fitted_with_decisions(bag, model.signals, options.progress.iterate("reading"))
+        try:
+            reading = options.progress.iterate("reading")
+            transient, decisions = read_as_fitted_with_decisions(bag, model.signals, reading)
+        except (BagError, SignalError) as error:
+            if len(bags) == 1:
+                raise
+            refused.append({"recording": str(bag.path), "error": str(error)})
+            complain("check", str(error))
+            continue
         print_notes(options, transient.notes)
         verdicts = monitor.check(transient)
         data = check_data(model, verdicts, samples=options.json)
@@ -83,10 +106,13 @@ def run(options: argparse.Namespace) -> int:
                 options,
                 f"{plural(made.messages, 'message')} and the verdicts below {made.topics} written to {made.path}",
             )
-    status = ALARM if any(r["alarm"] for r in results) else DONE
+    status = ALARM if any(r["alarm"] for r in results) else BAD_INPUT if refused else DONE
+    if refused:
+        complain("check", f"{len(refused)} of {plural(len(bags), 'recording')} not checked, as said above")
     if options.json:
-        ended = {"alarm": status == ALARM, "outcome": outcome(results), "exit_status": status}
-        print_json({"model": options.model, **ended, "recordings": results})
+        of_all = "unknown" if refused and status != ALARM else outcome(results)
+        ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}
+        print_json({"model": options.model, **ended, "recordings": results, "not_checked": refused})
     return status
 
 

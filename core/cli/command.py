@@ -7,10 +7,12 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import ModelError
 
 if TYPE_CHECKING:
@@ -78,6 +80,20 @@ def print_summary(options: argparse.Namespace, text: str) -> None:
         options.progress.say(text)
 
 
+def complain(command: str, text: str) -> None:
+    """Print an error on standard error, if anybody listens.
+
+    Parameters
+    ----------
+    command : str
+        Name of the command; empty where there is none.
+    text : str
+        The sentence.
+    """
+    with suppress(OSError, AttributeError):
+        print(f"uncertain-lti {command}: {printable(text)}".replace(" :", ":"), file=sys.stderr, flush=True)
+
+
 def print_json(data: Any) -> None:
     """Print data for a program.
 
@@ -134,13 +150,26 @@ def load_model(name: str) -> UncertainLTI:
     return UncertainLTI.load(name)
 
 
-def model_target(path: str) -> Path:
-    """Where a model file goes; an older one is replaced, and nothing else.
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """Declare the option that lets `model_target` replace a model.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
+    parser.add_argument("--force", action="store_true", help="write over a model that is there already")
+
+
+def model_target(path: str, force: bool) -> Path:
+    """Where a model file goes; with force an older one is replaced, and nothing else ever.
 
     Parameters
     ----------
     path : str
         What the user named.
+    force : bool
+        Whether a model that is there may be replaced.
 
     Returns
     -------
@@ -150,8 +179,12 @@ def model_target(path: str) -> Path:
     Raises
     ------
     BagError
-        As `files.target`.
+        As `files.target`; or a model is there.
     """
+    from uncertain_lti.base.errors import BagError
     from uncertain_lti.base.files import target
 
-    return target(path, holds=b'"uncertain-lti/', kind="model file", example="machine.model.json")
+    chosen = target(path, holds=b'"uncertain-lti/', kind="model file", example="machine.model.json")
+    if not force and chosen.is_file() and chosen.stat().st_size:
+        raise BagError(f"{path}: a model is there already; choose another name, or write over it with --force")
+    return chosen

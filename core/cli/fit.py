@@ -10,7 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.cli.command import DONE, GROUP, SILENT, Command, model_target, print_json, print_notes, print_summary
+from uncertain_lti.cli.command import (
+    DONE,
+    GROUP,
+    SILENT,
+    Command,
+    add_force,
+    model_target,
+    print_json,
+    print_notes,
+    print_summary,
+)
 from uncertain_lti.signals.additive import CHOICES
 
 
@@ -32,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
     )
     parser.add_argument("--output", required=True, metavar="MODEL", help="model file to write (*.model.json)")
+    add_force(parser)
     parser.add_argument("--criterion", choices=("qp", "lp"), default="qp", help="(10) squared or (11) largest width")
     parser.add_argument(
         "--additive",
@@ -85,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti.validation.fitted_model import leave_out_with_fit
     from uncertain_lti.validation.groups import resolve_groups
 
-    output = model_target(options.output)
+    output = model_target(options.output, options.force)
     if options.workers is not None and options.workers < 1:
         raise FitError(f"--workers is {options.workers}; give 1 or more")
     if options.cache or options.scheduler or options.workers:

@@ -7,7 +7,7 @@ import os
 import shlex
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.cli.command import DONE, Command, print_notes
+from uncertain_lti.cli.command import DONE, Command, print_json, print_notes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)"
     )
+    parser.add_argument("--json", action="store_true", help="print what is proposed as JSON, with the text of the file")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -54,14 +55,24 @@ def run(options: argparse.Namespace) -> int:
         raise SignalError(f"{output}: is there already; choose another output, or move it away")
     proposal = propose(options.bags, options.progress.iterate("reading"))
     print_notes(options, proposal.warnings)
-    if output is None:
+    if output is None and not options.json:
         print(proposal.text, end="")
         return DONE
-    try:
-        with whole_file(output) as stream:
-            stream.write(proposal.text.encode())
-    except OSError as error:
-        raise SignalError(f"{output}: cannot be written: {error.strerror}; choose another place") from None
+    if output is not None:
+        try:
+            with whole_file(output) as stream:
+                stream.write(proposal.text.encode())
+        except OSError as error:
+            raise SignalError(f"{output}: cannot be written: {error.strerror}; choose another place") from None
+    if options.json:
+        proposed = {
+            kind: [
+                {"name": c.name, "topic": c.topic, "field": c.path, "unit": c.unit, "delay": c.delay} for c in of_kind
+            ]
+            for kind, of_kind in (("states", proposal.states), ("controls", proposal.controls))
+        }
+        print_json({"output": output, **proposed, "warnings": list(proposal.warnings), "text": proposal.text})
+        return DONE
     options.progress.say(
         f"states: {', '.join(c.name for c in proposal.states)}\n"
         f"controls: {', '.join(c.name for c in proposal.controls) or 'none found'}\n"

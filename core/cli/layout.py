@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from uncertain_lti.cli.command import DONE, Command, load_model
+from uncertain_lti.cli.command import DONE, Command, load_model, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--foxglove", metavar="FILE.json", help="for Foxglove and Lichtblick")
     parser.add_argument("--plotjuggler", metavar="FILE.xml", help="for PlotJuggler")
     parser.add_argument("--topics", metavar="NAME", help="what the topics begin with (default: /envelope_monitor)")
+    parser.add_argument("--json", action="store_true", help="print the paths as JSON")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -41,7 +42,11 @@ def run(options: argparse.Namespace) -> int:
     """
     from uncertain_lti.reports.layouts import write_layouts
 
-    for path in write_layouts(load_model(options.model), options.foxglove, options.plotjuggler, options.topics):
+    written = write_layouts(load_model(options.model), options.foxglove, options.plotjuggler, options.topics)
+    if options.json:
+        print_json({"model": options.model, "layouts": [str(path) for path in written]})
+        return DONE
+    for path in written:
         print(f"layout written to {path}")
     return DONE
 

@@ -15,11 +15,10 @@ from contextlib import suppress
 from typing import Any, NoReturn
 
 from uncertain_lti import __version__
-from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import check, fit, info, init, layout, report, reproduce, ros, topics, validate
-from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command
+from uncertain_lti.cli import check, completion, fit, info, init, layout, report, reproduce, ros, topics, validate
+from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain
 
 COMMANDS: tuple[Command, ...] = (
     topics.COMMAND,
@@ -34,6 +33,7 @@ COMMANDS: tuple[Command, ...] = (
     ros.PLAY,
     ros.RECORD,
     ros.DEMO,
+    completion.COMMAND,
 )
 """Every command, in the order of the help."""
 
@@ -43,6 +43,7 @@ _EXTRAS = {
     **dict.fromkeys(("cvxpy", "osqp", "daqp", "piqp", "highspy", "scipy"), _FIT),
     **dict.fromkeys(("rclpy", "std_msgs", "sensor_msgs", "rosgraph_msgs", "std_srvs", "uncertain_lti_ros"), _ROS),
     "distributed": "install what a cluster needs: pip install 'uncertain-lti-ros[cluster]'",
+    "shtab": "install what completion needs: pip install 'uncertain-lti-ros[completion]'",
     **dict.fromkeys(("matplotlib", "PIL"), "install what figures need: pip install 'uncertain-lti-ros[plots]'"),
 }
 
@@ -116,19 +117,14 @@ def _run(command: str, given: Sequence[str]) -> int:
     except MemoryError:
         return _refuse(command, "there is not enough memory for this; give fewer or shorter recordings at a time")
     except KeyboardInterrupt:
-        _complain(command, "interrupted; no half-written file is left")
+        complain(command, "interrupted; no half-written file is left")
         return INTERRUPTED
     except Exception:
         return _fault(command)
 
 
-def _complain(command: str, text: str) -> None:
-    with suppress(OSError, AttributeError):  # nobody listens
-        print(f"uncertain-lti {command}: {printable(text)}".replace(" :", ":"), file=sys.stderr, flush=True)
-
-
 def _refuse(command: str, text: str) -> int:
-    _complain(command, text)
+    complain(command, text)
     return BAD_INPUT
 
 
@@ -136,9 +132,7 @@ def _fault(command: str) -> int:
     """Print the traceback of what nobody expected; its exit status is not that of an alarm."""
     with suppress(OSError, AttributeError):
         traceback.print_exc()
-    _complain(
-        command, "this is a fault of the program, not of what it was given; please report it with the lines above"
-    )
+    complain(command, "this is a fault of the program, not of what it was given; please report it with the lines above")
     return FAULT
 
 
@@ -148,13 +142,15 @@ def _drop_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def build_parser(chosen: str = "") -> argparse.ArgumentParser:
+def build_parser(chosen: str = "", every: bool = False) -> argparse.ArgumentParser:
     """Declare the arguments of every command; those that need rclpy, only of the chosen one.
 
     Parameters
     ----------
     chosen : str, default ""
         Name of the command that will run, or empty.
+    every : bool, default False
+        Declare those that need rclpy too, where it is installed.
 
     Returns
     -------
@@ -168,6 +164,7 @@ def build_parser(chosen: str = "") -> argparse.ArgumentParser:
         "130 interrupted by Ctrl-C.",
     )
     parser.add_argument("--version", action="version", version=f"uncertain-lti {__version__}")
+    parser.set_defaults(build_parser=build_parser)
     parsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in COMMANDS:
         text = command.help
@@ -180,23 +177,38 @@ def build_parser(chosen: str = "") -> argparse.ArgumentParser:
                 output.add_argument("-v", "--verbose", action="store_true", help=command.verbose)
         if not command.deferred or command.name == chosen:
             command.add_arguments(sub)
+        elif every:
+            with suppress(ModuleNotFoundError):
+                command.add_arguments(sub)
     return parser
 
 
 class _Parser(argparse.ArgumentParser):
     """Names the nearest command, option or choice in place of a misspelt one."""
 
+    _given: Sequence[str] = ()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Keep the words, for the error."""
+        self._given = list(args or ())
+        return super().parse_known_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
         from uncertain_lti.base.english import meant
 
         if match := re.search(r"invalid choice: '?(.*?)'? \(choose from (.*)\)", message):
-            message += meant(match[1], re.findall(r"[\w-]+", match[2]))
+            message += meant(match[1], re.findall(r"[\w-]+", match[2]), 1)
+        elif message.startswith("the following arguments are required"):
+            words = [word.partition("=")[0] for word in self._given if word.startswith("--")]
+            for word in words:
+                if not any(option.startswith(word) for option in self._option_string_actions):
+                    message += f"; there is no {word}{meant(word, self._option_string_actions, 1)}"
         elif message.startswith("unrecognized arguments: "):
             commands: list[dict[str, argparse.ArgumentParser]] = [
                 a.choices for a in self._actions if isinstance(a.choices, dict)
             ]
             known = {o for group in commands for p in group.values() for o in p._option_string_actions}
-            message += meant(message.split(": ")[1].split()[0].partition("=")[0], known)
+            message += meant(message.split(": ")[1].split()[0].partition("=")[0], known, 1)
         super().error(message)
 
 

@@ -59,6 +59,7 @@ def run(options: argparse.Namespace) -> int:
                         "readable": f.info.readable,
                         "reason": f.info.reason,
                         "rate": f.rate,
+                        "bursts": f.bursts,
                         "largest_gap": f.largest_gap,
                         "header_stamps": f.stamps,
                         "log_minus_header": f.stamp_offset,
@@ -76,7 +77,8 @@ def run(options: argparse.Namespace) -> int:
         if f.stamp_offset is not None and abs(f.stamp_offset) > 1.0:
             stamps += f", log {f.stamp_offset:+.0f} s"
         name, kind = printable(f.info.topic, _LONGEST_NAME), printable(f.info.type, _LONGEST_NAME)
-        rows.append([name, kind, str(f.info.count), number(f.rate), number(f.largest_gap), stamps])
+        rate = f"{number(f.rate)} in bursts" if f.bursts else number(f.rate)
+        rows.append([name, kind, str(f.info.count), rate, number(f.largest_gap), stamps])
     print(table(("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps"), rows))
     for f in facts:
         if not f.info.readable or f.info.reason:

@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import os
 
 from uncertain_lti.base.errors import BagError, FitError
-from uncertain_lti.cli.command import DONE, GROUP, SILENT, Command, model_target, print_json, print_notes, print_summary
+from uncertain_lti.cli.command import (
+    DONE,
+    GROUP,
+    SILENT,
+    Command,
+    add_force,
+    model_target,
+    print_json,
+    print_notes,
+    print_summary,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write the model with this validation, and the alarm rule found, to this file; where --false-alarms "
         "finds none, nothing is written and the exit status is 2",
     )
+    add_force(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -74,7 +86,8 @@ def run(options: argparse.Namespace) -> int:
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
     if options.output is not None:
-        model_target(options.output)
+        own = os.path.exists(options.output) and os.path.samefile(options.output, options.model)
+        model_target(options.output, options.force or own)
     reading = options.progress.iterate("reading")
     transients = [
         read_as_fitted(bag, model.signals, reading) for bag in group_recordings(bags, layout=model.signals.table)

@@ -401,11 +401,20 @@ def _position(name: Any, names: Sequence[str], where: str) -> int:
     return list(names).index(name)
 
 
+def _number(value: Any) -> Any:
+    """A number that YAML 1.1 reads as text, such as 1.0e9; any other value as it is."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
 def _range(value: Any, where: str) -> tuple[float, float]:
     if isinstance(value, dict) and value and set(value) <= {"min", "max"}:
         low, high = value.get("min", -math.inf), value.get("max", math.inf)
     else:
         low = high = value
+    low, high = _number(low), _number(high)
     for number in (low, high):
         if isinstance(number, bool) or not isinstance(number, (int, float)) or math.isnan(number):
             raise FitError(f"{where} is {value!r}; write a number, or {{min: a, max: b}}")

@@ -57,7 +57,8 @@ class TopicFacts:
     info : TopicInfo
         What the recording holds of it.
     rate : float or None
-        That of the median log-time step, 1/s; None where there is no step or it is 0.
+        That of the median log-time step, 1/s, or of the mean one where messages come in bursts; None where there is no
+        step or it is 0.
     largest_gap : float or None
         Longest log-time step, s; None where there is no step.
     fields : tuple of str
@@ -66,6 +67,8 @@ class TopicFacts:
         Whether header stamps can be used.
     stamp_offset : float or None
         Median of log time less header stamp, s; None without a stamp.
+    bursts : bool, default False
+        Whether messages come in bursts, with most steps far shorter than the mean.
     """
 
     info: TopicInfo
@@ -74,6 +77,7 @@ class TopicFacts:
     fields: tuple[str, ...]
     stamps: Literal["none", "usable", "zero", "mixed"]
     stamp_offset: float | None
+    bursts: bool = False
 
 
 @dataclass

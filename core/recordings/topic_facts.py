@@ -12,6 +12,8 @@ from uncertain_lti.recordings.raw_messages import RawMessage
 from uncertain_lti.recordings.recording import TopicFacts, TopicInfo
 from uncertain_lti.signals.paths import signal_paths
 
+_BURSTS = 10  # times that the mean step is longer than the median one where messages come in bursts
+
 
 def topic_facts(topics: Mapping[str, TopicInfo], messages: Iterable[RawMessage]) -> list[TopicFacts]:
     """Facts about every topic of a recording; reads its messages once, and decodes one of each topic.
@@ -62,7 +64,7 @@ def _facts(
     info: TopicInfo, times: array[int], offsets: array[float], zeros: int, longest: RawMessage | None
 ) -> TopicFacts:
     steps = [b - a for a, b in itertools.pairwise(times)]
-    step = median(steps) if steps else 0
+    step, bursts = usual_step(median(steps), times[-1] - times[0], len(steps)) if steps else (0.0, False)
     fields: tuple[str, ...] = ()
     if longest:
         definition = longest.channel.definition
@@ -78,4 +80,28 @@ def _facts(
         fields=fields,
         stamps="mixed" if zeros and offsets else "usable" if offsets else "zero" if zeros else "none",
         stamp_offset=median(offsets) if offsets else None,
+        bursts=bursts,
     )
+
+
+def usual_step(middle: float, span: float, steps: int) -> tuple[float, bool]:
+    """Step that a topic's rate is that of: the median one, or the mean where most messages come in bursts.
+
+    Parameters
+    ----------
+    middle : float
+        Median step, ns.
+    span : float
+        From the first message to the last, ns.
+    steps : int
+        Number of steps.
+
+    Returns
+    -------
+    step : float
+        ns.
+    bursts : bool
+        Whether it is the mean one, as the median is less than a tenth of it.
+    """
+    mean = span / steps
+    return (mean, True) if 0 <= middle * _BURSTS < mean else (middle, False)
