@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, validate
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.html_table import MOST
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 control = pytest.importorskip("control", reason="python-control is not installed")
@@ -242,3 +243,106 @@ def test_tables_of_large_and_of_empty_things():
     verdicts = EnvelopeMonitor(UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]])).check(still)
     assert "none possible" in repr(verdicts)
     Reader(verdicts._repr_html_())
+
+
+# --- scheduled models -------------------------------------------------------------------------------------------
+
+
+def scheduled_model(axes, further=(), n=2, m=1, seed=4):
+    rng = np.random.default_rng(seed)
+    schedule = Schedule(axes)
+    R = schedule.blocks
+    names = [f"x{i}" for i in range(n)]
+    states = tuple(Signal(name, "", "x", i + 1.0, 2.3 + i, "rpm") for i, name in enumerate(names))
+    controls = tuple(Signal(f"u{j}", "", "u", -1.0, 0.5 + j, "") for j in range(m))
+    signals = SignalMap(states, controls, tuple(Signal(name, "", "s", 0.1, 0.7, "K") for name in further))
+    return UncertainLTI(
+        rng.normal(size=(R, n, n)), rng.normal(size=(R, n, m)), rng.random((R, n, n)), rng.random((R, n, m)),
+        rng.normal(size=(R, n)), rng.random((R, n)), rng.random((R, n)), schedule=schedule, signals=signals,
+        block_data=[BlockData(None if r == 1 else r, 0 if r == 2 else None) for r in range(R)],
+    )  # fmt: skip
+
+
+KNOTS, GEAR = Axis("x0", knots=(-0.3, 0.1, 0.77)), Axis("gear", modes=(1.0, 2.0))
+SCHEDULES = [((KNOTS,), (), 2, 1), ((GEAR,), ("gear",), 3, 2), ((KNOTS, GEAR), ("gear",), 2, 0), ((KNOTS,), (), 1, 1)]
+SCHEDULES.append(((Axis("gear", modes=(3.0,)),), ("gear",), 2, 1))
+
+
+def test_a_scheduled_model_is_one_system_per_block_and_one_at_a_point():
+    model = scheduled_model((KNOTS,))
+    systems = model.to_control(dt=0.02)
+    assert len(systems) == 3
+    for r, system in enumerate(systems):
+        one = model.to_control(0.02, knot=r)
+        assert np.array_equal(one.A, system.A) and np.array_equal(one.B, system.B)
+        assert np.allclose(system.A, np.eye(2) + 0.02 * model.A[r]) and list(system.input_labels) == ["u0", "drift"]
+        again = UncertainLTI.from_control(system, dA=model.dA[r], dB=model.dB[r], signals=model.signals)
+        assert np.allclose(again.A, model.A[r]) and np.allclose(again.c, model.c[r])
+    between = model.at(x0=1.0 + 2.3 * 0.44).to_control(0.02)  # half way from one knot to the next
+    low, high = (np.hstack([s.A, s.B]) for s in systems[:2])
+    middle = model.at(x0=1.0 + 2.3 * -0.1).to_control(0.02)
+    assert np.allclose(np.hstack([middle.A, middle.B]), (low + high) / 2)
+    assert not np.allclose(between.A, middle.A)
+    calm = model.replace(c=np.where(np.arange(3)[:, None] == 1, model.c, 0.0))
+    assert [list(s.input_labels) for s in calm.to_control()] == [["u0", "drift"]] * 3
+    for knot in (-1, 3):
+        with pytest.raises(ModelError, match="blocks 0 to 2"):
+            model.to_control(knot=knot)
+    with pytest.raises(ModelError, match="no schedule"):
+        some_model().to_control(knot=0)
+
+
+@pytest.mark.parametrize(("axes", "further", "n", "m"), SCHEDULES)
+def test_a_scheduled_model_comes_back_from_matlab(axes, further, n, m, tmp_path):
+    model = scheduled_model(axes, further, n, m)
+    path = tmp_path / "m.mat"
+    model.save_mat(path)
+    assert UncertainLTI.load_mat(path).to_dict() == model.to_dict()
+    data = scipy_io.loadmat(path)
+    R = model.schedule.blocks
+    for r in range(R):
+        assert np.array_equal(np.reshape(data["A"], (n, n, R))[:, :, r], model.A[r])
+        assert np.array_equal(data["c"][:, r], model.c[r])
+    assert data["schedule_blocks"].tolist() == [[k + 1 for k in index] for index in model.schedule.indices]
+    for variable in ("model_json", "__header__", "__version__", "__globals__"):
+        data.pop(variable)
+    scipy_io.savemat(tmp_path / "own.mat", data)
+    again = UncertainLTI.load_mat(tmp_path / "own.mat")
+    same(model, again)
+    assert again.block_data == model.block_data
+    for mine, theirs in zip(model.schedule.axes, again.schedule.axes, strict=True):
+        assert theirs.signal == mine.signal and np.allclose(theirs.values, mine.values, rtol=1e-12)
+        assert bool(theirs.knots) == bool(mine.knots)
+    assert [s.name for s in again.signals.scheduling] == list(further)
+
+
+def test_what_was_changed_of_a_schedule_in_matlab_counts(tmp_path):
+    model = scheduled_model((KNOTS,))
+    model.save_mat(tmp_path / "m.mat")
+    data = {k: v for k, v in scipy_io.loadmat(tmp_path / "m.mat").items() if not k.startswith("__")}
+    data["dA"][0, 1, 2] = 9.0
+    data["schedule_values"][0, 0][1] = 1.5
+    scipy_io.savemat(tmp_path / "m.mat", data)
+    again = UncertainLTI.load_mat(tmp_path / "m.mat")
+    assert again.dA[2, 0, 1] == 9.0 and np.array_equal(again.A, model.A)
+    knots = again.schedule.axes[0].knots
+    assert knots[0] == KNOTS.knots[0] and knots[2] == KNOTS.knots[2] and np.isclose(knots[1], 0.5 / 2.3)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.update(A=d["A"][:, :, :2]), "'A' has shape"),
+        (lambda d: d.update(schedule_kinds=d["schedule_kinds"][:0]), "schedule_kinds"),
+        (lambda d: d["schedule_values"][0, 0].__setitem__(1, 99.0), "must increase"),
+        (lambda d: d.update(transitions=d["transitions"][:1]), "'transitions' has 1"),
+        (lambda d: d["schedule_signals"].__setitem__((0, 0), "torque"), "'torque'"),
+    ],
+)
+def test_a_damaged_schedule_is_refused_by_its_variable(change, words, tmp_path):
+    scheduled_model((KNOTS,)).save_mat(tmp_path / "m.mat")
+    data = {k: v for k, v in scipy_io.loadmat(tmp_path / "m.mat").items() if not k.startswith(("__", "model_json"))}
+    change(data)
+    scipy_io.savemat(tmp_path / "m.mat", data)
+    with pytest.raises(ModelError, match=words):
+        UncertainLTI.load_mat(tmp_path / "m.mat")

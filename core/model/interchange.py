@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
+from uncertain_lti.model.bounds import normalised
+from uncertain_lti.model.bounds import recorded as in_recorded_units
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -22,11 +26,12 @@ DRIFT = "drift"
 _VECTORS = tuple(name for name in ARRAYS if SHAPES[name].regressor == "1")
 
 
-def to_control(model: Any, dt: float | None = None, recorded: bool = False) -> Any:
+def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot: int | None = None) -> Any:
     """The nominal model as a `control.StateSpace`; its outputs are the states.
 
     Half-widths have no place there: keep the model beside it. A drift c becomes a last input called `drift`, to be
-    held at 1.
+    held at 1. Of a scheduled model there is one system per block, each for deviations from the one operating point, all
+    with the same inputs; between the knots `model.at(...)` is a model without a schedule, with a system of its own.
 
     Parameters
     ----------
@@ -37,29 +42,46 @@ def to_control(model: Any, dt: float | None = None, recorded: bool = False) -> A
         elements are those of one step of (3), so `control.c2d` of it is not (3) again.
     recorded : bool
         Deviations from the steady state in recorded units; default normalised.
+    knot : int, optional
+        Of a scheduled model the number of one block, in the order of `model.blocks`; default all of them.
 
     Returns
     -------
-    control.StateSpace
-        Continuous, or discrete with the step dt.
+    control.StateSpace, or list of it
+        Continuous, or discrete with the step dt; a list of a scheduled model without `knot`, in the order of
+        `model.blocks`.
 
     Raises
     ------
     ModelError
-        dt is not a positive number, or a control is called `drift` beside a drift.
+        dt is not a positive number, a control is called `drift` beside a drift, or there is no such block.
     """
-    import control
-
     if dt is not None and not (math.isfinite(dt) and dt > 0):
         raise ModelError(f"dt is {dt}; it must be a positive number of seconds, or left out")
+    drift = bool(np.any(model.c))
+    if drift and DRIFT in model.control_names:
+        raise ModelError(f"a control is called '{DRIFT}', as the input for c would be; rename it")
+    if model.schedule is None:
+        if knot is not None:
+            raise ModelError(f"knot is {knot}, and the model has no schedule; leave it out")
+        return _system(model, dt, recorded, drift)
+    if knot is None:
+        return [_system(block, dt, recorded, drift) for block in model.blocks]
+    if not 0 <= knot < len(model.blocks):
+        raise ModelError(f"knot is {knot}; the model has blocks 0 to {len(model.blocks) - 1}")
+    return _system(model.blocks[knot], dt, recorded, drift)
+
+
+def _system(model: Any, dt: float | None, recorded: bool, drift: bool) -> Any:
+    """Of a model without a schedule; drift: whether c is an input."""
+    import control
+
     A, B, c = np.array(model.A), np.array(model.B), np.array(model.c)
     if recorded:
         X, U = model.operating_point.X, model.operating_point.U
         A, B, c = A * X[:, None] / X, B * X[:, None] / U, c * X
     inputs = list(model.control_names)
-    if c.any():
-        if DRIFT in inputs:
-            raise ModelError(f"a control is called '{DRIFT}', as the input for c would be; rename it")
+    if drift:
         B, inputs = np.column_stack([B, c]), [*inputs, DRIFT]
     if dt is not None:
         A, B = np.eye(model.n) + dt * A, dt * B
@@ -152,7 +174,11 @@ def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
     """Write a MATLAB file (version 5): A, B, dA, dB, c, dc, v, names, units, operating point and steps.
 
     dt, dt_min, dt_max (s) are NaN where the model does not say them. `model_json` holds the whole model file, so that
-    `UncertainLTI.load_mat` gives back everything.
+    `UncertainLTI.load_mat` gives back everything. Of a scheduled model the block is the last dimension: `A(:,:,r)`,
+    `B(:,:,r)`, `c(:,r)`. Then there are also, one row per scheduling signal, `schedule_signals`, `schedule_kinds`
+    (knots or modes) and `schedule_values` (a cell of column vectors, recorded units); per block `schedule_blocks` (the
+    position, from 1, of its knot or mode on each axis), `transitions` (NaN: not known) and `tied_to` (a block from 1,
+    or 0); and `scheduling_names`, `scheduling_units`, `s_steady`, `s_scale` of further scheduling signals.
 
     Parameters
     ----------
@@ -171,14 +197,17 @@ def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
     point, sampling = model.operating_point, model.sampling
     # first, so that a file that was cut has nothing, or everything
     data: dict[str, Any] = {"model_json": json.dumps(model.to_dict())}
-    data |= {name: np.atleast_2d(getattr(model, name)) for name in ARRAYS}
-    for name in _VECTORS:
-        data[name] = data[name].T
+    if model.schedule is None:
+        data |= {name: np.atleast_2d(getattr(model, name)) for name in ARRAYS}
+        for name in _VECTORS:
+            data[name] = data[name].T
+    else:
+        data |= {name: np.moveaxis(getattr(model, name), 0, -1) for name in ARRAYS}
+        data |= _schedule_variables(model)
     for name, values in (("x_steady", point.x_s), ("x_scale", point.X), ("u_steady", point.u_s), ("u_scale", point.U)):
         data[name] = values[:, None]
     for name, group in (("state", model.signals.states), ("control", model.signals.controls)):
-        data[f"{name}_names"] = np.array([[s.name] for s in group], dtype=object).reshape(len(group), 1)
-        data[f"{name}_units"] = np.array([[s.unit] for s in group], dtype=object).reshape(len(group), 1)
+        data |= {f"{name}_names": _cells([s.name for s in group]), f"{name}_units": _cells([s.unit for s in group])}
     for name, step in (("dt", sampling.dt_median), ("dt_min", sampling.dt_min), ("dt_max", sampling.dt_max)):
         data[name] = math.nan if step is None else step
     try:
@@ -188,11 +217,45 @@ def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
         raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
+def _cells(values: Sequence[Any]) -> NDArray[np.object_]:
+    """A cell array, one row per entry."""
+    cells = np.empty((len(values), 1), dtype=object)
+    for row, value in zip(cells, values, strict=True):
+        row[0] = value
+    return cells
+
+
+def _schedule_variables(model: Any) -> dict[str, Any]:
+    """Variables of a scheduled model beside its arrays."""
+    point, schedule = model.operating_point, model.schedule
+    places = model.scheduling_positions
+    values = [_in_recorded_units(model, axis, i) for axis, i in zip(schedule.axes, places, strict=True)]
+    facts = model.block_data
+    return {
+        "schedule_signals": _cells([axis.signal for axis in schedule.axes]),
+        "schedule_kinds": _cells(["knots" if axis.knots else "modes" for axis in schedule.axes]),
+        "schedule_values": _cells([v[:, None] for v in values]),
+        "schedule_blocks": np.array(schedule.indices, dtype=np.float64) + 1.0,
+        "transitions": np.array([[math.nan if f.transitions is None else f.transitions] for f in facts]),
+        "tied_to": np.array([[0.0 if f.tied_to is None else f.tied_to + 1.0] for f in facts]),
+        "scheduling_names": _cells([s.name for s in model.signals.scheduling]),
+        "scheduling_units": _cells([s.unit for s in model.signals.scheduling]),
+        "s_steady": point.s_s[:, None],
+        "s_scale": point.S[:, None],
+    }
+
+
+def _in_recorded_units(model: Any, axis: Axis, i: int) -> Array:
+    """Knots or modes of one axis whose signal is the i-th of [x; u; s]."""
+    point = model.operating_point
+    return np.asarray(in_recorded_units(np.array(axis.values), point.steady[i], point.scale[i]))
+
+
 def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
     """Read a MATLAB file (up to version 7) with at least A, B, dA and dB.
 
-    What else it holds of `save_mat` is taken too; matrices that were changed in MATLAB count, not those of
-    `model_json`.
+    What else it holds of `save_mat` is taken too; matrices, and the knots or modes of a schedule, that were changed in
+    MATLAB count, not those of `model_json`.
 
     Parameters
     ----------
@@ -228,17 +291,19 @@ def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
     for name in REQUIRED:
         if name not in data:
             raise ModelError(f"{path}: there is no variable '{name}'; a model needs A, B, dA and dB")
-    matrices = {name: _real(data[name], name, path) for name in ARRAYS if name in data}
-    n, m = len(matrices["A"]), matrices["B"].shape[1] if matrices["B"].size else 0
-    for name in _VECTORS:
-        if name in matrices:
-            matrices[name] = matrices[name].ravel()
-    matrices["B"], matrices["dB"] = (
-        matrices[k].reshape(n, m) if not matrices[k].size else matrices[k] for k in ("B", "dB")
-    )
     try:
-        if "model_json" in data:
-            whole = json.loads(_texts(data["model_json"])[0])
+        whole = json.loads(_texts(data["model_json"])[0]) if "model_json" in data else None
+        if "schedule_signals" in data:
+            return _scheduled(model_class, data, whole, path)
+        matrices = {name: _real(data[name], name, path) for name in ARRAYS if name in data}
+        n, m = len(matrices["A"]), matrices["B"].shape[1] if matrices["B"].size else 0
+        for name in _VECTORS:
+            if name in matrices:
+                matrices[name] = matrices[name].ravel()
+        matrices["B"], matrices["dB"] = (
+            matrices[k].reshape(n, m) if not matrices[k].size else matrices[k] for k in ("B", "dB")
+        )
+        if whole is not None:
             if isinstance(whole, dict):
                 whole |= {name: value.tolist() for name, value in matrices.items()}
             return model_class.from_dict(whole, source=os.fspath(path))
@@ -250,6 +315,79 @@ def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
         raise ModelError(f"{path}: 'model_json' or the names are damaged ({error}); write the file anew") from None
     except (ModelError, SignalError) as error:
         raise ModelError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+
+
+def _scheduled(model_class: Any, data: dict[str, Any], whole: Any, path: str | os.PathLike[str]) -> Any:
+    """A scheduled model: its arrays have the block last."""
+    names, kinds = _texts(data["schedule_signals"]), _texts(data["schedule_kinds"])
+    values = [_real(v, "schedule_values", path).ravel() for v in np.asarray(data["schedule_values"]).ravel()]
+    if not len(names) == len(kinds) == len(values) or set(kinds) - {"knots", "modes"}:
+        raise ModelError("'schedule_kinds' and 'schedule_values' must have an entry per signal, of knots or modes")
+    R = math.prod(len(v) for v in values)
+    sizes = {"x": _rows(data["A"]), "u": _rows(data["B"], 1), "1": 1}
+    n = sizes["x"]
+    arrays = {}
+    for name in ARRAYS:
+        if name in data:
+            shape = (*SHAPES[name].shape(n, sizes["u"]), R)  # MATLAB drops a last dimension of 1
+            array = _real(data[name], name, path)
+            if array.size != math.prod(shape) or (array.ndim == len(shape) and array.size and array.shape != shape):
+                raise ModelError(f"variable '{name}' has shape {array.shape}; it must be {shape}, the block last")
+            arrays[name] = np.moveaxis(array.reshape(shape), -1, 0)
+    if isinstance(whole, dict):
+        blocks = whole.get("blocks")
+        if not isinstance(blocks, list) or len(blocks) != R or not all(isinstance(block, dict) for block in blocks):
+            raise ModelError(f"'model_json' does not have the {plural(R, 'block')} of 'schedule_values'")
+        for r, block in enumerate(blocks):
+            block |= {name: array[r].tolist() for name, array in arrays.items()}
+        model = model_class.from_dict(whole, source=os.fspath(path))
+        if [axis.signal for axis in model.schedule.axes] != names:
+            raise ModelError("'schedule_signals' are not those of 'model_json'")
+        return model.replace(schedule=_changed(model, kinds, values))
+    signals = SignalMap(
+        _signals(data, "state", "x", n, path),
+        _signals(data, "control", "u", sizes["u"], path),
+        _signals(data, "scheduling", "s", len(_texts(data.get("scheduling_names", []))), path),
+        source=os.fspath(path),
+    )
+    named = {s.name: s for s in signals.signals}
+    axes = []
+    for name, kind, there in zip(names, kinds, values, strict=True):
+        if name not in named:
+            raise ModelError(f"schedule: '{name}' is no state, control or scheduling signal")
+        at = normalised(there, float(named[name].steady), float(named[name].scale))
+        axes.append(Axis(name, **{kind: tuple(at.tolist())}))
+    facts = [BlockData(None if math.isnan(a) else int(a), int(b) - 1 if b else None) for a, b in _block_rows(data, R)]
+    return model_class(**arrays, schedule=Schedule(tuple(axes)), block_data=facts, signals=signals)
+
+
+def _rows(value: Any, axis: int = 0) -> int:
+    """Length of one dimension of an array; 0 where it has no entries."""
+    array = np.asarray(value)
+    return array.shape[axis] if array.size and array.ndim > axis else 0
+
+
+def _block_rows(data: dict[str, Any], R: int) -> list[tuple[float, float]]:
+    """Transitions and tied_to of each block, as `save_mat` writes them."""
+    columns = []
+    for name, default in (("transitions", math.nan), ("tied_to", 0.0)):
+        values = np.asarray(data[name], dtype=np.float64).ravel() if name in data else np.full(R, default)
+        if len(values) != R:
+            raise ModelError(f"'{name}' has {plural(len(values), 'entry')} for {plural(R, 'block')}")
+        columns.append(values.tolist())
+    return list(zip(*columns, strict=True))
+
+
+def _changed(model: Any, kinds: Sequence[str], values: Sequence[Array]) -> Schedule:
+    """The schedule of `model_json`, with the knots or modes that were changed since; the others keep their bits."""
+    axes = []
+    for axis, i, kind, there in zip(model.schedule.axes, model.scheduling_positions, kinds, values, strict=True):
+        point, written = model.operating_point, _in_recorded_units(model, axis, i)
+        at = normalised(there, point.steady[i], point.scale[i])
+        if len(there) == len(written):
+            at = np.where(there == written, axis.values, at)
+        axes.append(Axis(axis.signal, **{kind: tuple(at.tolist())}))
+    return Schedule(tuple(axes))
 
 
 def _real(value: Any, name: str, path: str | os.PathLike[str]) -> Array:

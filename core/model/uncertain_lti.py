@@ -217,10 +217,13 @@ class UncertainLTI:
 
     def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:
         """One block with the signals of this model that are states and controls."""
+        read = {s.topic for s in (*self.signals.states, *self.signals.controls)}
         return UncertainLTI(
             **arrays,
-            signals=replace(self.signals, scheduling=(), schedule=()),
-            sampling=self.sampling,
+            signals=replace(
+                self.signals, scheduling=(), schedule=(), time={t: k for t, k in self.signals.time.items() if t in read}
+            ),
+            sampling=replace(self.sampling, time={t: k for t, k in self.sampling.time.items() if t in read}),
             domain=self.domain,
             alarm_rule=self.alarm_rule,
         )
@@ -259,7 +262,22 @@ class UncertainLTI:
         return text + ")"
 
     def _repr_html_(self) -> str:
-        """Nominal elements with their half-widths, and the widths that the fit reached."""
+        """Nominal elements with their half-widths, or the blocks of a schedule, and the widths that the fit reached."""
+        header, rows = self._elements_table() if self.schedule is None else self._blocks_table(self.schedule)
+        facts, below = self.fit_summary, []
+        if facts.get("mean_width_recorded") is not None:
+            widths = [
+                f"{name_with_unit(s.name, s.unit)} {number_text(float(w))}"
+                for s, w in zip(self.signals.states[:MOST], np.ravel(facts["mean_width_recorded"]), strict=False)
+            ]
+            below.append(f"mean one-step width: {', '.join(widths)}" + ", …" * (self.n > MOST))
+        rule = self.alarm_rule
+        below.append(f"alarm: {rule.violations} of {plural(rule.window, 'verdict')}, margin {number_text(rule.margin)}")
+        below += [f"note: {message}" for message in facts.get("messages", [])]
+        return html_table(repr(self), header, rows, below)
+
+    def _elements_table(self) -> tuple[list[str], list[list[str]]]:
+        """Of one block: a row per state, a column per signal and additive term."""
         names = [*self.state_names, *self.control_names]
         nominal, half = np.hstack([self.A, self.B]), np.hstack([self.dA, self.dB])
         shown = range(min(len(names), MOST))
@@ -273,17 +291,22 @@ class UncertainLTI:
             rows.append(row)
         if self.n > MOST:
             rows.append(["…"] * len(header))
-        facts, below = self.fit_summary, []
-        if facts.get("mean_width_recorded") is not None:
-            widths = [
-                f"{name_with_unit(s.name, s.unit)} {number_text(float(w))}"
-                for s, w in zip(self.signals.states[:MOST], np.ravel(facts["mean_width_recorded"]), strict=False)
-            ]
-            below.append(f"mean one-step width: {', '.join(widths)}" + ", …" * (self.n > MOST))
-        rule = self.alarm_rule
-        below.append(f"alarm: {rule.violations} of {plural(rule.window, 'verdict')}, margin {number_text(rule.margin)}")
-        below += [f"note: {message}" for message in facts.get("messages", [])]
-        return html_table(repr(self), header, rows, below)
+        return header, rows
+
+    def _blocks_table(self, schedule: Schedule) -> tuple[list[str], list[list[str]]]:
+        """A row per block: its data, and the element of A on the diagonal of each state."""
+        shown = range(min(self.n, MOST))
+        header = ["regime", "transitions", "elements of", *(f"{self.state_names[i]}: A [1/s]" for i in shown)]
+        header += ["…"] * (self.n > MOST)
+        rows = []
+        for r, data in enumerate(self.block_data[:MOST]):
+            row = [self.block_name(r), "–" if data.transitions is None else str(data.transitions)]
+            row.append("its own" if data.tied_to is None else self.block_name(data.tied_to))
+            row += [f"{self.A[r, i, i]:.4g} ± {self.dA[r, i, i]:.3g}" for i in shown] + ["…"] * (self.n > MOST)
+            rows.append(row)
+        if schedule.blocks > MOST:
+            rows.append(["…"] * len(header))
+        return header, rows
 
     # --- one-step bounds ---
 
@@ -390,6 +413,31 @@ class UncertainLTI:
         places, weights = self.schedule.corners(s)
         known = np.array([data.known for data in self.block_data])
         return places[0] >= 0, self.schedule.beyond(s) | ((weights > 0) & ~known[places]).any(axis=0)
+
+    @property
+    def scheduling_positions(self) -> tuple[int, ...]:
+        """Where the scheduling signals are in [x; u; s], one per axis; empty without a schedule."""
+        return tuple(self._positions)
+
+    def main_block(self, z: Array) -> NDArray[np.intp]:
+        """The block that has the largest weight, of two alike the first.
+
+        Parameters
+        ----------
+        z : array (n + m + q, K)
+            Normalised [x; u; s].
+
+        Returns
+        -------
+        array of int (K,)
+            Numbers of blocks; -1 for a mode that is not listed, and 0 without a schedule.
+        """
+        if self.schedule is None:
+            return np.zeros(z.shape[1], dtype=np.intp)
+        places, weights = self.schedule.corners(z[self._positions])
+        largest = np.argmax(weights, axis=0)
+        found: NDArray[np.intp] = np.take_along_axis(places, largest[None], axis=0)[0]
+        return found
 
     def why_unknown(self, values: Sequence[float]) -> str:
         """In words, why the regime of a sample is unknown.
@@ -647,7 +695,7 @@ class UncertainLTI:
 
     # --- other tools ---
 
-    def to_control(self, dt: float | None = None, recorded: bool = False) -> Any:
+    def to_control(self, dt: float | None = None, recorded: bool = False, knot: int | None = None) -> Any:
         """The nominal model as a `control.StateSpace`; see `interchange.to_control`.
 
         Parameters
@@ -656,15 +704,18 @@ class UncertainLTI:
             As in `interchange.to_control`.
         recorded : bool, default False
             As in `interchange.to_control`.
+        knot : int, optional
+            As in `interchange.to_control`.
 
         Returns
         -------
-        control.StateSpace
-            The nominal model.
+        control.StateSpace, or list of it
+            The nominal model; with a schedule and without `knot` one system per block. That between the knots is
+            `model.at(...).to_control()`.
         """
         from uncertain_lti.model.interchange import to_control
 
-        return to_control(self, dt, recorded)
+        return to_control(self, dt, recorded, knot)
 
     @staticmethod
     def from_control(system: Any, **options: Any) -> UncertainLTI:
