@@ -16,7 +16,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
-    parser.add_argument("--json", action="store_true", help="print the file as JSON")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print the file as JSON; of a scheduled model with `regimes`, what each rests on",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -38,10 +42,13 @@ def run(options: argparse.Namespace) -> int:
         The model cannot be read.
     """
     from uncertain_lti.reports.model_text import model_text
+    from uncertain_lti.reports.plain_data import finite_data
+    from uncertain_lti.reports.regimes import block_facts
 
     model = load_model(options.model)
     if options.json:
-        print_json(model.to_dict())
+        regimes = finite_data(block_facts(model))
+        print_json(model.to_dict() | ({"regimes": regimes} if regimes else {}))
     else:
         print(model_text(model))
     return DONE

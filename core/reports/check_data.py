@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.reports.regimes import check_regimes, sample_blocks, unknown_in_words
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
@@ -27,7 +28,8 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
 
     Counts, the first and the longest violation of each state, the spans in which the alarm was raised, widths and
     coverage; with samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no
-    verdict).
+    verdict). Of a scheduled model also `regimes`, what became of the verdicts in each, `unknown`, in words why a regime
+    is unknown or a mode has no verdict, and of each sample its `regime`, a position in `regimes`.
 
     Parameters
     ----------
@@ -75,6 +77,8 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "inside": None if not judged else 1.0 - int(verdicts.violated.sum()) / judged,
         "outside_domain": int(verdicts.outside_domain.sum()),
         "unknown_regime": int(verdicts.unknown_regime.sum()),
+        "unknown": unknown_in_words(model, verdicts),
+        "regimes": check_regimes(model, verdicts),
         "states": states,
         "alarm": bool(alarms),
         "alarms": [{**_instant(transient, start), **_length(t, (start, stop))} for start, stop in alarms],
@@ -87,11 +91,12 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         ""
         if not unknown
         else f"{share:.2%} of the verdicts are outside the fitted domain, where nothing vouches for the bounds; fit "
-        f"recordings that reach as far"
+        f"recordings that reach as far" + f" ({'; '.join(data['unknown'])})" * bool(data["unknown"])
         if judged
-        else "no verdict was possible, so nothing is known"
+        else "; ".join(["no verdict was possible, so nothing is known", *data["unknown"]])
     )
     if samples:
+        block = sample_blocks(model, verdicts)
         data["verdict_per_sample"] = [
             {
                 "t_ns": int(t[k]),
@@ -104,6 +109,11 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
                 "outside_domain": bool(verdicts.outside_domain[k]),
                 "alarm": bool(verdicts.alarm[k]),
             }
+            | (
+                {"regime": int(block[k]) if block[k] >= 0 else None, "unknown_regime": bool(verdicts.unknown_regime[k])}
+                if model.schedule is not None
+                else {}
+            )
             for k, status in enumerate(verdicts.statuses())
         ]
     return data

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from uncertain_lti.base.english import plural, times
+from uncertain_lti.reports.regimes import MOST_REGIMES
 from uncertain_lti.reports.tables import number, table
 
 
@@ -41,8 +42,18 @@ def check_text(data: dict[str, Any]) -> str:
         head + (f"; no verdict or not used: {', '.join(data['no_verdict'])}" if data["no_verdict"] else ""),
         table(("state", "violations", "inside", "mean width", "largest", "first", "longest"), rows),
     ]
+    visited = [r for r in data["regimes"] if r["verdicts"]]
+    if len(visited) > 1 or len(data["regimes"]) > len(visited) > 0:
+        header = ("regime", "verdicts", "inside", "unknown", *(f"{name}: mean width" for name in data["states"]))
+        lines.append(table(header, [_regime(r) for r in visited[:MOST_REGIMES]]))
+        if (more := len(visited) - MOST_REGIMES) > 0:
+            lines.append(f"  and {plural(more, 'more regime')}; --json has all")
     if data["verdicts"]:
         lines.append(f"outside the fitted domain: {data['outside_domain'] / data['verdicts']:.2%} of the verdicts")
+        if data["unknown_regime"]:
+            share = data["unknown_regime"] / data["verdicts"]
+            lines.append(f"unknown regime: {share:.2%} of the verdicts, which nothing vouches for")
+    lines += [f"  {text}" for text in data["unknown"]]
     if data["alarm"]:
         first = data["alarms"][0]
         lines.append(
@@ -53,3 +64,14 @@ def check_text(data: dict[str, Any]) -> str:
     else:
         lines.append("no alarm" if data["verdicts"] else data["reason"])
     return "\n".join(lines)
+
+
+def _regime(regime: dict[str, Any]) -> list[str]:
+    """Cells of one regime with verdicts."""
+    return [
+        regime["regime"],
+        str(regime["verdicts"]),
+        f"{regime['inside']:.3%}",
+        str(regime["unknown_regime"]),
+        *(number(state["mean_width"]) for state in regime["states"].values()),
+    ]

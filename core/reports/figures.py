@@ -20,21 +20,28 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.reports.drawing import (
+    ALARM,
+    ENVELOPE,
+    NO_VERDICT,
+    RECORDED,
+    VIOLATED,
+    WIDTH,
+    brief,
+    elements,
+    line,
+    new_figure,
+    no_ticks,
+    patch,
+    plain,
+    short,
+)
 from uncertain_lti.reports.figure_columns import PIXELS, DrawnColumns, TimeAxis
-from uncertain_lti.reports.tables import shortened
+from uncertain_lti.reports.schedule_figures import elements_figure
 from uncertain_lti.reports.width_budget import width_budget
 from uncertain_lti.sampling.transient import Transient
 
-ENVELOPE, RECORDED, VIOLATED, ALARM, NO_VERDICT = "#56B4E9", "#000000", "#D55E00", "#F0E442", "#999999"
-
-
 _FEW = 8  # states that get a panel of full size each, and columns whose numbers fit into a heat map
-
-
-_WIDTH = 10.0  # inches
-
-
-_LONGEST_NAME = 34
 
 
 _MANY = 30  # names next to each other are written smaller from here on
@@ -93,11 +100,11 @@ def envelope_figure(
         _ticks(axis)
     _finish_time(figure, axes, axis_time, drawn, event)
     handles = [
-        _patch(ENVELOPE, 0.55, "one-step bounds"),
-        _line(RECORDED, "recorded"),
-        _line(VIOLATED, "violated", "o"),
-        _patch(ALARM, 0.45, "alarm"),
-        _patch(NO_VERDICT, 0.35, "no verdict"),
+        patch(ENVELOPE, 0.55, "one-step bounds"),
+        line(RECORDED, "recorded"),
+        line(VIOLATED, "violated", "o"),
+        patch(ALARM, 0.45, "alarm"),
+        patch(NO_VERDICT, 0.35, "no verdict"),
     ]
     return _head(figure, verdicts, handles)
 
@@ -159,11 +166,11 @@ def utilisation_figure(
         _ticks(axis)
     _finish_time(figure, axes, axis_time, drawn, None)
     handles = [
-        _patch(ENVELOPE, 0.25, "inside the bounds"),
-        _line(RECORDED, "utilisation"),
-        _line(VIOLATED, "violated", "o"),
-        _patch(ALARM, 0.45, "alarm"),
-        _patch(NO_VERDICT, 0.35, "no verdict"),
+        patch(ENVELOPE, 0.25, "inside the bounds"),
+        line(RECORDED, "utilisation"),
+        line(VIOLATED, "violated", "o"),
+        patch(ALARM, 0.45, "alarm"),
+        patch(NO_VERDICT, 0.35, "no verdict"),
     ]
     return _head(figure, verdicts, handles)
 
@@ -172,7 +179,8 @@ def matrices_figure(model: UncertainLTI) -> Any:
     """A and B with their half-widths ΔA and ΔB as heat maps with names, in 1/s of normalised quantities.
 
     A dot marks an element whose half-width is greater than itself: its sign is not known. Columns c (drift) and
-    v (noise, not multiplied by Δt) appear where the model has them.
+    v (noise, not multiplied by Δt) appear where the model has them. A scheduled model is drawn by
+    `schedule_figures.elements_figure`; one block of it is `model.blocks[r]`.
 
     Parameters
     ----------
@@ -186,14 +194,16 @@ def matrices_figure(model: UncertainLTI) -> Any:
     """
     from matplotlib.colors import LogNorm, SymLogNorm
 
-    nominal, half, columns = _with_additive(model)
-    rows = [_short(name) for name in model.state_names]
+    if model.schedule is not None:
+        return elements_figure(model)
+    nominal, half, columns = elements(model)
+    rows = [short(name) for name in model.state_names]
     numbers = nominal.size <= 110
     cell = 0.62 if numbers else max(0.16, min(0.4, 9.0 / len(columns)))
     width, height = cell * 1.1 * len(columns), max(cell * 0.7 * len(rows), 1.0)
     crowd = max(len(rows), len(columns))
     label, below = _length(rows, crowd), _length(columns, crowd)
-    figure = _figure(max(label + width + 1.0, 3.6), 2 * (height + below + 0.45) + 0.3)
+    figure = new_figure(max(label + width + 1.0, 3.6), 2 * (height + below + 0.45) + 0.3)
     total_w, total_h = figure.get_size_inches()
     greatest = float(np.abs(nominal).max(initial=0.0)) or 1.0
     least = float(half[half > 0].min(initial=math.inf))
@@ -212,11 +222,11 @@ def matrices_figure(model: UncertainLTI) -> Any:
         bar = figure.add_axes(((label + width + 0.15) / total_w, bottom / total_h, 0.15 / total_w, height / total_h))
         figure.colorbar(image, cax=bar)
         bar.tick_params(labelsize=7)
-        bar.yaxis.set_minor_locator(_no_ticks())
+        bar.yaxis.set_minor_locator(no_ticks())
         if not k:
             inner = greatest * 10**-1.5
             ticks = [-greatest, 0.0, greatest] if height < 1.3 else [-greatest, -inner, 0.0, inner, greatest]
-            bar.set_yticks(ticks, [_brief(tick) if tick else "0" for tick in ticks])
+            bar.set_yticks(ticks, [brief(tick) if tick else "0" for tick in ticks])
         axis.set_title(title, loc="left", fontsize=9)
         _name_cells(axis, rows, columns)
         axis.axvline(model.n - 0.5, color=RECORDED, linewidth=0.8)
@@ -256,11 +266,11 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
         No recording has a usable transition.
     """
     shares, width, names = width_budget(model, transients)
-    columns = [_short(name) for name in names]
+    columns = [short(name) for name in names]
     rows = []
     for i, name in enumerate(model.state_names):
         unit = model.signals.states[i].unit
-        rows.append(f"{_short(name)}\n{width[i]:.4g}{' ' + _plain(unit) if unit else ''}")
+        rows.append(f"{short(name)}\n{width[i]:.4g}{' ' + plain(unit) if unit else ''}")
     numbers = shares.size <= 250
     few = len(rows) <= 12
     if not few:
@@ -270,7 +280,7 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
     width_in, height = cell * len(columns), (0.42 if few else 0.2) * len(rows)
     label = _length([part for row in rows for part in row.split("\n")], crowd)
     below = _length(columns, crowd)
-    figure = _figure(max(label + width_in + 0.8, 3.8), height + below + 0.35)
+    figure = new_figure(max(label + width_in + 0.8, 3.8), height + below + 0.35)
     total_w, total_h = figure.get_size_inches()
     axis = figure.add_axes((label / total_w, below / total_h, width_in / total_w, height / total_h))
     top = 100 * float(shares.max(initial=0.0)) or 100.0
@@ -307,16 +317,16 @@ def coverage_figure(model: UncertainLTI, checked: Sequence[Verdicts]) -> Any:
     matplotlib.figure.Figure
         Not written yet; see `save`.
     """
-    names = [_short(os.path.basename(v.transient.name) or v.transient.name, 40) for v in checked]
+    names = [short(os.path.basename(v.transient.name) or v.transient.name, 40) for v in checked]
     outside, of_any, judged = _outside(checked, model.n)
     rows = [f"{name}  ({_count(n)})" for name, n in zip(names, judged, strict=True)]
-    columns = [_short(name) for name in model.state_names]
+    columns = [short(name) for name in model.state_names]
     below, bars = max(_length(columns, len(columns)), 0.55), 2.6
     label = _length(rows, len(rows))
     cell = max(0.16, min(0.6, 9.0 / len(columns)))
     width = max(cell * len(columns), 0.6)
     height = (0.3 if len(rows) <= 15 else 0.2) * len(rows) + 0.1
-    figure = _figure(label + bars + 0.35 + width + 0.9, height + below + 0.75)
+    figure = new_figure(label + bars + 0.35 + width + 0.9, height + below + 0.75)
     total_w, total_h = figure.get_size_inches()
     axis = figure.add_axes((label / total_w, below / total_h, bars / total_w, height / total_h))
     places = np.arange(len(rows))
@@ -410,15 +420,6 @@ def _chosen(model: UncertainLTI, states: Sequence[str] | None) -> list[int]:
     return [model.state_names.index(name) for name in names]
 
 
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def _panels(count: int, height: float = 1.45) -> tuple[Any, list[Any]]:
     """One panel per state; many in two columns."""
     columns = 1 if count <= _FEW else 2
@@ -426,15 +427,15 @@ def _panels(count: int, height: float = 1.45) -> tuple[Any, list[Any]]:
     if columns == 2:
         height = min(height, 0.8)
     left, gap, top, bottom, title = 0.75, 0.75, 0.5, 0.5, 0.3
-    width = (_WIDTH - left - 0.15 - (columns - 1) * gap) / columns
-    figure = _figure(_WIDTH, top + bottom + rows * (height + title))
+    width = (WIDTH - left - 0.15 - (columns - 1) * gap) / columns
+    figure = new_figure(WIDTH, top + bottom + rows * (height + title))
     total = figure.get_size_inches()[1]
     axes: list[Any] = []
     for i in range(count):
         column, row = divmod(i, rows)
         x, y = left + column * (width + gap), bottom + (rows - 1 - row) * (height + title)
         axes.append(
-            figure.add_axes((x / _WIDTH, y / total, width / _WIDTH, height / total), sharex=axes[0] if axes else None)
+            figure.add_axes((x / WIDTH, y / total, width / WIDTH, height / total), sharex=axes[0] if axes else None)
         )
         last = row == rows - 1 or i == count - 1
         axes[-1].tick_params(labelbottom=last, labelsize=7)
@@ -446,12 +447,12 @@ def _panels(count: int, height: float = 1.45) -> tuple[Any, list[Any]]:
 def _utilisation_map(
     model: UncertainLTI, verdicts: Verdicts, chosen: Sequence[int], axis_time: TimeAxis, drawn: DrawnColumns
 ) -> Any:
-    names = [_short(model.state_names[i]) for i in chosen]
+    names = [short(model.state_names[i]) for i in chosen]
     label = _length(names, 0)
     height = 0.19 * len(names)
-    figure = _figure(_WIDTH, height + 1.35)
+    figure = new_figure(WIDTH, height + 1.35)
     total = figure.get_size_inches()[1]
-    axis = figure.add_axes((label / _WIDTH, 0.5 / total, (_WIDTH - label - 0.9) / _WIDTH, height / total))
+    axis = figure.add_axes((label / WIDTH, 0.5 / total, (WIDTH - label - 0.9) / WIDTH, height / total))
     edge = np.unique(drawn.edges)
     column = np.searchsorted(edge, drawn.edges[:, 0])
     values = np.full((len(chosen), max(len(edge) - 1, 1)), np.nan)
@@ -468,23 +469,11 @@ def _utilisation_map(
     axis.set_ylim(len(chosen), 0)
     axis.tick_params(axis="x", labelsize=7)
     axis.set_xlabel(axis_time.label, fontsize=8)
-    bar = figure.add_axes(((_WIDTH - 0.75) / _WIDTH, 0.5 / total, 0.15 / _WIDTH, height / total))
+    bar = figure.add_axes(((WIDTH - 0.75) / WIDTH, 0.5 / total, 0.15 / WIDTH, height / total))
     figure.colorbar(mesh, cax=bar, extend="max")
     bar.tick_params(labelsize=7)
     bar.set_title("|utilisation|", fontsize=7)
-    return _head(figure, verdicts, [_patch(VIOLATED, 1.0, "violated"), _patch("#FFFFFF", 1.0, "no verdict")])
-
-
-def _with_additive(model: UncertainLTI) -> tuple[Array, Array, list[str]]:
-    """Nominal elements and half-widths (n, columns), with what the model has of drift and noise."""
-    nominal, half = [model.A, model.B], [model.dA, model.dB]
-    columns = [_short(name) for name in (*model.state_names, *model.control_names)]
-    for term, centre, width in model.additive():
-        if centre.any() or width.any():
-            nominal.append(centre[:, None])
-            half.append(width[:, None])
-            columns.append(f"{term.nominal or term.half} ({term.word})")
-    return np.hstack(nominal), np.hstack(half), columns
+    return _head(figure, verdicts, [patch(VIOLATED, 1.0, "violated"), patch("#FFFFFF", 1.0, "no verdict")])
 
 
 def _name_cells(axis: Any, rows: Sequence[str], columns: Sequence[str]) -> None:
@@ -498,13 +487,7 @@ def _number_cells(axis: Any, values: Array, image: Any) -> None:
     for i, j in np.argwhere(values != 0.0):
         red, green, blue, _ = image.cmap(image.norm(values[i, j]))
         dark = 0.3 * red + 0.6 * green + 0.1 * blue < 0.5
-        axis.text(j, i, _brief(values[i, j]), ha="center", va="center", fontsize=6.5, color="w" if dark else "k")
-
-
-def _brief(value: float) -> str:
-    if 1e-3 <= abs(value) < 1e4:
-        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
-    return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+        axis.text(j, i, brief(values[i, j]), ha="center", va="center", fontsize=6.5, color="w" if dark else "k")
 
 
 def _limits(lower: Array, upper: Array) -> tuple[float, float]:
@@ -567,9 +550,9 @@ def _title(axis: Any, model: UncertainLTI, i: int, verdicts: Verdicts, drawn: Dr
     first = int(drawn.starts[0]) if len(drawn.starts) else 0
     bad = int((verdicts.flags[first : drawn.stop, i] == 1.0).sum())
     wide = axis.get_position().width > 0.6
-    text, size = _short(signal.name, 70 if wide else 30), 8 if wide else 7
+    text, size = short(signal.name, 70 if wide else 30), 8 if wide else 7
     if unit and signal.unit:
-        text += f" [{_plain(signal.unit)}]"
+        text += f" [{plain(signal.unit)}]"
     axis.set_title(text, loc="left", fontsize=size, pad=3)
     if bad:
         axis.set_title(f"violated {_count(bad)}", loc="right", fontsize=size, pad=3, color=VIOLATED)
@@ -600,7 +583,7 @@ def _finish_time(
             axis.axvline(event[0], color=RECORDED, linestyle="--", linewidth=1.0)
     if event is not None and axes:
         axes[0].annotate(
-            _plain(event[1]), (event[0], 1.0), xycoords=("data", "axes fraction"), xytext=(4, -10),
+            plain(event[1]), (event[0], 1.0), xycoords=("data", "axes fraction"), xytext=(4, -10),
             textcoords="offset points", fontsize=8,
         )  # fmt: skip
 
@@ -616,9 +599,9 @@ def _head(figure: Any, verdicts: Verdicts, handles: list[Any]) -> Any:
         if judged
         else "nothing is known"
     )
-    name = _short(os.path.basename(verdicts.transient.name) or verdicts.transient.name, 60)
+    name = short(os.path.basename(verdicts.transient.name) or verdicts.transient.name, 60)
     figure.text(
-        0.1 / _WIDTH,
+        0.1 / WIDTH,
         1 - 0.22 / total,
         f"{name}: {_count(judged)} verdict{'s' * (judged != 1)}, {outside_text}",
         fontsize=9,
@@ -630,28 +613,10 @@ def _head(figure: Any, verdicts: Verdicts, handles: list[Any]) -> Any:
     return figure
 
 
-def _patch(colour: str, alpha: float, label: str) -> Any:
-    from matplotlib.patches import Patch
-
-    return Patch(facecolor=colour, alpha=alpha, label=label, edgecolor="#999999", linewidth=0.3)
-
-
-def _line(colour: str, label: str, marker: str = "") -> Any:
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], color=colour, label=label, marker=marker, markersize=4, linewidth=0 if marker else 1)
-
-
 def _over(name: str) -> Any:
     from matplotlib import colormaps
 
     return colormaps[name].with_extremes(over=VIOLATED, bad="#FFFFFF")
-
-
-def _no_ticks() -> Any:
-    from matplotlib.ticker import NullLocator
-
-    return NullLocator()
 
 
 def _count(number: int) -> str:
@@ -662,13 +627,3 @@ def _count(number: int) -> str:
 def _length(names: Sequence[str], crowd: int) -> float:
     """Room for the longest of these, inches; less where there are many and they are written smaller."""
     return (0.06 if crowd <= _MANY else 0.048) * max(map(len, names), default=0) + 0.15
-
-
-def _plain(text: str) -> str:
-    """Text of a file, which is never a formula and never a line break."""
-    return " ".join(text.split()).replace("$", r"\$")
-
-
-def _short(text: str, longest: int = _LONGEST_NAME) -> str:
-    """A name of a file, with its middle left out where it is long."""
-    return _plain(shortened(" ".join(text.split()), longest))

@@ -18,6 +18,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.plain_data import finite_data, list_of, numbers_of
+from uncertain_lti.reports.regimes import block_facts, blocks_in_words
 from uncertain_lti.reports.reliance import answer, reasons
 from uncertain_lti.reports.tables import number, shortened
 
@@ -122,7 +123,13 @@ def _model(model: UncertainLTI, model_file: str | os.PathLike[str]) -> dict[str,
         ],
         "clock": model.sampling.clock,
         "dt_median": model.sampling.dt_median,
-        "eigenvalues": [[float(v.real), float(v.imag)] for v in model.eigenvalues()],
+        "scheduling": [
+            {"name": s.name, "unit": s.unit, "topic": s.topic, "field": s.field} for s in model.signals.scheduling
+        ],
+        "eigenvalues": [[float(v.real), float(v.imag)] for v in model.eigenvalues()] if model.schedule is None else [],
+        "schedule": "" if model.schedule is None else model.schedule.words,
+        "regimes": block_facts(model),
+        "regimes_in_words": blocks_in_words(model),
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from uncertain_lti.base.english import plural
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.reports.model_text import eigenvalues_text
+from uncertain_lti.reports.model_text import dynamics_text
 from uncertain_lti.reports.reliance import TOO_FEW_INSIDE
 from uncertain_lti.reports.tables import number, table
 from uncertain_lti.sampling.reading import unused
@@ -76,7 +76,7 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
         f"criterion {criterion}; additive: {facts['additive']}; {plural(facts['transitions'], 'transition')}, "
         f"{facts['violations']} outside, {_optimality_gap(facts)}",
         table(("one-step envelope", "mean width", "largest", "rms step", "range", "width/range"), rows),
-        f"eigenvalues of A [1/s]: {eigenvalues_text(model)}",
+        *dynamics_text(model),
     ]
     if "discarded" in facts:
         gone, before = facts["discarded"], facts["with_discarded"]["mean_width_recorded"]
@@ -119,7 +119,7 @@ def archive_text(model: UncertainLTI) -> str:
             f"{plural(facts['transitions'], 'transition')}, {facts['violations']} outside, {_optimality_gap(facts)}, "
             f"{plural(facts['solver']['passes'], 'pass')}",
             table(("one-step envelope", "mean width", "largest"), rows),
-            f"eigenvalues of A [1/s]: {eigenvalues_text(model)}",
+            *dynamics_text(model),
         ]
     )
 

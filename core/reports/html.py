@@ -22,6 +22,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.recording import Progress
 from uncertain_lti.reports import figures as plots
+from uncertain_lti.reports import schedule_figures
 from uncertain_lti.reports.findings import APART
 from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, WEIGHTS, YES
 from uncertain_lti.reports.tables import beyond, number, shortened
@@ -93,6 +94,7 @@ def html_report(
         partial(_first_screen, name, facts),
         *_recordings(model, checked, facts),
         partial(_tightness, model, checked, facts),
+        *([] if model.schedule is None else [partial(_regimes, model, facts)]),
         partial(_trust, facts),
         partial(_origin, facts),
     ]
@@ -148,8 +150,10 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
         f"<header><h1>{_text(name)}</h1>"
         f'<p class="soft">{_text(_summary(facts))}. Alarm rule: {_rule(rule)}, margin '
         f"{number(rule['margin'])}.</p>"
-        '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a><a href="#trust">How far to trust it'
-        '</a><a href="#origin">Where it comes from</a></nav></header>\n'
+        '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a>'
+        + '<a href="#regimes">Regimes</a>'
+        * bool(facts["model"]["regimes"])
+        + '<a href="#trust">How far to trust it</a><a href="#origin">Where it comes from</a></nav></header>\n'
         f'<div class="cards"><section class="card {tone[rely["answer"]]}"><h2>May I rely on it?</h2>'
         f'<p class="answer">{_ANSWER[rely["answer"]]}</p><ul>{listed}</ul></section>\n'
         f'<section class="card {look}"><h2>What happened?</h2><p class="answer">{what}</p><ul>{items}</ul></section>'
@@ -166,6 +170,8 @@ def _rule(rule: Mapping[str, Any]) -> str:
 def _summary(facts: Mapping[str, Any]) -> str:
     model = facts["model"]
     text = f"{plural(len(model['states']), 'state')}, {plural(len(model['controls']), 'control')}"
+    if model["schedule"]:
+        text += f"; {plural(len(model['regimes']), 'regime')} over {model['schedule']}"
     fit = model["fit"]
     if "criterion" in fit:
         text += f"; fitted by criterion {'(11)' if fit['criterion'] == 'lp' else '(10)'}"
@@ -216,6 +222,7 @@ def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]
         f"{facts['violated']} of them violated.{_text(silent)} "
         f"Outside the fitted ranges: {facts['outside_domain']}.</p>"
     )
+    parts += [f"<p>{_text(text)}.</p>" for text in facts["unknown"]]
     parts += [f'<p class="soft">{_text(note)}</p>' for note in facts["notes"][:5]]
     worst = sorted(model.state_names, key=lambda name: -states[name]["violations"])[:_MOST_STATES]
     shown = [name for name in model.state_names if name in worst]
@@ -324,8 +331,53 @@ def _tightness(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[
         parts.append(_figure(figure, "Which element contributes how much of the mean width of each state"))
     except ModelError:
         pass  # no transition: the reasons above say so
-    parts.append(_figure(plots.matrices_figure(model), "The matrices and their half-widths, for normalised quantities"))
+    if model.schedule is None:
+        figure = plots.matrices_figure(model)
+        parts.append(_figure(figure, "The matrices and their half-widths, for normalised quantities"))
     return "\n".join(parts)
+
+
+def _regimes(model: UncertainLTI, facts: Mapping[str, Any]) -> str:
+    """Data, widths and verdicts in each regime of a scheduled model, and its elements over the schedule."""
+    blocks, names = facts["model"]["regimes"], [state["name"] for state in facts["model"]["states"]]
+    parts = [
+        '<h2 id="regimes">Regimes</h2>',
+        f"<p>The model is scheduled on {_text(facts['model']['schedule'])}: between two knots its elements are "
+        "interpolated, and a mode has its own. A transition counts for the regime that has the largest weight.</p>",
+        *(f"<p>{_text(text)}.</p>" for text in facts["model"]["regimes_in_words"]),
+    ]
+    rows = []
+    for r, block in enumerate(blocks):
+        here = [recording["regimes"][r] for recording in facts["recordings"]]
+        judged, bad = sum(h["verdicts"] for h in here), sum(h["violated"] for h in here)
+        transitions = "unknown" if block["transitions"] is None else str(block["transitions"])
+        rows.append(
+            [
+                _text(block["regime"]),
+                transitions if block["known"] else '<b class="care">0, not visited</b>',
+                "" if block["tied_to"] is None else _text(blocks[block["tied_to"]]["regime"]),
+                str(judged),
+                f"{1 - bad / judged:.3%}" if judged else "-",
+                str(sum(h["unknown_regime"] for h in here)),
+                *(
+                    number(sum(w * n for w, n in _widths(here, name)) / judged if judged else None)
+                    for name in names[:_MOST_STATES]
+                ),
+            ]
+        )
+    widths = [f"{shortened(name)}: mean width here" for name in names[:_MOST_STATES]]
+    header = ("regime", "fitted transitions", "shares elements of", "verdicts", "inside", "unknown regime", *widths)
+    parts.append(_table(header, rows, left=(2,)))
+    figure = schedule_figures.regimes_figure(model)
+    parts.append(_figure(figure, "Regime by regime: data of the fit, mean one-step widths, time constants"))
+    figure = schedule_figures.elements_figure(model)
+    parts.append(_figure(figure, "Elements over the schedule with their half-widths, for normalised quantities"))
+    return "\n".join(parts)
+
+
+def _widths(regimes: Sequence[Mapping[str, Any]], name: str) -> list[tuple[float, int]]:
+    """Mean width of a state and verdicts, of each recording with some in a regime."""
+    return [(r["states"][name]["mean_width"], r["verdicts"]) for r in regimes if r["verdicts"]]
 
 
 def _trust(facts: Mapping[str, Any]) -> str:
@@ -390,18 +442,29 @@ def _origin(facts: Mapping[str, Any]) -> str:
     rows += [["checked", _text(f["file"]), _code(f["sha256"])] for r in facts["recordings"] for f in r["files"]]
     signals = [
         [kind, _text(s["name"]), _text(s["unit"] or "-"), _text(s["topic"] or "-"), _code(s["field"])]
-        for kind, group in (("state", model["states"]), ("control", model["controls"]))
+        for kind, group in (
+            ("state", model["states"]),
+            ("control", model["controls"]),
+            ("scheduling", model["scheduling"]),
+        )
         for s in group
     ]
     origin = {**model["fit"], "clock": model["clock"] or "-", "median step [s]": number(model["dt_median"])}
     about = [[_text(key), _text(number(v) if isinstance(v, float) else v)] for key, v in origin.items()]
-    eigenvalues = ", ".join(f"{a:.4g}{b:+.4g}j" if b else f"{a:.4g}" for a, b in model["eigenvalues"])
+    sets = [("", model["eigenvalues"]), *((block["regime"], block["eigenvalues"]) for block in model["regimes"])]
+    eigenvalues = [
+        f"<p>Eigenvalues of A{_text(f' at {where}' if where else '')} [1/s]: "
+        + ", ".join(f"{a:.4g}{b:+.4g}j" if b else f"{a:.4g}" for a, b in pairs)
+        + "</p>"
+        for where, pairs in sets[:_MOST_ROWS]
+        if pairs
+    ]
     return "\n".join(
         [
             '<h2 id="origin">Where it comes from</h2>',
             _table(("what", "file", "sha256"), rows, left=(1, 2), most=300),
             _table(("fit", ""), about, left=(1,)),
-            f"<p>Eigenvalues of A [1/s]: {_text(eigenvalues)}</p>",
+            *eigenvalues,
             _table(("signal", "name", "unit", "topic", "field"), signals, left=(1, 2, 3, 4), most=300),
         ]
     )

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.reports.regimes import MOST_REGIMES, block_facts, blocks_in_words
 from uncertain_lti.reports.tables import number, table
 
 
@@ -38,25 +42,15 @@ def model_text(model: UncertainLTI) -> str:
             number(float(signal.scale)),
             signal.unit or "-",
         ]
-        for kind, group in (("state", model.signals.states), ("control", model.signals.controls))
+        for kind, group in (
+            ("state", model.signals.states),
+            ("control", model.signals.controls),
+            ("scheduling", model.signals.scheduling),
+        )
         for signal in group
     ]
     lines.append(table(("signal", "topic", "field", "steady", "scale", "unit"), signals))
-    names = [*model.state_names, *model.control_names]
-    nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
-    shown = [
-        (term.nominal or f"{term.half} ({term.word})", np.column_stack(pair))
-        for term, *pair in model.additive()
-        if np.any(pair)
-    ]
-    rows = [
-        [name]
-        + [f"{nominal[i, j]:.4g} ± {half[i, j]:.3g}" for j in range(len(names))]
-        + [f"{pair[i, 0]:.4g} ± {pair[i, 1]:.3g}" for _, pair in shown]
-        for i, name in enumerate(model.state_names)
-    ]
-    lines.append(table(("A, B [1/s]", *names, *(name for name, _ in shown)), rows))
-    lines.append(f"eigenvalues of A [1/s]: {eigenvalues_text(model)}")
+    lines += _scheduled_text(model) if model.schedule is not None else [_elements(model), *dynamics_text(model)]
     if facts.get("mean_width_recorded"):
         widths = [
             [name, number(a), number(b)]
@@ -73,19 +67,118 @@ def model_text(model: UncertainLTI) -> str:
     return "\n".join(lines + [f"note: {message}" for message in facts.get("messages", [])])
 
 
-def eigenvalues_text(model: UncertainLTI) -> str:
-    """Eigenvalues of A in one line.
+MOST_PRINTED = 12
+"""Blocks whose elements are printed."""
+
+
+def _elements(model: UncertainLTI, title: str = "A, B [1/s]") -> str:
+    """Elements of one block with their half-widths."""
+    names = [*model.state_names, *model.control_names]
+    nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
+    shown = [
+        (term.nominal or f"{term.half} ({term.word})", np.column_stack(pair))
+        for term, *pair in model.additive()
+        if np.any(pair)
+    ]
+    rows = [
+        [name]
+        + [f"{nominal[i, j]:.4g} ± {half[i, j]:.3g}" for j in range(len(names))]
+        + [f"{pair[i, 0]:.4g} ± {pair[i, 1]:.3g}" for _, pair in shown]
+        for i, name in enumerate(model.state_names)
+    ]
+    return table((title, *names, *(name for name, _ in shown)), rows)
+
+
+def _scheduled_text(model: UncertainLTI) -> list[str]:
+    """Regimes, then the elements of each block that has some of its own."""
+    lines = regimes_text(model)
+    own = [r for r, data in enumerate(model.block_data) if data.tied_to is None]
+    lines += [_elements(model.blocks[r], f"{model.block_name(r)}: A, B [1/s]") for r in own[:MOST_PRINTED]]
+    if (more := len(own) - MOST_PRINTED) > 0:
+        lines.append(f"  and the elements of {plural(more, 'more regime')}; --json has all")
+    return lines
+
+
+def regimes_text(model: UncertainLTI) -> list[str]:
+    """The regimes of a scheduled model: data, mean widths when fitted, eigenvalues and time constants.
 
     Parameters
     ----------
     model : UncertainLTI
-        Any model.
+        The model.
+
+    Returns
+    -------
+    list of str
+        A heading, tables, and what to know of regimes with little data; empty without a schedule.
+    """
+    if model.schedule is None:
+        return []
+    blocks = block_facts(model)
+    widths = any(block["mean_width"] for block in blocks)
+    header = ["regime", "transitions", "elements of"]
+    header += [f"{name}: mean width" for name in model.state_names] * widths
+    rows = []
+    for block in blocks[:MOST_REGIMES]:
+        transitions = "unknown" if block["transitions"] is None else str(block["transitions"])
+        row = [block["regime"], transitions if block["known"] else "0, not visited"]
+        row.append("its own" if block["tied_to"] is None else blocks[block["tied_to"]]["regime"])
+        row += [number(w) for w in block["mean_width"] or [None] * model.n] * widths
+        rows.append(row)
+    lines = [
+        f"scheduled on {model.schedule.words}, {plural(model.schedule.blocks, 'regime')}",
+        table(header, rows),
+        table(
+            ("regime", "eigenvalues of A [1/s]", "time constants [s]"),
+            [
+                [b["regime"], _eigenvalues(b["eigenvalues"]), ", ".join(_constant(v) for v in b["time_constants"])]
+                for b in blocks[:MOST_REGIMES]
+            ],
+        ),
+    ]
+    if (more := len(blocks) - MOST_REGIMES) > 0:
+        lines.append(f"  and {plural(more, 'more regime')}; --json has all")
+    return lines + [f"note: {text}" for text in blocks_in_words(model)]
+
+
+def _constant(value: float | None) -> str:
+    return "grows" if value is None else number(value)
+
+
+def eigenvalues_text(model: UncertainLTI) -> str:
+    """Eigenvalues of A of a model without a schedule in one line.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Without a schedule; `regimes_text` has those of every block.
 
     Returns
     -------
     str
         Numbers with four digits, 1/s.
     """
+    return _eigenvalues([[float(v.real), float(v.imag)] for v in model.eigenvalues()])
+
+
+def _eigenvalues(pairs: Sequence[Sequence[float]]) -> str:
     return ", ".join(
-        f"{v.real:.4g}{v.imag:+.4g}j" if abs(v.imag) > 1e-12 * abs(v) else f"{v.real:.4g}" for v in model.eigenvalues()
+        f"{real:.4g}{imag:+.4g}j" if abs(imag) > 1e-12 * math.hypot(real, imag) else f"{real:.4g}"
+        for real, imag in pairs
     )
+
+
+def dynamics_text(model: UncertainLTI) -> list[str]:
+    """How fast a fitted model is: eigenvalues in one line, or the regimes of a scheduled model.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+
+    Returns
+    -------
+    list of str
+        Lines.
+    """
+    return regimes_text(model) or [f"eigenvalues of A [1/s]: {eigenvalues_text(model)}"]

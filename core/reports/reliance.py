@@ -9,7 +9,9 @@ from typing import Any
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.reports.check_data import UNVOUCHED
 from uncertain_lti.reports.plain_data import list_of, numbers_of
+from uncertain_lti.reports.regimes import blocks_in_words
 from uncertain_lti.reports.tables import number, shortened
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
@@ -61,6 +63,7 @@ def reasons(
     return [
         *_fit_reasons(model),
         *_stability_reasons(model),
+        *_regime_reasons(model, recordings),
         *_validation_reasons(validation, model),
         *_width_reasons(model, recordings),
         *_recording_reasons(model, recordings, validation),
@@ -105,6 +108,24 @@ def _stability_reasons(model: UncertainLTI) -> list[dict[str, str]]:
         return []  # the fit reports it
     text = f"the nominal model runs away: a deviation can grow {number(radius)} times in a step (spectral radius)"
     return [_reason(CARE, "stability", text)]
+
+
+def _regime_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Regimes with little data, and verdicts in regimes that no recording of the fit visited."""
+    said = " ".join(str(message) for message in list_of(model.fit_summary.get("messages")))
+    found = [] if "too little data for elements" in said else blocks_in_words(model)  # else the fit reports it
+    reasons = [_reason(CARE, "regimes", text) for text in found]
+    judged = sum(r["verdicts"] for r in recordings)
+    unknown = sum(r["unknown_regime"] for r in recordings)
+    if judged and unknown:
+        why = "; ".join(dict.fromkeys(text for r in recordings for text in r["unknown"]))
+        text = (
+            f"{_percent(unknown / judged)} of the verdicts are in regimes that no recording of the fit visited: {why}"
+        )
+        reasons.append(_reason(UNKNOWN if unknown > UNVOUCHED * judged else CARE, "regimes", text))
+    elif strange := list(dict.fromkeys(text for r in recordings for text in r["unknown"])):
+        reasons.append(_reason(CARE, "regimes", "; ".join(strange)))
+    return reasons
 
 
 def _validation_reasons(validation: Mapping[str, Any] | None, model: UncertainLTI) -> list[dict[str, str]]:

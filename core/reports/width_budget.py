@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, Transitions
+
+_AT_ONCE = 65536  # transitions
 
 
 def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[Array, Array, list[str]]:
     """Which element contributes how much of the mean one-step width.
 
-    Columns are states, controls, and what the model has of drift and noise.
+    Columns are states, controls, and what the model has of drift and noise. The elements of a scheduled model are those
+    of its blocks, blended as in the bounds; a sample of a mode that is not listed has no width.
 
     Parameters
     ----------
@@ -38,19 +42,21 @@ def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[
     ModelError
         No recording has a usable transition.
     """
-    point = model.operating_point
-    additive = [(term, half) for term, _, half in model.additive()]
-    total, count = np.zeros(model.n + model.m + len(additive)), 0
+    additive = [(term, np.atleast_2d(half)) for term, _, half in model.additive()]
+    blocks = len(model.blocks)
+    total, count = np.zeros((blocks, model.n + model.m + len(additive))), 0
     for transient in transients:
         steps = transient.transitions()
-        if not len(steps.k):
-            continue
-        count += len(steps.k)
-        z = np.abs(np.hstack([point.normalise_x(steps.x), point.normalise_u(steps.u)]))
-        total += [*(steps.dt @ z), *(steps.dt.sum() if term.times_dt else len(steps.k) for term, _ in additive)]
+        for start in range(0, len(steps.k), _AT_ONCE):
+            weights, part = _weights(model, steps.take(_slice(len(steps.k), start)))
+            count += len(part.dt)
+            z = np.abs(model.normalised_columns(part)[: model.n + model.m])
+            sums = [weights @ part.dt if term.times_dt else weights.sum(axis=1) for term, _ in additive]
+            total += np.column_stack([(weights * part.dt) @ z.T, *sums])
     if not count:
         raise ModelError("no recording has a usable transition, so there is no width to share out")
-    parts = 2.0 * np.hstack([model.dA, model.dB, *(half[:, None] for _, half in additive)]) * (total / count)
+    halves = [array.reshape(blocks, model.n, -1) for array in (model.dA, model.dB, *(half for _, half in additive))]
+    parts = 2.0 * (np.concatenate(halves, axis=2) * (total / count)[:, None, :]).sum(axis=0)
     columns = [*model.state_names, *model.control_names]
     kept = list(range(model.n + model.m))
     for place, (term, half) in enumerate(additive, start=len(kept)):
@@ -59,4 +65,19 @@ def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[
             columns.append(term.word)
     width = parts.sum(axis=1)
     shares = np.divide(parts, width[:, None], out=np.zeros_like(parts), where=width[:, None] > 0)
-    return shares[:, kept], width * point.X, columns
+    return shares[:, kept], width * model.operating_point.X, columns
+
+
+def _slice(count: int, start: int) -> NDArray[np.bool_]:
+    """Which of some transitions are among `_AT_ONCE` from one on."""
+    place = np.arange(count)
+    return (start <= place) & (place < start + _AT_ONCE)
+
+
+def _weights(model: UncertainLTI, steps: Transitions) -> tuple[Array, Transitions]:
+    """Weights (blocks, K) of those transitions that have a block, and these."""
+    if model.schedule is None:
+        return np.ones((1, len(steps.dt))), steps
+    weights = model.schedule.weights(model.normalised_columns(steps)[list(model.scheduling_positions)])
+    listed = ~np.isnan(weights[0])
+    return weights[:, listed], steps.take(listed)

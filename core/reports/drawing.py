@@ -1,0 +1,180 @@
+"""Pieces that figures share: colours, names, numbers, legends, and the elements of a model as columns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.reports.tables import shortened
+
+ENVELOPE, RECORDED, VIOLATED, ALARM, NO_VERDICT = "#56B4E9", "#000000", "#D55E00", "#F0E442", "#999999"
+"""Distinguished by colour-blind people (Okabe and Ito 2008)."""
+
+WIDTH = 10.0
+"""Of a figure, inches."""
+
+LONGEST_NAME = 34
+"""Letters of a name that are drawn."""
+
+
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure that no window shows.
+
+    Parameters
+    ----------
+    width : float
+        Inches.
+    height : float
+        Inches.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Without axes.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def elements(model: UncertainLTI) -> tuple[Array, Array, list[str]]:
+    """Elements of A and B side by side, with what the model has of drift and noise.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+
+    Returns
+    -------
+    nominal, half : array (n, columns), or (R, n, columns) with a schedule
+        Nominal elements and half-widths.
+    columns : list of str
+        What each column multiplies.
+    """
+    nominal, half = [model.A, model.B], [model.dA, model.dB]
+    columns = [short(name) for name in (*model.state_names, *model.control_names)]
+    for term, centre, width in model.additive():
+        if centre.any() or width.any():
+            nominal.append(centre[..., None])
+            half.append(width[..., None])
+            columns.append(f"{term.nominal or term.half} ({term.word})")
+    return np.concatenate(nominal, axis=-1), np.concatenate(half, axis=-1), columns
+
+
+def brief(value: float) -> str:
+    """A number in few letters.
+
+    Parameters
+    ----------
+    value : float
+        Any.
+
+    Returns
+    -------
+    str
+        Three digits, or one with an exponent.
+    """
+    if 1e-3 <= abs(value) < 1e4:
+        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def patch(colour: str, alpha: float, label: str) -> Any:
+    """Entry of a legend for an area.
+
+    Parameters
+    ----------
+    colour : str
+        Of the area.
+    alpha : float
+        Its opacity.
+    label : str
+        What it means.
+
+    Returns
+    -------
+    matplotlib.patches.Patch
+        The entry.
+    """
+    from matplotlib.patches import Patch
+
+    return Patch(facecolor=colour, alpha=alpha, label=label, edgecolor="#999999", linewidth=0.3)
+
+
+def line(colour: Any, label: str, marker: str = "", edge: str | None = None) -> Any:
+    """Entry of a legend for a line, or for a mark.
+
+    Parameters
+    ----------
+    colour : str or tuple
+        Of the line.
+    label : str
+        What it means.
+    marker : str, default ""
+        The mark, in place of a line.
+    edge : str, optional
+        Colour of the edge of the mark; default its own.
+
+    Returns
+    -------
+    matplotlib.lines.Line2D
+        The entry.
+    """
+    from matplotlib.lines import Line2D
+
+    width = 0 if marker else 1
+    return Line2D([], [], color=colour, label=label, marker=marker, markersize=4, linewidth=width, mec=edge or colour)
+
+
+def no_ticks() -> Any:
+    """No ticks on an axis.
+
+    Returns
+    -------
+    matplotlib.ticker.NullLocator
+        For `set_minor_locator`.
+    """
+    from matplotlib.ticker import NullLocator
+
+    return NullLocator()
+
+
+def plain(text: str) -> str:
+    """Text of a file, which is never a formula and never a line break.
+
+    Parameters
+    ----------
+    text : str
+        Any.
+
+    Returns
+    -------
+    str
+        For matplotlib.
+    """
+    return " ".join(text.split()).replace("$", r"\$")
+
+
+def short(text: str, longest: int = LONGEST_NAME) -> str:
+    """A name of a file, with its middle left out where it is long.
+
+    Parameters
+    ----------
+    text : str
+        Any.
+    longest : int, default LONGEST_NAME
+        Letters at most.
+
+    Returns
+    -------
+    str
+        For matplotlib.
+    """
+    return plain(shortened(" ".join(text.split()), longest))

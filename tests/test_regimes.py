@@ -1,0 +1,345 @@
+"""Scheduled models: every command and report works with them, says what each regime rests on, and draws it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_writer import Message, Topic, cdr, write
+from engine_bag import joint_state
+from test_html_report import Page, needs_nothing_else
+from test_schedule import GEAR, SPEED
+from test_schedule import scheduled as by_hand
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.cli.main import main
+from uncertain_lti.model.domain import Sampling
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.reports.figures import budget_figure, matrices_figure, save
+from uncertain_lti.reports.regimes import block_facts, check_regimes, unknown_in_words
+from uncertain_lti.reports.reliance import CARE, UNKNOWN
+from uncertain_lti.reports.schedule_figures import elements_figure, regimes_figure
+from uncertain_lti.reports.width_budget import width_budget
+from uncertain_lti.sampling.status import Status
+from uncertain_lti.signals.signal_map import Signal, SignalMap
+
+START = 10**18  # ns
+STEP = 50_000_000  # ns
+COUNT = 240
+BESIDE = Axis("gear", modes=(1.0, 2.0))
+
+CASES = {
+    "knots": Schedule((SPEED,)),
+    "modes": Schedule((GEAR,)),
+    "two axes": Schedule((SPEED, BESIDE)),
+}
+
+
+def signal_map(schedule: Schedule) -> SignalMap:
+    """Two states and a control on two topics, and the gear on a third."""
+    further = [axis.signal for axis in schedule.axes if axis.signal == "gear"]
+    return SignalMap(
+        (
+            Signal("speed", "/state", "position[speed]", 3.0, 2.0, "m/s", "sensor_msgs/msg/JointState"),
+            Signal("b", "/state", "position[b]", unit="K", type="sensor_msgs/msg/JointState"),
+        ),
+        (Signal("c", "/control", "position[c]", type="sensor_msgs/msg/JointState"),),
+        tuple(Signal(name, "/gear", "data", type="std_msgs/msg/Float64") for name in further),
+        clock="/state",
+        max_gap=0.2,
+        max_skew=0.2,
+        time={"/state": "header", "/control": "header"} | ({"/gear": "log"} if further else {}),
+    )
+
+
+def model_of(case: str, **changes: Any) -> UncertainLTI:
+    """The first block was never visited, the second has elements of its own, of the others one is tied to it."""
+    schedule = CASES[case]
+    model = by_hand(np.random.default_rng(len(case)), schedule, ("gear",) * (schedule.axes[-1].signal == "gear"))
+    R = schedule.blocks
+    signals, names = signal_map(schedule), ("A", "B", "c")
+    small: dict[str, Any] = {name: 0.3 * getattr(model, name) for name in names}
+    small["A"] = small["A"] - 1.5 * np.eye(2)
+    facts = {
+        "mean_width_recorded": [0.2, 0.1],
+        "max_width_recorded": [0.3, 0.2],
+        "blocks": [{"mean_width": [0.1 + r, 0.2], "max_width": [0.2 + r, 0.3]} if r else {} for r in range(R)],
+    }
+    return model.replace(
+        **small,
+        signals=signals,
+        sampling=Sampling(
+            signals.clock or "", "sensor_msgs/msg/JointState", signals.time, 0.05, 0.05, 0.05, 0.2, 0.0, 0.2
+        ),
+        block_data=[BlockData(100 * r, 1 if r in (0, R - 1) else None) for r in range(R)],
+        fit_summary=facts,
+        **changes,
+    )
+
+
+def arrays(strange: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, u and gear over all regimes; strange: a gear that no model lists, and a speed beyond the knots."""
+    k = np.arange(COUNT)
+    x = np.column_stack([3.0 + 1.9 * np.sin(k / 30.0), 0.2 * np.cos(k / 11.0)])
+    gear = 1.0 + (k // 80) % 2
+    if strange:
+        gear[200:210] = 7.0
+        x[220:, 0] += 10.0
+    return x, 0.1 * np.sin(k / 7.0)[:, None], gear
+
+
+def recording(path: Path, strange: bool = False) -> Path:
+    x, u, gear = arrays(strange)
+    messages = []
+    for k, t in enumerate((START + STEP * np.arange(COUNT)).tolist()):
+        messages.append(Message("/gear", t, cdr("std_msgs/msg/Float64", data=float(gear[k])), t))
+        messages.append(Message("/control", t, joint_state(["c"], u[k], t), t))
+        messages.append(Message("/state", t, joint_state(["speed", "b"], x[k], t), t + 1))
+    types = {"/state": "sensor_msgs/msg/JointState", "/control": "sensor_msgs/msg/JointState"}
+    topics = [Topic(name, kind) for name, kind in {**types, "/gear": "std_msgs/msg/Float64"}.items()]
+    return Path(write(topics, messages).save(path))
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def checked(model: UncertainLTI, strange: bool = False) -> Verdicts:
+    x, u, gear = arrays(strange)
+    t = START + STEP * np.arange(COUNT)
+    s = gear[:, None] if model.q else None
+    return EnvelopeMonitor(model).check(Transient(t, x, u, s=s, signals=model.signals, max_gap=0.2))
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:
+    status = main([str(a) for a in arguments])
+    captured = capsys.readouterr()
+    assert status in (0, 1), captured.err
+    return status, captured.out
+
+
+# --- commands ----------------------------------------------------------------------------------------------------
+
+
+def test_info_shows_every_regime(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = model_of(case)
+    model.save(tmp_path / "m.json")
+    status, text = run(capsys, "info", tmp_path / "m.json")
+    assert status == 0
+    for r in range(len(model.blocks)):
+        assert model.block_name(r) in text
+    assert "0, not visited" in text and "time constants [s]" in text and "b: mean width" in text
+    assert f"no recording visited 1 regime of {len(model.blocks)}" in text
+    assert f"{model.block_name(len(model.blocks) - 1)} (as {model.block_name(1)})" in text
+    for name in model.signals.signals:
+        assert name.name in text
+    status, text = run(capsys, "info", tmp_path / "m.json", "--json")
+    data = json.loads(text)
+    regimes = data.pop("regimes")
+    assert UncertainLTI.from_dict(data).to_dict() == model.to_dict()
+    assert [r["regime"] for r in regimes] == [model.block_name(r) for r in range(len(model.blocks))]
+    for r, block in enumerate(model.blocks):
+        values = np.array([complex(*pair) for pair in regimes[r]["eigenvalues"]])
+        np.testing.assert_allclose(values, block.eigenvalues())
+        assert regimes[r]["transitions"] == 100 * r and regimes[r]["known"] == bool(r)
+        assert math.isclose(-1.0 / regimes[r]["time_constants"][0], values[0].real)
+    assert regimes[0]["mean_width"] is None and regimes[1]["mean_width"] == [2 * 1.1, 0.2]
+
+
+def test_check_counts_by_regime(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = model_of(case)
+    model.save(tmp_path / "m.json")
+    bag = recording(tmp_path / "strange.mcap", strange=True)
+    _, text = run(capsys, "check", tmp_path / "m.json", bag)
+    _, out = run(capsys, "check", tmp_path / "m.json", bag, "--json")
+    (data,) = json.loads(out)["recordings"]
+    here = data["regimes"]
+    assert len(here) == len(model.blocks)
+    assert sum(r["verdicts"] for r in here) == data["verdicts"] and sum(r["violated"] for r in here) == data["violated"]
+    assert sum(r["unknown_regime"] for r in here) == data["unknown_regime"] > 0
+    samples = data["verdict_per_sample"]
+    for r, regime in enumerate(here):
+        mine = [s for s in samples if s["regime"] == r]
+        assert len(mine) == regime["verdicts"]
+        assert sum(1 in s["flags"] for s in mine) == regime["violated"]
+        assert sum(s["unknown_regime"] for s in mine) == regime["unknown_regime"]
+        for i, name in enumerate(model.state_names):
+            width = [s["upper"][i] - s["lower"][i] for s in mine]
+            assert regime["states"][name]["violations"] == sum(s["flags"][i] == 1 for s in mine)
+            if mine:
+                assert math.isclose(regime["states"][name]["mean_width"], np.mean(width), rel_tol=1e-12)
+        if mine:
+            assert regime["regime"] in text
+    words = " ".join(data["unknown"])
+    assert words and all(word in text for word in data["unknown"])
+    modes = sum(s["status"] == Status.MODE.value for s in samples)
+    if case != "knots":
+        assert modes == 10 and f"{modes} mode not in the model" in text and "10 samples with 7 have no verdict" in words
+    if case != "modes":
+        assert "speed is beyond its knots, 2 to 5 m/s, in" in words
+    assert f"no recording visited {model.block_name(0)}" in words
+
+
+def test_an_annotated_recording_gives_the_same_verdicts(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = model_of(case)
+    model.save(tmp_path / "m.json")
+    bag = recording(tmp_path / "run.mcap", strange=True)
+    run(capsys, "check", tmp_path / "m.json", bag, "--write", tmp_path / "copy.mcap")
+    one, other = (
+        json.loads(run(capsys, "check", tmp_path / "m.json", path, "--json")[1])["recordings"][0]
+        for path in (bag, tmp_path / "copy.mcap")
+    )
+    assert one["verdict_per_sample"] == other["verdict_per_sample"] and one["regimes"] == other["regimes"]
+    assert one["unknown_regime"] and one["verdicts"] == other["verdicts"] > 100
+
+
+def test_the_report_has_every_regime(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = model_of(case)
+    model.save(tmp_path / "m.json")
+    bags = [recording(tmp_path / "run.mcap"), recording(tmp_path / "strange.mcap", strange=True)]
+    out = tmp_path / "page.html"
+    run(capsys, "report", tmp_path / "m.json", *bags, "--output", out)
+    page = Page(out.read_text(encoding="utf-8"))
+    needs_nothing_else(page)
+    text = " ".join(page.text)
+    for r in range(len(model.blocks)):
+        assert model.block_name(r) in text and f"Eigenvalues of A at {model.block_name(r)}" in text
+    assert "Regimes" in text and "0, not visited" in text and "Regime by regime" in text
+    for signal in model.signals.scheduling:
+        assert "scheduling" in text and signal.name in text
+    _, printed = run(capsys, "report", tmp_path / "m.json", *bags, "--json")
+    facts = json.loads(printed)
+    assert len(facts["model"]["regimes"]) == len(model.blocks) and facts["model"]["eigenvalues"] == []
+    reasons = [r for r in facts["rely"]["reasons"] if r["about"] == "regimes"]
+    assert any("no recording visited" in r["text"] for r in reasons)
+    assert {r["weight"] for r in reasons} <= {CARE, UNKNOWN}
+
+
+def test_layouts_notebooks_and_texts(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = model_of(case)
+    model.save(tmp_path / "m.json")
+    assert main(["layout", str(tmp_path / "m.json"), "--foxglove", str(tmp_path / "l.json")]) == 0
+    shown = model._repr_html_()
+    for r in range(len(model.blocks)):
+        assert model.block_name(r) in shown
+    assert f"{len(model.blocks)} blocks over" in repr(model)
+    assert "violations" in checked(model)._repr_html_()
+
+
+# --- facts -------------------------------------------------------------------------------------------------------
+
+
+def test_the_budget_is_the_width_that_a_check_gives(case: str) -> None:
+    model = model_of(case)
+    verdicts = checked(model, strange=True)
+    shares, width, columns = width_budget(model, [verdicts.transient])
+    judged = (verdicts.upper - verdicts.lower)[verdicts.judged]
+    np.testing.assert_allclose(width, judged.mean(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0)
+    assert columns == ["speed", "b", "c", "drift", "noise"]
+
+
+def test_a_regime_holds_the_block_with_the_largest_weight(case: str) -> None:
+    model = model_of(case)
+    rng = np.random.default_rng(0)
+    z = np.vstack([rng.uniform(-1, 2, (3, 500)), rng.integers(1, 3, (model.q, 500))])
+    dense = CASES[case].weights(z[list(model.scheduling_positions)])
+    np.testing.assert_array_equal(model.main_block(z), dense.argmax(axis=0))
+    z[list(model.scheduling_positions)] = math.nan
+    assert (model.main_block(z) == -1).all()
+
+
+def test_of_a_known_regime_there_is_nothing_to_say() -> None:
+    model = model_of("knots").replace(block_data=[BlockData(50)] * 3)
+    x, u, _ = arrays(strange=False)
+    x[:, 0] = np.clip(x[:, 0], 2.0, 5.0)
+    verdicts = EnvelopeMonitor(model).check(Transient(STEP * np.arange(COUNT), x, u, signals=model.signals))
+    assert unknown_in_words(model, verdicts) == []
+    assert sum(r["unknown_regime"] for r in check_regimes(model, verdicts)) == 0
+    one = model.blocks[0]
+    assert check_regimes(one, EnvelopeMonitor(one).check(verdicts.transient)) == [] == block_facts(one)
+
+
+def test_what_the_file_says_of_its_blocks_may_be_anything() -> None:
+    model = model_of("knots")
+    for said in (None, 7, [3, "a"], [{"mean_width": "wide"}] * 3, [{"mean_width": [1.0]}] * 9, {"a": 1}):
+        facts = block_facts(model.replace(fit_summary={"blocks": said}))
+        assert [f["mean_width"] for f in facts] == [None] * 3
+        regimes_figure(model.replace(fit_summary={"blocks": said}))
+
+
+# --- figures -----------------------------------------------------------------------------------------------------
+
+LONG = "x_$the$_total <pressure>\nbehind_the_high_pressure_compressor_état_"
+
+
+def sized(blocks: tuple[int, ...], n: int = 2, modes: bool = False) -> UncertainLTI:
+    rng = np.random.default_rng(sum(blocks))
+    axes = tuple(
+        Axis(f"{LONG}{k}", **{"modes" if modes else "knots": tuple(np.linspace(-1, 1, count))})
+        for k, count in enumerate(blocks)
+    )
+    R = math.prod(blocks)
+    signals = SignalMap(
+        tuple(Signal(f"{LONG}{i}", "", "x", unit="$kPa$") for i in range(n)), (Signal("push", "", "u"),)
+    )
+    return UncertainLTI(
+        rng.normal(size=(R, n, n)), rng.normal(size=(R, n, 1)), rng.random((R, n, n)), rng.random((R, n, 1)),
+        rng.normal(size=(R, n)), rng.random((R, n)), rng.random((R, n)), schedule=Schedule(axes), signals=signals,
+        block_data=[BlockData(r % 5 * 40, 0 if r == 1 else None) for r in range(R)],
+        fit_summary={"blocks": [{"mean_width": rng.random(n).tolist()} for _ in range(R)]},
+    )  # fmt: skip
+
+
+SIZES = [
+    ((1,), 2, True), ((2,), 2, False), ((12,), 6, False), ((12,), 2, True), ((200,), 3, False), ((3, 2), 2, False),
+    ((3, 2), 6, True), ((12, 12), 2, False), ((40, 3), 9, False),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("blocks", "n", "modes"), SIZES)
+def test_every_size_can_be_drawn(blocks: tuple[int, ...], n: int, modes: bool, tmp_path: Path) -> None:
+    model = sized(blocks, n, modes)
+    for k, make in enumerate((elements_figure, regimes_figure)):
+        figure = make(model)
+        width, height = figure.get_size_inches()
+        assert width <= 16 and height <= 40
+        save(figure, tmp_path / f"{k}.png", 50)
+        figure.canvas.draw()
+        for axis in figure.axes:  # nothing is cut off below or on the left
+            box = axis.get_tightbbox()
+            assert box.x0 >= -3 and box.y0 >= -3, (axis.get_title("left"), box)
+
+
+def test_panels_show_the_elements_with_their_half_widths() -> None:
+    model = model_of("knots")
+    figure = elements_figure(model)
+    assert len(figure.axes) == 2 * 5
+    first = figure.axes[0]
+    nominal = next(line for line in first.lines if len(line.get_xdata()) == 3)
+    np.testing.assert_allclose(nominal.get_xdata(), [2.0, 3.0, 5.0])
+    np.testing.assert_allclose(nominal.get_ydata(), model.A[:, 0, 0])
+    band = first.collections[0].get_paths()[0].vertices
+    for r, at in enumerate((2.0, 3.0, 5.0)):
+        there = band[np.isclose(band[:, 0], at), 1]
+        assert math.isclose(there.max(), model.A[r, 0, 0] + model.dA[r, 0, 0])
+        assert math.isclose(there.min(), model.A[r, 0, 0] - model.dA[r, 0, 0])
+
+
+def test_the_figures_of_other_models_take_these_too(tmp_path: Path) -> None:
+    model = model_of("two axes")
+    assert len(matrices_figure(model).axes) == len(elements_figure(model).axes)
+    save(budget_figure(model, [checked(model).transient]), tmp_path / "b.png", 40)
+    with pytest.raises(ModelError, match="no schedule"):
+        elements_figure(model.blocks[0])
+    with pytest.raises(ModelError, match="no schedule"):
+        regimes_figure(model.blocks[0])
