@@ -467,7 +467,8 @@ def folder(tmp_path):
 
 def fitted(folder):
     bags = [str(folder / f"run{seed}.mcap") for seed in range(6)]
-    return main(["fit", *bags, "--signals", str(folder / "signals.yaml"), "--output", str(folder / "m.json")])
+    options = ["--signals", str(folder / "signals.yaml"), "--output", str(folder / "m.json"), "--force"]
+    return main(["fit", *bags, *options])
 
 
 def test_fit_prints_and_stores_what_leaving_out_gives(folder, capsys):
@@ -558,7 +559,7 @@ def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
         bags[-1].write_bytes(content[:header] + record + content[header:-37])
         assert metadata_pairs(bags[-1]) == {"machine": f"M{seed // 2}", "about/machine": f"M{seed // 2}"}
     model = str(folder / "grouped.json")
-    command = ["fit", *map(str, bags), "--signals", str(folder / "signals.yaml"), "--output", model]
+    command = ["fit", *map(str, bags), "--signals", str(folder / "signals.yaml"), "--output", model, "--force"]
     capsys.readouterr()
     assert main([*command]) == 0
     assert "lie in 3 folders" in capsys.readouterr().out
