@@ -11,14 +11,17 @@ import pytest
 from bag_writer import Message, Topic, cdr, header, write
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import Transient, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import BagError, ModelError, SignalError, TransientError
 from uncertain_lti.cli.main import COMMANDS, main
 from uncertain_lti.identification.archive import fit_archive
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.sampling.instants import LONGEST_NS, to_ns
 from uncertain_lti.sampling.reading import read_transients
+from uncertain_lti.sampling.sampler import Step
+from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import SignalMap
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -310,3 +313,30 @@ def test_recorded_values_whose_squares_overflow_are_refused_by_a_fit(folder, tmp
     assert main(line) == 2
     assert f"'fan' reaches {abs(value):.3g}" in capsys.readouterr().err
     assert main(["check", str(folder / "m.model.json"), str(path)]) == 1
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e308, -1e308, 1e160, 1e51])
+def test_a_value_that_the_bounds_cannot_carry_has_no_verdict_live_as_offline(value):
+    """What arrives there is judged by bounds that are numbers; what starts there is not judged."""
+    rng = np.random.default_rng(0)
+    x, u = np.cumsum(0.01 * rng.standard_normal((300, 2)), axis=0), rng.standard_normal((300, 1))
+    model = fit(Transient(np.arange(300) * 0.01, x, u), additive="noise")
+    x[100, 0] = u[200, 0] = value
+    run = Transient(np.arange(300) * 0.01, x, u)
+    monitor = EnvelopeMonitor(model)
+    verdicts = monitor.check(run)
+    assert np.flatnonzero(~verdicts.judged).tolist() == [0, 101, 201]
+    assert verdicts.flags[100, 0] == 1.0 and np.isfinite(verdicts.lower[verdicts.judged]).all()
+    assert {verdicts.statuses()[k] for k in (101, 201)} == {Status.MISSING}
+    for k in (99, 100, 101, 200, 201):
+        before = [*x[k - 1].tolist(), *u[k - 1].tolist()]
+        live = monitor.judge(Step(Status.OK, int(run.t_ns[k]), 0, float(run.dt[k - 1]), before, x[k].tolist()))
+        assert live.status is verdicts.statuses()[k]
+        for name in ("flags", "lower", "upper", "utilisation"):
+            assert np.array_equal(getattr(live, name), getattr(verdicts, name)[k], equal_nan=True), (k, name)
+
+
+def test_a_duration_beyond_64_bits_is_the_longest():
+    assert to_ns(1e308) == to_ns(np.float64(1e300)) == to_ns(1e10) == to_ns(np.inf) == LONGEST_NS
+    assert to_ns(-1e308) == -LONGEST_NS and to_ns(1.5) == 1_500_000_000

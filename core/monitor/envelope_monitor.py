@@ -15,6 +15,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
+from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.bounds import (
     FLAGS,
@@ -260,6 +261,9 @@ class Verdicts:
             model lists no such mode.
         """
         kinds = self.transient.statuses()
+        for k in np.flatnonzero(~self.judged):
+            if kinds[k] is Status.OK:  # but for the two below, a value is beyond what the arithmetic carries
+                kinds[k] = Status.MISSING
         for which, kind in ((self.unfitted_step, Status.STEP), (self.unlisted_mode, Status.MODE)):
             for k in np.flatnonzero(which):
                 kinds[k] = kind
@@ -433,6 +437,8 @@ class EnvelopeMonitor:
             return Verdict(step, window.alarm, None)
         if not contained(self._shortest, step.dt, self._longest):
             return Verdict(step, window.alarm, None, Status.STEP)
+        if not -LARGEST <= min(step.before) <= max(step.before) <= LARGEST:  # the bounds would be no numbers
+            return Verdict(step, window.alarm, None, Status.MISSING)
         judgement = self._judge.judge(step.before, step.after, step.dt)
         if judgement is None:
             return Verdict(step, window.alarm, None, Status.MODE)
@@ -477,6 +483,10 @@ class EnvelopeMonitor:
         if not fitted.all():
             unfitted_step[steps.k[~fitted] + 1] = True
             steps = steps.take(fitted)
+        sizes = [np.abs(values).max(axis=1, initial=0.0) for values in (steps.x, steps.u, steps.s)]
+        carried = np.asarray(np.max(sizes, axis=0) <= LARGEST)
+        if not carried.all():
+            steps = steps.take(carried)
         listed, unknown = model.regime(model.normalised_columns(steps))
         if not listed.all():
             unlisted_mode[steps.k[~listed] + 1] = True
@@ -485,9 +495,10 @@ class EnvelopeMonitor:
         flags, lower = np.full((count, n), np.nan), np.full((count, n), np.nan)
         upper, utilisation = np.full((count, n), np.nan), np.full((count, n), np.nan)
         judged, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
-        flags[arrival], low, high, utilisation[arrival] = self._judge_all(z, steps.dt, x_next)
-        lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
+        with np.errstate(over="ignore", invalid="ignore"):  # a value far beyond its bounds is beyond all numbers
+            z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
+            flags[arrival], low, high, utilisation[arrival] = self._judge_all(z, steps.dt, x_next)
+            lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
         judged[arrival] = True
         unknown_regime = np.zeros(count, dtype=bool)
         unknown_regime[arrival] = unknown

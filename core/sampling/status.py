@@ -12,7 +12,7 @@ class Status(StrEnum):
     FIRST = "first"  # first sample of a recording
     RESET = "reset"  # time stepped back by more than max_gap: first sample of a new segment
     GAP = "gap"  # the step is longer than max_gap: first sample of a new segment
-    MISSING = "missing"  # a signal at either end is missing, stale, NaN or infinite
+    MISSING = "missing"  # a signal at either end is missing, stale, not finite, or too large for the bounds
     STEP = "step out of range"  # the step is shorter or longer than those that the model was fitted to
     MODE = "mode not in the model"  # the scheduling signal has a value that the model does not list
     EQUAL = "equal stamp"  # dropped: the instant of the sample before
