@@ -66,7 +66,7 @@ def validate(
     progress : callable, optional
         Called with one line of text per fit.
     **options : object
-        Further arguments of `fit`.
+        Further arguments of `fit`. Every fit has the schedule of the fit to all recordings, with its knots.
 
     Returns
     -------
@@ -83,10 +83,13 @@ def validate(
         raise FitError(f"confidence is {confidence:g}; it must be at least 0.5 and below 1")
     if blocks is not None and blocks < 2:
         raise FitError(f"blocks is {blocks}; at least 2 are needed to leave one out")
+    if full is not None and options.get("schedule") is not None:
+        raise FitError("full has its own schedule, which every fit is given; leave schedule out")
     if full is None:
         full = fit(transients, weights=weights, operating_point=operating_point, alarm_rule=alarm_rule, **options)
     elif alarm_rule is not None:
         full = full.replace(alarm_rule=alarm_rule)
+    options["schedule"] = full.schedule or {}  # none, even where the signals file asks for one
     if groups is not None and blocks is not None:
         raise FitError("groups leave out whole recordings, and blocks cut them; choose one")
     names, grouping = resolve_groups(transients, groups)

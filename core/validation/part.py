@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,6 +48,8 @@ class Part:
         The mean over that of the full model on the same samples.
     group : str
         What was left out together with it; "" if it was left out alone.
+    block : array (K,) of int, optional
+        Block of the full model that has the largest weight at each judged transition; 0 without a schedule.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Part:
     max_width: Array
     relative_width: Array
     group: str = ""
+    block: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
@@ -177,6 +180,7 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         np.full(n, np.nan) if empty else width.max(axis=0),
         np.full(n, np.nan) if empty else width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
         group,
+        full.main_block(full.normalised_columns(steps)),
     )
 
 

@@ -1,0 +1,585 @@
+"""Choice of a schedule: how many knots the recordings carry, by what is left out of the fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import fit
+from uncertain_lti.identification.regimes import Knots
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.validation.blocks import BLOCKS, block_spans, guard_interval
+from uncertain_lti.validation.groups import resolve_groups
+from uncertain_lti.validation.left_out import validate
+from uncertain_lti.validation.part import by_unit, unit_numbers
+from uncertain_lti.validation.result import Validation
+
+COUNTS = (1, 2, 3, 5)
+"""Numbers of knots that are tried, ..."""
+FURTHER = (7, 9)
+"""... and those that follow while the last one tried is the best so far."""
+FOLDS = 10
+"""Times that something is left out, at most; of more recordings or groups, neighbours are left out together."""
+SLACK = 0.25
+"""Share of what one knot leaves outside of a left-out part by which more may be outside: the other recordings do not
+represent such a part, and the narrower an envelope is, the more of it is outside."""
+EXCESS = 0.005
+"""Share of all left-out transitions that may be outside beyond that."""
+PAYS = 0.9
+"""Mean width relative to one knot from which on more knots are worth having."""
+WANTED = 5
+"""Recordings that should visit each range of the scheduling signal."""
+FINEST = 1e-6
+"""Width, relative to the range of its state, below which an envelope is no narrower than another."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """How recordings are left out, the same way for every candidate.
+
+    Parameters
+    ----------
+    groups : list of str or None
+        One name per recording, where whole groups are left out.
+    blocks : int or None
+        Blocks of a single recording.
+    gap : float or None
+        Guard interval of the blocks, s.
+    what : str
+        What is left out at a time: recording, group or block.
+    """
+
+    groups: list[str] | None
+    blocks: int | None
+    gap: float | None
+    what: str
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One number of knots, judged on what was left out of its fits.
+
+    Parameters
+    ----------
+    count : int
+        Knots of the signal.
+    model : UncertainLTI or None
+        Fitted to everything; None where there is no such fit.
+    refused : str
+        Why there is none, or why nothing could be left out of it.
+    judged : array (units,)
+        Left-out transitions of each recording, group or block.
+    outside : array (units,)
+        Those outside the bounds of some state.
+    log_width : array (units,)
+        Logarithm of the mean width relative to one knot, the mean over the states.
+    visits : array (blocks, units)
+        Left-out transitions nearest to each knot.
+    block_outside : array (blocks,)
+        Those of them outside.
+    """
+
+    count: int
+    model: UncertainLTI | None = None
+    refused: str = ""
+    judged: Array = field(default_factory=lambda: np.zeros(0))
+    outside: Array = field(default_factory=lambda: np.zeros(0))
+    log_width: Array = field(default_factory=lambda: np.zeros(0))
+    visits: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    block_outside: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def share(self) -> float:
+        """Share of the left-out transitions outside."""
+        return float(self.outside.sum() / self.judged.sum()) if self.judged.sum() else math.nan
+
+    def more_outside(self, base: Candidate) -> tuple[float, float]:
+        """Share outside beyond that of another candidate, with its standard error.
+
+        Parameters
+        ----------
+        base : Candidate
+            The other, on the same left-out transitions.
+
+        Returns
+        -------
+        float
+            Difference of the shares.
+        float
+            Standard error over what was left out.
+        """
+        return _jackknife(self.outside - base.outside, self.judged)
+
+    def excess(self, base: Candidate) -> float:
+        """Share outside beyond what may be, summed over the left-out parts in which there is any.
+
+        Parameters
+        ----------
+        base : Candidate
+            One knot, on the same left-out transitions.
+
+        Returns
+        -------
+        float
+            Of all left-out transitions.
+        """
+        beyond = np.maximum(self.outside - (1.0 + SLACK) * base.outside, 0.0)
+        return float(beyond.sum() / max(self.judged.sum(), 1.0))
+
+    @property
+    def width(self) -> tuple[float, float]:
+        """Logarithm of the mean width relative to one knot, with its standard error."""
+        return _jackknife(self.log_width * self.judged, self.judged)
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The number of knots that the recordings carry on one signal.
+
+    Parameters
+    ----------
+    signal : str
+        Name of the signal.
+    candidates : tuple of Candidate
+        All that were tried, one knot first.
+    chosen : Candidate
+        The one taken.
+    what : str
+        What was left out at a time.
+    reason : str
+        Why, in words.
+    record : str
+        What to record so that more knots are carried; empty where that would not help.
+    """
+
+    signal: str
+    candidates: tuple[Candidate, ...]
+    chosen: Candidate
+    what: str
+    reason: str
+    record: str
+
+    def facts(self) -> dict[str, Any]:
+        """As plain data for `fit_summary`.
+
+        Returns
+        -------
+        dict
+            The table with its errors, the choice, the reason, and what to record.
+        """
+        base = self.candidates[0]
+        rows = []
+        for c in self.candidates:
+            row: dict[str, Any] = {"knots": c.count}
+            if c.model is not None:
+                row["at"] = knots_of(c.model, self.signal)
+            if c.refused:
+                rows.append({**row, "refused": c.refused})
+                continue
+            more, more_error = c.more_outside(base)
+            width, width_error = c.width
+            rows.append(
+                {
+                    **row,
+                    "outside": c.share,
+                    "more_outside": more,
+                    "more_outside_error": more_error,
+                    "excess": c.excess(base),
+                    "width": math.exp(width),
+                    "width_error": math.exp(width) * width_error,
+                }
+            )
+        return {
+            "signal": self.signal,
+            "left_out": self.what,
+            "units": len(base.judged),
+            "candidates": rows,
+            "chosen": self.chosen.count,
+            "reason": self.reason,
+            "record": self.record,
+        }
+
+
+class Trials:
+    """Numbers of knots, judged one after the other on the same left-out parts.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    others : mapping, optional
+        Scheduling signals with their knots or modes, which every candidate has.
+    groups : sequence or str, optional
+        As in `validate`.
+    folds : int, optional
+        Times that something is left out, at most.
+    progress : callable, optional
+        Called with one line of text per candidate.
+    **options : object
+        Further arguments of `fit`.
+
+    Raises
+    ------
+    FitError
+        No model can be fitted at all.
+    """
+
+    def __init__(
+        self,
+        transients: Sequence[Transient],
+        others: Mapping[str, Knots] | None = None,
+        *,
+        groups: Sequence[Any] | str | None = None,
+        folds: int = FOLDS,
+        progress: Callable[[str], None] | None = None,
+        **options: Any,
+    ) -> None:
+        self.transients, self.others, self.options, self.progress = transients, dict(others or {}), options, progress
+        model = fit(transients, schedule=self.others, describe_data=False, **options)
+        self._baseline: Validation | None = None
+        try:
+            self.fold = _fold(transients, groups, model, folds)
+        except FitError as error:
+            self.fold = Fold(None, None, None, "recording")
+            self.base = Candidate(1, model, str(error))
+        else:
+            self.base = self._left_out(1, model)
+
+    def candidate(self, signal: str, count: int) -> Candidate:
+        """One number of knots on one signal.
+
+        Parameters
+        ----------
+        signal : str
+            A state, a control or a further scheduling signal.
+        count : int
+            Number of knots, 2 or more.
+
+        Returns
+        -------
+        Candidate
+            What it is worth.
+        """
+        if self.progress is not None:
+            self.progress(f"{plural(count, 'knot')} on {signal}")
+        try:
+            model = fit(self.transients, schedule={signal: count, **self.others}, describe_data=False, **self.options)
+        except FitError as error:
+            return Candidate(count, None, str(error))
+        if tied := sum(data.tied_to is not None for data in model.block_data):
+            return Candidate(
+                count, model, f"{tied} of {plural(len(model.block_data), 'block')} would have too little data"
+            )
+        return self._left_out(count, model)
+
+    def _left_out(self, count: int, model: UncertainLTI) -> Candidate:
+        options = {k: v for k, v in self.options.items() if k != "operating_point"}  # that of the model is taken
+        fold = self.fold
+        try:
+            left = validate(
+                self.transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap, **options
+            )
+        except FitError as error:
+            return Candidate(count, model, str(error))
+        self._baseline = self._baseline or left
+        return _judged(count, model, left, self._baseline)
+
+
+def choose_knots(
+    transients: Sequence[Transient],
+    signal: str,
+    others: Mapping[str, Knots] | None = None,
+    *,
+    groups: Sequence[Any] | str | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Choice:
+    """How many knots the recordings carry on one signal: the simplest within the error of the best.
+
+    Each number of COUNTS, and those of FURTHER while the last one is the best, is fitted to all recordings, which
+    places the knots, and then without each recording, group, or block of a single recording, which is judged.
+    Coverage comes first: a number is refused if more than EXCESS of the left-out transitions are outside beyond
+    1 + SLACK times those of one knot in the same part. Of those whose mean width (geometric over states and left-out
+    parts) is at most PAYS of one knot's, the one with the least width is the best, and the fewest knots within one
+    standard error of it are chosen; the standard error is that of the jackknife over what was left out.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    signal : str
+        A state, a control or a further scheduling signal.
+    others : mapping, optional
+        Another scheduling signal with its knots or modes, which every candidate has.
+    groups : sequence or str, optional
+        As in `validate`.
+    progress : callable, optional
+        Called with one line of text per candidate.
+    **options : object
+        Further arguments of `fit`.
+
+    Returns
+    -------
+    Choice
+        The choice with its table.
+
+    Raises
+    ------
+    FitError
+        No model can be fitted at all.
+    """
+    trials = Trials(transients, others, groups=groups, progress=progress, **options)
+    candidates = [trials.base]
+    for count in (*COUNTS[1:], *FURTHER):
+        if candidates[-1].refused or (count in FURTHER and candidates[-1] is not best_of(candidates)):
+            break  # more knots would be refused likewise, or are worth nothing
+        candidates.append(trials.candidate(signal, count))
+    return decide(signal, candidates, trials)
+
+
+def knots_of(model: UncertainLTI, signal: str) -> list[float]:
+    """Knots of one scheduling signal in recorded units.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        With a schedule or without.
+    signal : str
+        Name of the signal.
+
+    Returns
+    -------
+    list of float
+        Empty if the model is not scheduled on it.
+    """
+    if model.schedule is None:
+        return []
+    named = {s.name: s for s in model.signals.signals}
+    steady, scale = float(named[signal].steady), float(named[signal].scale)
+    return [steady + scale * v for axis in model.schedule.axes if axis.signal == signal for v in axis.values]
+
+
+def _fold(transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI, folds: int) -> Fold:
+    """What is left out at a time."""
+    names, _ = resolve_groups(transients, groups)
+    if not names and len(transients) == 1:
+        usable = int(transients[0].usable.sum())
+        blocks = max(2, min(BLOCKS, folds, usable // 2))
+        spans = [(transients[0], *span) for span in block_spans(transients[0], blocks)]
+        return Fold(None, blocks, guard_interval(base, spans), "block")
+    what = "group" if names else "recording"
+    each = names or [str(i) for i in range(len(transients))]
+    units = list(dict.fromkeys(each))
+    if len(units) <= folds:
+        return Fold(names or None, None, None, what)
+    joined = {units[k]: str(i) for i, part in enumerate(np.array_split(np.arange(len(units)), folds)) for k in part}
+    return Fold([joined[name] for name in each], None, None, f"{folds}th part of the {what}s")
+
+
+def _judged(count: int, model: UncertainLTI, left: Validation, base: Validation) -> Candidate:
+    parts = left.parts
+    judged = np.array([part.judged for part in parts], dtype=np.float64)
+    span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    floor = np.maximum(FINEST * span, 1e-300)
+    ratios = np.array(
+        [
+            np.mean(np.log(np.maximum(mine.mean_width, floor) / np.maximum(one.mean_width, floor)))
+            if mine.judged
+            else 0.0
+            for mine, one in zip(parts, base.parts, strict=True)
+        ]
+    )
+    units = by_unit(parts, judged)
+    numbers = unit_numbers(parts)
+    blocks = 1 if model.schedule is None else model.schedule.blocks
+    visits, outside = np.zeros((blocks, len(units))), np.zeros(blocks)
+    for part, unit in zip(parts, numbers, strict=True):
+        visits[:, unit] += np.bincount(part.block, minlength=blocks)
+        outside += np.bincount(part.block[part.severity > 1.0], minlength=blocks)
+    return Candidate(
+        count,
+        model,
+        "",
+        units,
+        by_unit(parts, [part.violated for part in parts]),
+        by_unit(parts, judged * ratios) / np.maximum(units, 1.0),
+        visits,
+        outside,
+    )
+
+
+def _jackknife(sums: Array, counts: Array) -> tuple[float, float]:
+    """Σ sums / Σ counts, with its standard error over the units."""
+    total = counts.sum()
+    value = float(sums.sum() / total) if total else math.nan
+    rest = total - counts
+    there = (counts > 0) & (rest > 0)
+    if there.sum() < 2:
+        return value, math.inf
+    without = (sums.sum() - sums[there]) / rest[there]
+    number = len(without)
+    return value, float(np.sqrt((number - 1) / number * np.sum((without - without.mean()) ** 2)))
+
+
+def _admissible(candidate: Candidate, base: Candidate) -> bool:
+    """Whether its coverage does not speak against it."""
+    return not candidate.refused and candidate.excess(base) <= EXCESS
+
+
+def best_of(candidates: Sequence[Candidate]) -> Candidate:
+    """The least width among those that cover as well as one knot and whose widths pay; else one knot.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+        One knot first.
+
+    Returns
+    -------
+    Candidate
+        One of them.
+    """
+    base = candidates[0]
+    good = [c for c in candidates[1:] if _admissible(c, base) and c.width[0] <= math.log(PAYS)]
+    return min(good, key=lambda c: c.width[0], default=base)
+
+
+def decide(signal: str, candidates: Sequence[Candidate], trials: Trials) -> Choice:
+    """The simplest candidate within the error of the best, with the reason.
+
+    Parameters
+    ----------
+    signal : str
+        Name of the signal.
+    candidates : sequence of Candidate
+        One knot first, then more and more.
+    trials : Trials
+        That judged them.
+
+    Returns
+    -------
+    Choice
+        The choice.
+    """
+    base, best = candidates[0], best_of(candidates)
+    chosen = best
+    if best is not base:
+        limit = min(sum(best.width), math.log(PAYS))
+        chosen = next(c for c in candidates[1:] if _admissible(c, base) and c.width[0] <= limit)
+    reason = _reason(candidates, best, chosen)
+    narrow = [c for c in candidates[1:] if not c.refused and c.width[0] <= math.log(PAYS) and not _admissible(c, base)]
+    short = [c for c in candidates[1:] if c.refused and c.model is not None]
+    wanted = narrow or short
+    record = ""
+    if chosen is base and wanted:
+        record = _record(signal, min(wanted, key=lambda c: c.share) if narrow else wanted[0], trials)
+    return Choice(signal, tuple(candidates), chosen, trials.fold.what, reason, record)
+
+
+def _reason(candidates: Sequence[Candidate], best: Candidate, chosen: Candidate) -> str:
+    """Why this one, in words."""
+    base = candidates[0]
+    if base.refused:
+        return f"nothing can be left out: {base.refused}"
+    if chosen is not base:
+        inside, one = f"{1 - chosen.share:.4g}", f"{1 - base.share:.4g}"
+        text = (
+            f"on left-out data the mean width is x {math.exp(chosen.width[0]):.2g} of one knot's, with "
+            f"{float(inside):.2%} inside, where one knot has {float(one):.2%}"
+        )
+        if chosen is not best:
+            text += f"; {best.count} knots, x {math.exp(best.width[0]):.2g}, are within its error"
+        return text
+    judged = [c for c in candidates[1:] if not c.refused]
+    if not judged:
+        return candidates[1].refused if len(candidates) > 1 else "no other was tried"
+    narrow = [c for c in judged if c.width[0] <= math.log(PAYS)]
+    if not narrow:
+        least = min(judged, key=lambda c: c.width[0])
+        return (
+            f"on left-out data the mean width with {least.count} knots is x {math.exp(least.width[0]):.2g} of one "
+            f"knot's, which does not pay"
+        )
+    nearest = min(narrow, key=lambda c: c.share)
+    return (
+        f"with {nearest.count} knots {nearest.share:.1%} of the left-out transitions are outside, where one knot has "
+        f"{base.share:.1%}: the recordings do not carry them"
+    )
+
+
+def ranges(candidate: Candidate, signal: str, trials: Trials) -> list[dict[str, Any]]:
+    """What the recordings hold of the signal, knot by knot.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        With a model; where nothing was left out of it, its own recordings are counted.
+    signal : str
+        Name of the signal.
+    trials : Trials
+        That judged it.
+
+    Returns
+    -------
+    list of dict
+        `from`, `to` (recorded units), `recordings` that are there with as many transitions as a row has unknowns, and
+        the share `outside` of what was left out there (None where it is not known).
+    """
+    model = candidate.model
+    assert model is not None and model.schedule is not None
+    axis = [a.signal for a in model.schedule.axes].index(signal)
+    at = knots_of(model, signal)
+    edges = [at[0], *(0.5 * (a + b) for a, b in zip(at, at[1:], strict=False)), at[-1]]
+    place = np.array([index[axis] for index in model.schedule.indices])
+    enough = 2 * (model.n + model.m)
+    there = np.zeros(len(at), dtype=int)
+    for transient in trials.transients:
+        blocks = model.main_block(model.normalised_columns(transient.transitions()))
+        there += np.bincount(place[blocks[blocks >= 0]], minlength=len(at)) >= enough
+    rows = []
+    for k in range(len(at)):
+        visits = float(candidate.visits[place == k].sum()) if len(candidate.visits) else 0.0
+        rows.append(
+            {
+                "from": edges[k],
+                "to": edges[k + 1],
+                "recordings": int(there[k]),
+                "outside": float(candidate.block_outside[place == k].sum() / visits) if visits else None,
+            }
+        )
+    return rows
+
+
+def _record(signal: str, candidate: Candidate, trials: Trials) -> str:
+    """What to record, so that this candidate is carried."""
+    rows = ranges(candidate, signal, trials)
+    bad = [r for r in rows if r["recordings"] < WANTED or (r["outside"] or 0.0) > EXCESS]
+    if not bad or candidate.model is None:
+        return ""
+    unit = next(s.unit for s in candidate.model.signals.signals if s.name == signal)
+    number = len(trials.transients)
+    words, last = [], -2
+    spans: list[list[Any]] = []
+    for i, row in enumerate(rows):
+        if row not in bad:
+            continue
+        if i == last + 1:
+            spans[-1][1] = row["to"]
+            spans[-1][2] = min(spans[-1][2], row["recordings"])
+        else:
+            spans.append([row["from"], row["to"], row["recordings"]])
+        last = i
+    for low, high, count in spans:
+        words.append(
+            f"{low:.5g} to {high:.5g}{' ' + unit if unit else ''} in at least {max(2, WANTED - count)} more recordings "
+            f"({count} of {number} {'is' if count == 1 else 'are'} there)"
+        )
+    return f"to carry more knots, record {signal} from {', and from '.join(words)}, moving otherwise than in these"
