@@ -8,10 +8,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from uncertain_lti.identification import fit as fit
     from uncertain_lti.model.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.model.uncertain_lti import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor as EnvelopeMonitor
+    from uncertain_lti.proposal.fitting import fit as fit
     from uncertain_lti.sampling.reading import read_transients as read_transients
     from uncertain_lti.sampling.transient import Transient as Transient
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
@@ -25,7 +25,7 @@ _HOME = {
     "SignalMap": "signals.signal_map",
     "Transient": "sampling.transient",
     "UncertainLTI": "model.uncertain_lti",
-    "fit": "identification",
+    "fit": "proposal.fitting",
     "read_transients": "sampling.reading",
     "validate": "validation.left_out",
 }

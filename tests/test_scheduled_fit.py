@@ -363,7 +363,6 @@ def test_a_knot_without_a_schedule_is_refused():
     "schedule, words",
     [
         ({"u7": 3}, "no signal 'u7'; did you mean u"),
-        ({"u1": "auto"}, "chooses none"),
         ({"u1": "three"}, "'three'"),
         ({"u1": 0}, "at least 1"),
         ({"u1": True}, "at least 1"),

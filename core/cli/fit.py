@@ -49,6 +49,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=CHOICES,
         help="further terms: drift with its half-width, measurement noise (default: the signals file's, else none)",
     )
+    parser.add_argument(
+        "--schedule",
+        type=_schedule,
+        action="append",
+        metavar="SIGNAL[=auto|N|a,b,...|modes:a,b,...]",
+        help="piecewise-linear over this signal: as many knots as the recordings carry (auto, the default), N knots, "
+        "knots or modes in recorded units; once or twice (default: what the signals file says)",
+    )
+    parser.add_argument(
+        "--no-suggest",
+        action="store_true",
+        help="do not try, on a part of the recordings (some 4000 transitions), whether a schedule would pay",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
         "--discard",
@@ -91,7 +104,8 @@ def run(options: argparse.Namespace) -> int:
     """
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
-    from uncertain_lti.reports.fit_text import fit_text, next_text, recording_text
+    from uncertain_lti.proposal.fitting import asked_for, is_auto
+    from uncertain_lti.reports.fit_text import fit_text, next_text, recording_text, schedule_text
     from uncertain_lti.reports.validation_text import left_out_text
     from uncertain_lti.validation.fitted_model import leave_out_with_fit
     from uncertain_lti.validation.groups import resolve_groups
@@ -101,17 +115,24 @@ def run(options: argparse.Namespace) -> int:
         raise FitError(f"--workers is {options.workers}; give 1 or more")
     if options.cache or options.scheduler or options.workers:
         return _fit_archive(options, output)
+    schedule = _asked(options)
     transients = read_transients(options.bags, options.signals, options.progress.iterate("reading"), processes=None)
     for transient in transients:
         if not options.json:
             print_notes(options, transient.notes)
         print_summary(options, recording_text(transient))
     resolve_groups(transients, options.group)  # what is wrong with the key is found before the fit
+    suggest = not options.no_suggest
+    asked = asked_for(transients, schedule)
+    leaves_out = is_auto(asked) if asked else suggest
     with options.progress.stage("fitting") as step:
         model = fit(
             transients,
             options.criterion,
             additive=options.additive,
+            schedule=schedule,
+            groups=options.group if leaves_out else None,
+            suggest=suggest,
             discard=options.discard,
             count=options.count,
             seek_carriers=True,
@@ -130,6 +151,8 @@ def run(options: argparse.Namespace) -> int:
         data = model.to_dict()
         print_json({"model": str(output), "fit": data["fit"], "validation": data["validation"]})
     else:
+        for choice in model.fit_summary.get("schedule", []):
+            print_summary(options, schedule_text(choice))
         print_summary(options, fit_text(model, transients))
         print_summary(options, left_out_text(left_out))
         print_summary(options, f"model written to {output}")
@@ -146,6 +169,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
 
     if options.discard:
         raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
+    schedule = _asked(options)
     if options.group is not None:
         raise FitError("--group needs all recordings in memory; leave out --cache, --scheduler and --workers")
     if options.count != "sample":
@@ -168,6 +192,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
                 options.signals,
                 options.criterion,
                 options.additive,
+                schedule=schedule,
                 cache=options.cache,
                 client=client,
                 progress=step,
@@ -196,6 +221,39 @@ def _local_cluster(dask: Any, workers: int) -> Any:
             dashboard_address=None,
             silence_logs=logging.CRITICAL,  # of work that is broken off; what goes wrong comes back as an error
         )
+
+
+def _asked(options: argparse.Namespace) -> dict[str, Any] | None:
+    """The schedule of the command line, checked against the signals file before anything is read."""
+    if not options.schedule:
+        return None
+    from uncertain_lti import SignalMap
+    from uncertain_lti.identification.regimes import Modes, check_names
+
+    names = [name for name, *_ in options.schedule]
+    for name in names:
+        if names.count(name) > 1:
+            raise FitError(f"--schedule names '{name}' twice; give each scheduling signal once")
+    check_names(names, [s.name for s in SignalMap.load(options.signals).signals])
+    return {name: Modes(values) if kind == "modes" else values for name, kind, values in options.schedule}
+
+
+def _schedule(text: str) -> tuple[str, str, Any]:
+    """A signal with its knots, how many, auto, or its modes."""
+    name, given, knots = text.rpartition("=") if "=" in text else (text, "", "auto")
+    if not name or (given and not knots):
+        raise argparse.ArgumentTypeError(f"{text!r} is no schedule; write SIGNAL, SIGNAL=3 or SIGNAL=0.2,0.5,0.9")
+    if knots == "auto":
+        return name, "knots", knots
+    kind, values = ("modes", knots[6:]) if knots.startswith("modes:") else ("knots", knots)
+    try:
+        if kind == "knots" and "," not in values:
+            return name, kind, int(values)
+        return name, kind, [float(v) for v in values.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{knots!r} is neither auto, a number of knots, knots such as 0.2,0.5,0.9 nor modes such as modes:1,2,3"
+        ) from None
 
 
 def _budget(text: str) -> float:

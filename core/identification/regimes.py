@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem, Regimes
-from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.model.schedule import MOST_AXES, Axis, BlockData, Schedule
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 LOOKED_AT = 20_000
@@ -218,6 +218,47 @@ def place(schedule: Schedule, block: int, signals: Sequence[Signal]) -> str:
     return ", ".join(parts)
 
 
+def asked_by(signals: SignalMap) -> dict[str, Knots]:
+    """The schedule that a signals file asks for.
+
+    Parameters
+    ----------
+    signals : SignalMap
+        The signals.
+
+    Returns
+    -------
+    dict
+        Scheduling signals with their knots, "auto" as it is, or their modes; empty for one block.
+    """
+    return {rule.signal: Modes(rule.modes) if rule.knots is None else rule.knots for rule in signals.schedule}
+
+
+def check_names(schedule: Iterable[str], names: Sequence[str]) -> None:
+    """Check that there are one or two scheduling signals at most, and that they exist.
+
+    Parameters
+    ----------
+    schedule : iterable of str
+        Their names.
+    names : sequence of str
+        Names of all signals.
+
+    Raises
+    ------
+    FitError
+        There are more, or there is no such signal; names those that are near.
+    """
+    asked = list(schedule)
+    if len(asked) > MOST_AXES:
+        raise FitError(f"schedule: {plural(len(asked), 'scheduling signal')}; give one or two")
+    for name in asked:
+        if name not in names:
+            near = difflib.get_close_matches(str(name), names, 3, 0.5)
+            there = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names)}"
+            raise FitError(f"schedule: there is no signal '{name}'; {there}")
+
+
 def scheduled_by(
     schedule: Schedule | Mapping[str, Knots] | None,
     signals: SignalMap,
@@ -246,7 +287,7 @@ def scheduled_by(
         names the signal.
     """
     if schedule is None:
-        schedule = {rule.signal: Modes(rule.modes) if rule.knots is None else rule.knots for rule in signals.schedule}
+        schedule = asked_by(signals)
     if isinstance(schedule, Schedule):
         return schedule
     if not isinstance(schedule, Mapping):
@@ -255,17 +296,14 @@ def scheduled_by(
             f"units, Modes, or how many knots"
         )
     names = [s.name for s in signals.signals]
+    check_names(schedule, names)
     asked: dict[str, Knots] = {}
     for name, knots in schedule.items():
-        if name not in names:
-            near = difflib.get_close_matches(str(name), names, 3, 0.5)
-            there = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names)}"
-            raise FitError(f"schedule: there is no signal '{name}'; {there}")
         if isinstance(knots, str):
             if knots == "auto":
                 raise FitError(
                     f"schedule: the knots of '{name}' are auto, and this fit chooses none: it is left-out recordings "
-                    f"that decide how many they carry; use the command fit, or give knots or how many"
+                    f"that decide how many they carry; use uncertain_lti.fit or the command, or give knots or how many"
                 )
             raise FitError(f"schedule: the knots of '{name}' are {knots!r}; give numbers, Modes, or how many")
         if isinstance(knots, (int, np.integer)):

@@ -32,9 +32,11 @@ SLACK = 0.25
 """Share of what one knot leaves outside of a left-out part by which more may be outside: the other recordings do not
 represent such a part, and the narrower an envelope is, the more of it is outside."""
 EXCESS = 0.005
-"""Share of all left-out transitions that may be outside beyond that."""
-PAYS = 0.9
-"""Mean width relative to one knot from which on more knots are worth having."""
+"""Share of all left-out transitions that may be outside beyond that, ..."""
+WORSE = 0.01
+"""... and share that may be if it is within the standard error of the comparison."""
+PAYS = 0.8
+"""Mean width relative to one knot up to which more knots are worth having."""
 WANTED = 5
 """Recordings that should visit each range of the scheduling signal."""
 FINEST = 1e-6
@@ -307,9 +309,10 @@ def choose_knots(
     Each number of COUNTS, and those of FURTHER while the last one is the best, is fitted to all recordings, which
     places the knots, and then without each recording, group, or block of a single recording, which is judged.
     Coverage comes first: a number is refused if more than EXCESS of the left-out transitions are outside beyond
-    1 + SLACK times those of one knot in the same part. Of those whose mean width (geometric over states and left-out
-    parts) is at most PAYS of one knot's, the one with the least width is the best, and the fewest knots within one
-    standard error of it are chosen; the standard error is that of the jackknife over what was left out.
+    1 + SLACK times those of one knot in the same part, unless the share outside exceeds that of one knot by less than
+    its standard error, and by less than WORSE. Of those whose mean width (geometric over states and left-out parts) is
+    at most PAYS of one knot's, the one with the least width is the best, and the fewest knots within one standard
+    error of it are chosen. Standard errors are those of the jackknife over what was left out.
 
     Parameters
     ----------
@@ -429,18 +432,23 @@ def _jackknife(sums: Array, counts: Array) -> tuple[float, float]:
     return value, float(np.sqrt((number - 1) / number * np.sum((without - without.mean()) ** 2)))
 
 
-def _admissible(candidate: Candidate, base: Candidate) -> bool:
+def _admissible(candidate: Candidate, base: Candidate, allowed: float) -> bool:
     """Whether its coverage does not speak against it."""
-    return not candidate.refused and candidate.excess(base) <= EXCESS
+    if candidate.refused:
+        return False
+    more, error = candidate.more_outside(base)
+    return candidate.excess(base) <= allowed or more < min(error, WORSE)
 
 
-def best_of(candidates: Sequence[Candidate]) -> Candidate:
+def best_of(candidates: Sequence[Candidate], allowed: float = EXCESS) -> Candidate:
     """The least width among those that cover as well as one knot and whose widths pay; else one knot.
 
     Parameters
     ----------
     candidates : sequence of Candidate
         One knot first.
+    allowed : float, default EXCESS
+        Share that may be outside beyond 1 + SLACK times that of one knot.
 
     Returns
     -------
@@ -448,11 +456,11 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
         One of them.
     """
     base = candidates[0]
-    good = [c for c in candidates[1:] if _admissible(c, base) and c.width[0] <= math.log(PAYS)]
+    good = [c for c in candidates[1:] if _admissible(c, base, allowed) and c.width[0] <= math.log(PAYS)]
     return min(good, key=lambda c: c.width[0], default=base)
 
 
-def decide(signal: str, candidates: Sequence[Candidate], trials: Trials) -> Choice:
+def decide(signal: str, candidates: Sequence[Candidate], trials: Trials, allowed: float = EXCESS) -> Choice:
     """The simplest candidate within the error of the best, with the reason.
 
     Parameters
@@ -463,24 +471,26 @@ def decide(signal: str, candidates: Sequence[Candidate], trials: Trials) -> Choi
         One knot first, then more and more.
     trials : Trials
         That judged them.
+    allowed : float, default EXCESS
+        As for `best_of`.
 
     Returns
     -------
     Choice
         The choice.
     """
-    base, best = candidates[0], best_of(candidates)
+    base, best = candidates[0], best_of(candidates, allowed)
     chosen = best
     if best is not base:
         limit = min(sum(best.width), math.log(PAYS))
-        chosen = next(c for c in candidates[1:] if _admissible(c, base) and c.width[0] <= limit)
+        chosen = next(c for c in candidates[1:] if _admissible(c, base, allowed) and c.width[0] <= limit)
     reason = _reason(candidates, best, chosen)
-    narrow = [c for c in candidates[1:] if not c.refused and c.width[0] <= math.log(PAYS) and not _admissible(c, base)]
+    narrow = [c for c in candidates[1:] if not c.refused and c.width[0] <= math.log(PAYS)]  # none is admissible
     short = [c for c in candidates[1:] if c.refused and c.model is not None]
     wanted = narrow or short
     record = ""
     if chosen is base and wanted:
-        record = _record(signal, min(wanted, key=lambda c: c.share) if narrow else wanted[0], trials)
+        record = _record(signal, min(narrow, key=lambda c: c.excess(base)) if narrow else wanted[0], trials)
     return Choice(signal, tuple(candidates), chosen, trials.fold.what, reason, record)
 
 
@@ -506,12 +516,12 @@ def _reason(candidates: Sequence[Candidate], best: Candidate, chosen: Candidate)
         least = min(judged, key=lambda c: c.width[0])
         return (
             f"on left-out data the mean width with {least.count} knots is x {math.exp(least.width[0]):.2g} of one "
-            f"knot's, which does not pay"
+            f"knot's, with {least.share:.2%} outside (one knot {base.share:.2%}), which does not pay"
         )
-    nearest = min(narrow, key=lambda c: c.share)
+    nearest = min(narrow, key=lambda c: c.excess(base))
     return (
         f"with {nearest.count} knots {nearest.share:.1%} of the left-out transitions are outside, where one knot has "
-        f"{base.share:.1%}: the recordings do not carry them"
+        f"{base.share:.1%}"
     )
 
 

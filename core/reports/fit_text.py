@@ -88,6 +88,39 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
     return "\n".join(lines + [f"note: {message}" for message in facts["messages"]])
 
 
+def schedule_text(choice: Mapping[str, Any]) -> str:
+    """How the number of knots of one signal was chosen.
+
+    Parameters
+    ----------
+    choice : mapping of str to object
+        One entry of `fit_summary["schedule"]`.
+
+    Returns
+    -------
+    str
+        A table of what was left out, and the choice; its reason is among the notes of the fit.
+    """
+    rows, refused = [], []
+    for c in choice["candidates"]:
+        if "refused" in c:
+            refused.append(f"{plural(c['knots'], 'knot')}: {c['refused']}")
+            continue
+        rows.append(
+            [
+                f"{c['knots']}{' (chosen)' if c['knots'] == choice['chosen'] else ''}",
+                f"{c['outside']:.2%}",
+                f"{c['excess']:.2%}",
+                f"x {c['width']:.3g} ± {c['width_error']:.2g}" if c["knots"] > 1 else "x 1",
+                ", ".join(f"{k:.4g}" for k in c["at"]) or "-",
+            ]
+        )
+    lines = [f"knots on {choice['signal']}, by leaving out one {choice['left_out']} of {choice['units']} at a time:"]
+    if rows:
+        lines.append(table(("knots", "outside", "excess", "mean width", "at"), rows))
+    return "\n".join([*lines, *(f"  {text}" for text in refused)])
+
+
 def _optimality_gap(facts: Mapping[str, Any]) -> str:
     """How far the fit is from its optimum at most."""
     gap = facts.get("optimality_gap")

@@ -69,9 +69,7 @@ def validate_model(
         groups = model.fit_summary.get("group")
     if progress is not None:
         progress("the fit to all recordings")
-    again = fit(
-        transients, operating_point=model.operating_point, schedule=model.schedule or {}, **_options(model)
-    )
+    again = fit(transients, operating_point=model.operating_point, schedule=model.schedule or {}, **_options(model))
     if not _same(again, model):
         raise FitError(
             "these recordings do not give this model again, so what was left out of them would say nothing about it; "

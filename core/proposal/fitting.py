@@ -1,0 +1,228 @@
+"""fit() as users call it: that of the identification, with the schedule that the recordings carry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import fitting
+from uncertain_lti.identification.regimes import Knots, asked_by, check_names
+from uncertain_lti.identification.structure import Structure
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.schedule import Schedule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.proposal.scheduling import choose_knots, knots_of
+from uncertain_lti.proposal.suggestion import suggest_schedule
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.additive import Additive
+
+
+def fit(
+    transients: Sequence[Transient] | Transient,
+    criterion: Literal["qp", "lp"] = "qp",
+    weights: ArrayLike | Sequence[ArrayLike] | None = None,
+    additive: Additive | None = None,
+    operating_point: OperatingPoint | None = None,
+    *,
+    transient_weights: Sequence[float] | None = None,
+    count: Literal["sample", "transient"] = "sample",
+    structure: Structure | None = None,
+    schedule: Schedule | Mapping[str, Knots] | None = None,
+    discard: float = 0,
+    method: Literal["working-set", "cvxpy"] = "working-set",
+    describe_data: bool = True,
+    seek_carriers: bool = False,
+    alarm_rule: AlarmRule | None = None,
+    progress: Callable[[str], None] | None = None,
+    groups: Sequence[Any] | str | None = None,
+    suggest: bool = False,
+) -> UncertainLTI:
+    """Fit dx/dt = (A ± ΔA) x + (B ± ΔB) u so that the one-step bounds contain every recorded sample.
+
+    Leibov (2006), eq. (10), the least sum of squared widths weighted by W, or eq. (11), the least largest width
+    per row. Ties: for (11) the least sum of squared widths among its optima; then, for both, the least sum of
+    squared distances of the bounds' centre from the recorded next sample.
+
+    Parameters
+    ----------
+    transients : Transient or sequence of Transient
+        Recordings, of any lengths, of the same states and controls; never joined to one another.
+    criterion : {"qp", "lp"}
+        Eq. (10) or eq. (11).
+    weights : array (n,), (N, n), (N, n, n), or a list with one of the latter two per transient, optional
+        W(t_{k+1}) for step k of N; positive; full matrices symmetric positive definite. Off-diagonal elements
+        couple the rows in (10); (11) uses the diagonal. Default ones.
+    additive : {"none", "disturbance", "noise", "both"}, optional
+        Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise). Default:
+        what the signals file says, else none.
+    operating_point : OperatingPoint, optional
+        Steady state and scales; default: those of the transients' signals, or values used as they are.
+    transient_weights : sequence of float, optional
+        One factor per transient on the weights of all its samples.
+    count : {"sample", "transient"}
+        In (10) and (11), every sample weighs the same, or every transient does, however long it is.
+    structure : Structure, optional
+        Elements that are known, or bounded. Default: the rules of the signals file, if it has any.
+    schedule : Schedule or mapping, optional
+        Of a scheduled (piecewise-linear) model. A mapping has one or two signals, a state, a control or a further
+        scheduling signal, each with its knots in recorded units, with `Modes`, or with how many knots: then from the
+        least to the greatest recorded value, the inner ones where they shrink the largest residuals most; or with
+        "auto": as many as the recordings carry, by what is left out of the fit (`choose_knots`), with the table in
+        `model.fit_summary["schedule"]`. Default: what the signals file says, else one block.
+    discard : int or float, default 0
+        Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
+        their effect on the objective and listed in `model.fit_summary["discarded"]`, beside the widths with them.
+    method : {"working-set", "cvxpy"}
+        cvxpy states the whole problem as written (OSQP, HiGHS); slow, without tie-breaks, for comparison.
+    describe_data : bool, default True
+        Say in `model.fit_summary["messages"]` what the user should know; a fit of many need not.
+    seek_carriers : bool
+        Say there as well which few transitions make a state's envelope much wider than the others need. Takes several
+        times as long as the fit; beyond 200 000 transitions it is not sought.
+    alarm_rule : AlarmRule, optional
+        Goes to the model file.
+    progress : callable, optional
+        Called with one line of text per pass over the data, and per discard.
+    groups : sequence or str, optional
+        What is left out together, for "auto" and `suggest`: one name per recording, or a key, as in `validate`.
+    suggest : bool, default False
+        Try, where no schedule is asked for, whether one would pay, on a part of the recordings (`suggest_schedule`).
+        The answer is among the messages, its tables in `model.fit_summary["suggestion"]`.
+
+    Returns
+    -------
+    UncertainLTI
+        With zero training transitions outside its own `bounds`. `fit_summary["messages"]` says in words what the user
+        should know; `fit_summary["optimality_gap"]` is the relative distance of the objective from a lower bound of
+        the optimum, None if no bound was found.
+
+    Raises
+    ------
+    FitError
+        The transients do not match, there are too few transitions, or no envelope exists (names the sample); groups
+        are given and nothing is left out.
+    """
+    transients = [transients] if isinstance(transients, Transient) else list(transients)
+    options: dict[str, Any] = {
+        "criterion": criterion,
+        "weights": weights,
+        "additive": additive,
+        "operating_point": operating_point,
+        "count": count,
+        "structure": structure,
+        "discard": discard,
+        "method": method,
+    }
+    asked = asked_for(transients, schedule)
+    chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
+    automatic = [name for name, knots in chosen.items() if _is_auto(knots)]
+    suggest = suggest and not asked
+    if groups is not None and not (automatic or suggest):
+        raise FitError("groups are given, and the fit leaves nothing out; leave them out, or choose knots auto")
+    if automatic and transient_weights is not None:
+        raise FitError(
+            f"the knots of '{automatic[0]}' are auto, which leaves recordings out, and transient_weights are for all "
+            f"of them; give the knots, or count='transient'"
+        )
+    resolved: Schedule | None = None
+    facts: list[dict[str, Any]] = []
+    messages: list[str] = []
+    for name in automatic:
+        others = {other: knots for other, knots in chosen.items() if other != name and not _is_auto(knots)}
+        choice = choose_knots(transients, name, others, groups=groups, progress=progress, **options)
+        facts.append(choice.facts())
+        messages.append(
+            f"schedule: {plural(choice.chosen.count, 'knot')} on {name}: {choice.reason}"
+            + (f"; {choice.record}" if choice.record else "")
+        )
+        at = knots_of(choice.chosen.model, name) if choice.chosen.model is not None else []
+        chosen = {**chosen, name: at or 1}
+        resolved = choice.chosen.model.schedule if choice.chosen.model is not None else None
+    model = fitting.fit(
+        transients,
+        **options,
+        transient_weights=transient_weights,
+        schedule=(resolved or {}) if automatic else asked,  # to the bit as it was judged
+        describe_data=describe_data,
+        seek_carriers=seek_carriers,
+        alarm_rule=alarm_rule,
+        progress=progress,
+    )
+    added: dict[str, Any] = {"schedule": facts} if facts else {}
+    if suggest:
+        if transient_weights is not None or not _per_state(weights):
+            added["suggestion"] = {"not_done": "the weights belong to the samples, of which a part is looked at"}
+        else:
+            suggestion = suggest_schedule(transients, groups, progress, **options)
+            added["suggestion"] = suggestion.facts
+            messages += [suggestion.message] if suggestion.message else []
+    if added or messages:
+        there = model.fit_summary.get("messages", [])
+        model = model.replace(fit_summary={**model.fit_summary, **added, "messages": [*there, *messages]})
+    return model
+
+
+def asked_for(
+    transients: Sequence[Transient], schedule: Schedule | Mapping[str, Knots] | None
+) -> Schedule | Mapping[str, Knots]:
+    """The schedule that a fit is asked for, by its argument or by the signals file.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    schedule : Schedule, mapping or None
+        As `fit` takes it.
+
+    Returns
+    -------
+    Schedule or mapping
+        Empty for one block.
+
+    Raises
+    ------
+    FitError
+        There is no such signal; names those that are near.
+    """
+    if not transients:
+        return schedule or {}
+    signals = transients[0].signals
+    if schedule is None:
+        schedule = {} if signals is None else asked_by(signals)
+    if isinstance(schedule, Mapping):
+        first = transients[0]
+        check_names(schedule, [*first.state_names, *first.control_names, *first.scheduling_names])
+    return schedule
+
+
+def is_auto(schedule: Schedule | Mapping[str, Knots]) -> bool:
+    """Whether the knots of some signal are to be chosen.
+
+    Parameters
+    ----------
+    schedule : Schedule or mapping
+        Of `asked_for`.
+
+    Returns
+    -------
+    bool
+        True if the knots of a signal are "auto".
+    """
+    return isinstance(schedule, Mapping) and any(_is_auto(knots) for knots in schedule.values())
+
+
+def _is_auto(knots: Knots) -> bool:
+    return isinstance(knots, str) and knots == "auto"
+
+
+def _per_state(weights: Any) -> bool:
+    """Whether they are the same at every sample."""
+    if isinstance(weights, (list, tuple)) and any(np.ndim(w) for w in weights):
+        return False
+    return weights is None or np.ndim(weights) == 1

@@ -1,0 +1,267 @@
+"""Choice of a schedule by what is left out, suggestions, and what the command says of them."""
+
+import inspect
+import json
+
+import numpy as np
+import pytest
+from engine_bag import SIGNALS, engine_bag
+
+from uncertain_lti import Transient, UncertainLTI, fit, validate
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fitting
+from uncertain_lti.identification.regimes import Modes
+from uncertain_lti.proposal.scheduling import EXCESS, WANTED, choose_knots
+from uncertain_lti.proposal.suggestion import promise, suggest_schedule, thinned
+from uncertain_lti.validation.fitted_model import validate_model
+
+DT = 0.05
+
+
+def run(seed, N=800, low=-1.0, high=1.0, bend=4.0, noise=2e-4):
+    """A tank whose outflow grows with its level: x1 is the level; and bend 0 makes it linear."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1, 1, (N // 20 + 1, 2)), 20, axis=0)[: N + 1]
+    u[:, 0] = low + (high - low) * (u[:, 0] + 1) / 2
+    x = np.zeros((N + 1, 2))
+    x[0, 0] = (low + high) / 2
+    for k in range(N):
+        level, second = x[k]
+        x[k + 1, 0] = level + DT * 2.0 * (u[k, 0] - level)
+        x[k + 1, 1] = second + DT * ((-3.0 - bend * abs(level)) * second + 2.0 * u[k, 1])
+    return Transient(DT * np.arange(N + 1), x + noise * rng.standard_normal(x.shape), u, name=f"run {seed}")
+
+
+RUNS = [run(seed) for seed in range(6)]
+LINEAR = [run(seed, bend=0.0) for seed in range(6)]
+APART = [run(1, low=-1.0, high=-0.4), run(2, low=-0.2, high=0.3), run(3, low=0.5, high=1.0)]
+
+
+def options(**more):
+    return {"additive": "noise", **more}
+
+
+def test_a_plant_with_regimes_gets_knots_and_narrower_bounds_on_what_is_left_out():
+    model = fit(RUNS, schedule={"x1": "auto"}, **options())
+    one = fit(RUNS, **options())
+    (facts,) = model.fit_summary["schedule"]
+    assert facts["chosen"] == 3 == model.schedule.blocks
+    rows = {row["knots"]: row for row in facts["candidates"]}
+    assert rows[3]["width"] < 0.7 and rows[3]["excess"] <= EXCESS and rows[1]["width"] == 1
+    inside = []
+    for tested in (model, one):
+        for steps in (run(seed).transitions() for seed in range(70, 80)):
+            low, high = tested.bounds(steps.x, steps.u, steps.dt)
+            inside.append(((low <= steps.x_next) & (steps.x_next <= high)).all(axis=1).mean())
+    assert np.mean(inside[:10]) > 0.98 and np.mean(inside[10:]) > 0.98
+    assert model.fit_summary["mean_width"][1] < 0.6 * one.fit_summary["mean_width"][1]
+
+
+def test_the_table_is_that_of_validate():
+    model = fit(RUNS, schedule={"x1": "auto"}, **options())
+    (facts,) = model.fit_summary["schedule"]
+    row = next(row for row in facts["candidates"] if row["knots"] == facts["chosen"])
+    left = validate_model(model, RUNS)
+    assert row["outside"] == pytest.approx(1 - left.to_dict()["inside"], abs=1e-12)
+    assert left.model.schedule == model.schedule
+    assert left.parts[0].block.max() < model.schedule.blocks and len(left.parts[0].block) == left.parts[0].judged
+
+
+def test_a_linear_plant_keeps_one_knot():
+    model = fit(LINEAR, schedule={"x1": "auto"}, **options())
+    assert model.schedule is None
+    (facts,) = model.fit_summary["schedule"]
+    assert facts["chosen"] == 1 and not facts["record"]
+    assert "does not pay" in facts["reason"] and facts["reason"] in model.fit_summary["messages"][-1]
+
+
+@pytest.mark.parametrize("N", [40, 150])
+def test_little_data_keeps_one_knot(N):
+    model = fit(run(3, N), schedule={"x1": "auto"}, **options())
+    assert model.schedule is None
+    assert model.fit_summary["schedule"][0]["reason"]
+
+
+def test_recordings_that_visit_different_regimes_keep_one_knot_and_hear_what_to_record():
+    model = fit(APART, schedule={"x1": "auto"}, **options())
+    assert model.schedule is None
+    (facts,) = model.fit_summary["schedule"]
+    assert "record x1 from" in facts["record"] and "more recordings" in facts["record"]
+    assert facts["record"] in model.fit_summary["messages"][-1]
+    assert f"at least {WANTED - 1} more" in facts["record"]
+
+
+def test_a_choice_is_the_same_again():
+    once, again = (choose_knots(RUNS, "x1", **options()).facts() for _ in range(2))
+    assert json.dumps(once) == json.dumps(again)
+
+
+def test_many_recordings_are_left_out_ten_times():
+    short = [run(seed, 100) for seed in range(23)]
+    choice = choose_knots(short, "x1", **options())
+    assert len(choice.candidates[0].judged) == 10 and choice.candidates[0].judged.sum() == 2300
+
+
+def test_groups_are_left_out_together():
+    facts = choose_knots(RUNS, "x1", groups=list("aabbcc"), **options()).facts()
+    assert facts["units"] == 3 and facts["left_out"] == "group"
+    with pytest.raises(FitError, match="nothing out"):
+        fit(RUNS, groups=list("aabbcc"))
+
+
+def test_knots_on_one_signal_beside_modes_of_another():
+    rng = np.random.default_rng(1)
+    runs = []
+    for one in RUNS:
+        gear = np.repeat(rng.choice([1.0, 2.0], len(one) // 50 + 1), 50)[: len(one), None]
+        runs.append(one.replace(s=gear, scheduling_names=["gear"]))
+    model = fit(runs, schedule={"gear": Modes([1, 2]), "x1": "auto"}, **options())
+    assert [axis.signal for axis in model.schedule.axes] in (["gear"], ["x1", "gear"], ["gear", "x1"])
+    assert model.fit_summary["schedule"][0]["candidates"][0]["knots"] == 1
+
+
+def test_what_is_no_choice_is_refused_by_name():
+    with pytest.raises(FitError, match="did you mean x1"):
+        fit(RUNS, schedule={"x11": "auto"})
+    with pytest.raises(FitError, match="transient_weights"):
+        fit(RUNS, schedule={"x1": "auto"}, transient_weights=[1] * 6)
+    with pytest.raises(FitError, match="one or two"):
+        fit(RUNS, schedule={"x1": "auto", "x2": 3, "u1": 3})
+    with pytest.raises(FitError, match="'most'"):
+        fit(RUNS, schedule={"x1": "most"})
+
+
+def test_the_identification_itself_chooses_no_knots():
+    with pytest.raises(FitError, match="chooses none"):
+        fitting.fit(RUNS, schedule={"x1": "auto"})
+
+
+def test_a_suggestion_names_the_signal_and_what_it_is_worth():
+    model = fit(RUNS, suggest=True, **options())
+    (message,) = (m for m in model.fit_summary["messages"] if "schedule" in m)
+    assert "scheduled on x1" in message and "mean width x 0." in message and "--schedule x1=auto" in message
+    assert model.fit_summary["suggestion"]["suggested"] == "x1"
+    assert model.schedule is None
+
+
+def test_no_schedule_is_suggested_for_a_linear_plant():
+    suggestion = suggest_schedule(LINEAR, **options())
+    assert suggestion.message == "" and suggestion.facts["tried"] == []
+
+
+def test_a_suggestion_says_what_the_recordings_lack():
+    suggestion = suggest_schedule(APART, **options())
+    assert "suggested" not in suggestion.facts
+    assert "not carried" in suggestion.message and "record " in suggestion.message
+
+
+def test_nothing_is_suggested_where_a_schedule_is_asked_for():
+    assert "suggestion" not in fit(RUNS, schedule={"x1": 2}, suggest=True).fit_summary
+
+
+def test_pieces_hold_transitions_of_the_recording_alone():
+    long = run(9, 20_000)
+    (some,) = thinned([long], 1000)
+    whole = long.transitions()
+    steps = some.transitions()
+    assert 800 <= len(steps.k) <= 1300
+    place = {x.tobytes(): k for k, x in enumerate(whole.x)}
+    at = [place[x.tobytes()] for x in steps.x]
+    assert (steps.x_next == whole.x_next[at]).all() and (steps.u == whole.u[at]).all()
+    assert max(at) > 19_000 and thinned([long], 30_000) == [long]
+
+
+def test_promise_is_largest_for_the_signal_that_bends_the_plant():
+    found = promise(RUNS)
+    assert min(found, key=found.get) == "x1" and found["x1"] < 0.8
+    assert all(value > 0.9 for value in promise(LINEAR).values())
+
+
+def test_the_public_fit_takes_what_the_identification_takes():
+    inner, outer = inspect.signature(fitting.fit).parameters, inspect.signature(fit).parameters
+    assert [outer[name] for name in inner] == list(inner.values())
+    assert list(outer)[len(inner) :] == ["groups", "suggest"]
+
+    def entries(function):
+        text = inspect.getdoc(function).split("Parameters\n----------\n")[1].split("\n\nReturns")[0]
+        found, name = {}, ""
+        for line in text.splitlines():
+            name = line.split(" : ")[0] if not line.startswith(" ") else name
+            found.setdefault(name, []).append(line)
+        return found
+
+    mine, theirs = entries(fitting.fit), entries(fit)
+    for name in inner:
+        assert name == "schedule" or mine[name] == theirs[name], name
+
+
+def test_validate_keeps_the_knots_of_the_model():
+    full = fit(RUNS, schedule={"x1": [-1.0, 0.1, 1.0]}, **options())
+    left = validate(RUNS, full=full, **options())
+    assert left.model.schedule == full.schedule
+    with pytest.raises(FitError, match="its own schedule"):
+        validate(RUNS, full=full, schedule={"x1": 2})
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A recording of an engine, whose plant is linear, and its signals file."""
+    (tmp_path / "signals.yaml").write_text(SIGNALS)
+    engine_bag(tmp_path / "run.mcap")
+    return tmp_path
+
+
+def command(folder, *more):
+    arguments = ["fit", str(folder / "run.mcap"), "--signals", str(folder / "signals.yaml")]
+    return main([*arguments, "--output", str(folder / "m.model.json"), "--additive", "noise", *more])
+
+
+def test_the_command_prints_the_table_and_the_reason(folder, capsys):
+    assert command(folder, "--schedule", "fan=auto") == 0
+    printed = capsys.readouterr().out
+    assert "knots on fan, by leaving out one block of 10 at a time" in printed
+    assert "1 (chosen)" in printed and "note: schedule: 1 knot on fan" in printed
+    assert UncertainLTI.load(folder / "m.model.json").schedule is None
+
+
+@pytest.mark.parametrize(("text", "blocks"), [("fan=2", 2), ("fan=-0.1,0,0.1", 3)])
+def test_the_command_takes_knots_and_validate_keeps_them(folder, capsys, text, blocks):
+    assert command(folder, "--schedule", text, "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)["fit"]["blocks"]) == blocks
+    model = UncertainLTI.load(folder / "m.model.json")
+    assert model.schedule.blocks == blocks
+    assert main(["validate", str(folder / "m.model.json"), "--output", str(folder / "v.model.json")]) == 0
+    again = UncertainLTI.load(folder / "v.model.json")
+    assert again.schedule == model.schedule and again.validation["inside"] == model.validation["inside"]
+
+
+def test_the_signals_file_asks_for_a_schedule(folder):
+    with open(folder / "signals.yaml", "a") as file:
+        file.write("schedule: [{signal: fan, knots: auto}]\n")
+    assert command(folder) == 0
+    model = UncertainLTI.load(folder / "m.model.json")
+    assert model.fit_summary["schedule"][0]["signal"] == "fan"
+    assert main(["validate", str(folder / "m.model.json")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--schedule", "fam"], "did you mean fan"),
+        (["--schedule", "fan", "--schedule", "fan=3"], "twice"),
+        (["--schedule", "fan=x"], "neither auto"),
+        (["--schedule", "fan="], "write SIGNAL"),
+        (["--schedule", "fan=0"], "at least 1"),
+        (["--schedule", "fan=modes:"], "neither auto"),
+        (["--schedule", "fan=auto", "--cache", "arrays"], "auto"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(folder, capsys, given, words, monkeypatch):
+    monkeypatch.chdir(folder)
+    try:
+        status = command(folder, *given)
+    except SystemExit as left:
+        status = left.code
+    assert status == 2
+    assert words in capsys.readouterr().err
