@@ -60,7 +60,7 @@ def fit(
         couple the rows in (10); (11) uses the diagonal. Default ones.
     additive : {"none", "disturbance", "noise", "both"}, optional
         Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise). Default:
-        what the signals file says, else none.
+        that of the signals file, else none.
     operating_point : OperatingPoint, optional
         Steady state and scales; default: those of the transients' signals, or values used as they are.
     transient_weights : sequence of float, optional
@@ -74,10 +74,11 @@ def fit(
         scheduling signal, each with its knots in recorded units, with `Modes`, or with how many knots: then from the
         least to the greatest recorded value, the inner ones where they shrink the largest residuals most; or with
         "auto": as many as the recordings carry, by what is left out of the fit (`choose_knots`), with the table in
-        `model.fit_summary["schedule"]`. Default: what the signals file says, else one block.
+        `model.fit_summary["schedule"]`. Default: that of the signals file, else one block. With a schedule the drift c is
+        always unknown: it moves the steady state from knot to knot.
     discard : int or float, default 0
         Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
-        their effect on the objective and listed in `model.fit_summary["discarded"]`, beside the widths with them.
+        their effect on the objective and listed in `model.fit_summary["discarded"]`, next to the widths with them.
     method : {"working-set", "cvxpy"}
         cvxpy states the whole problem as written (OSQP, HiGHS); slow, without tie-breaks, for comparison.
     describe_data : bool, default True
