@@ -1,6 +1,7 @@
 """Identification against its peers, side by side in one run: time as ratios, the same optimum, nothing outside.
 
 python benchmarks/fit.py million      # fit() on 1e6 transitions, n = 5, m = 4, against numpy.linalg.lstsq
+python benchmarks/fit.py scheduled    # the same with 5 knots, against lstsq on the same 45 and 50 regressors
 python benchmarks/fit.py joint        # 1e5 transitions, against the joint problem in cvxpy with Clarabel
 python benchmarks/fit.py pyipm        # n = 10, m = 3, 1e5 transitions, against PyIPM (pip install PyIPM)
 python benchmarks/fit.py large        # n = 50, m = 10, 1e5 transitions
@@ -30,6 +31,7 @@ from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Columns, Problem
+from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -129,18 +131,57 @@ def million(scale):
     table(f"fit() on a recording of {N} transitions, n = 5, m = 4: CPU time", header, rows)
 
 
-def recorded(N, seed=0):
-    """A recording of the published matrices, drawn anew inside their intervals at each step."""
+def recorded(N, seed=0, schedule=None):
+    """A recording of the published matrices, drawn anew inside their intervals at each step.
+
+    With a schedule on a control they are weaker at one end of it than at the other, and the state at rest moves.
+    """
     rng = np.random.default_rng(seed)
     model = leibov2006()
     nominal, spread = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
     u = np.repeat(rng.uniform(-1, 1, (N // 15 + 1, model.m)), 15, axis=0)[: N + 1]
     x = np.empty((N + 1, model.n))
     x[0] = 0.1
+    strength, drift = np.ones(N + 1), np.zeros(N + 1)
+    if schedule is not None:
+        blocks = np.arange(schedule.blocks) / schedule.blocks
+        strength, drift = np.array([0.8 + 0.4 * blocks**2, 0.2 * blocks]) @ schedule.weights(u[:, :1].T)
     for k in range(N):
         elements = nominal + spread * rng.uniform(-1, 1, spread.shape)
-        x[k + 1] = x[k] + DT * (elements @ np.concatenate([x[k], u[k]]))
+        x[k + 1] = x[k] + DT * (strength[k] * (elements @ np.concatenate([x[k], u[k]])) + drift[k])
     return Transient(np.arange(N + 1, dtype=np.int64) * round(DT * 1e9), x, u)
+
+
+def scheduled(scale):
+    """As `million`, of a plant whose matrices change with a control, fitted with five knots."""
+    N, knots = int(1e6 * scale), np.linspace(-1, 1, 5)
+    schedule = Schedule((Axis("u1", knots=tuple(knots.tolist())),))
+    clean, rows = recorded(N, schedule=schedule), []
+    for noise in (0.0, 1e-4):
+        x = clean.x + noise * np.random.default_rng(1).standard_normal(clean.x.shape)
+        transient = Transient(clean.t_ns, x, clean.u)
+        rate, weights = np.diff(x, axis=0) / DT, schedule.weights(clean.u[:-1, :1].T)
+        for additive in ("disturbance",) if not noise else ("noise", "both"):
+            drift = [np.ones((N, 1))] if additive != "noise" else []
+            z = np.hstack([x[:-1], clean.u[:-1], *drift])
+            regressors = np.hstack([w[:, None] * z for w in weights])
+            for criterion in ("qp", "lp"):
+                peer, ours = np.inf, np.inf
+                for _ in range(2):
+                    began = time.process_time()
+                    np.linalg.lstsq(regressors, rate, rcond=None)
+                    between = time.process_time()
+                    model = fit(transient, criterion, additive=additive, schedule=schedule)
+                    ours, peer = min(ours, time.process_time() - between), min(peer, between - began)
+                lower, upper = model.bounds(x[:-1], clean.u[:-1], transient.dt)
+                left = int((~((lower <= x[1:]) & (x[1:] <= upper))).any(axis=1).sum())
+                rows.append(
+                    [f"{noise:g}", additive, criterion, str(regressors.shape[1]), f"{peer:.2f} s", f"{ours:.2f} s"]
+                    + [f"{ours / peer:.2f}", str(model.fit_summary["solver"]["passes"])]
+                    + [f"{model.fit_summary['optimality_gap']:.0e}", str(left)]
+                )
+    header = ["noise", "additive", "criterion", "regressors", "lstsq", "fit()", "ratio", "passes", "optimality gap"]
+    table(f"fit() with 5 knots on {N} transitions, n = 5, m = 4: CPU time", [*header, "outside"], rows)
 
 
 def joint(scale):
@@ -308,7 +349,7 @@ def disk_fit(folder, N, parts):
     table(f"{N} transitions, n = 5, m = 4", [*header, "objective differs", "elements differ"], rows)
 
 
-CLAIMS = {f.__name__: f for f in (million, joint, pyipm, large, coupled, growth, disk)}
+CLAIMS = {f.__name__: f for f in (million, scheduled, joint, pyipm, large, coupled, growth, disk)}
 
 
 def main():

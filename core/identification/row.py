@@ -41,6 +41,11 @@ REGULARISATION = 1e-4
 With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
 of the squared widths. Whether it was is seen from the optimum of δ alone, at the end.
 """
+NEAR = 2e-6
+"""Distance from the optimum of (11), relative, up to which a row with many blocks is left as it is if a smaller weight
+leads to no answer: to break the ties of so many unknowns among the exact optima takes minutes."""
+LEAST_REGULARISATION = 1e-9
+"""Weight below which it is left to the simplex method and to a programme of the ties of their own."""
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
 JOIN = 48  # samples that join a working set per round, at least; more if there are many unknowns
 
@@ -197,6 +202,9 @@ class Row:
         self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
         self.limit: float | None = None  # δ of (11) in units of scale x width_unit
         self.exact = False  # (11) by the simplex method
+        self.regularisation = REGULARISATION
+        self.near: tuple[Array, Array, float | None, float] | None = None  # θ, d, limit and δ of an answer that will do
+        self.done = False  # and nothing better was found
         self._forget()
 
     def _forget(self) -> None:
@@ -611,9 +619,9 @@ class Row:
 
         def objective(factor: float, ridge: float) -> tuple[Array, Array]:
             H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
-            whole = REGULARISATION * np.eye(size + 1)
-            whole[:size, :size] = REGULARISATION * H
-            return whole, np.append(REGULARISATION * f, 1.0)
+            whole = self.regularisation * np.eye(size + 1)
+            whole[:size, :size] = self.regularisation * H
+            return whole, np.append(self.regularisation * f, 1.0)
 
         answer, solver = self._solve(
             "regularised",
