@@ -718,6 +718,13 @@ class Judge:
             raise ValueError(f"{len(before)} and {len(after)} values for {self.total} and {self.n} signals")
         if cython.compiled:
             return self._one(before, after, dt)
+        with np.errstate(over="ignore", invalid="ignore"):  # values that the arithmetic cannot carry leave the bounds
+            return self._of_arrays(before, after, dt)
+
+    def _of_arrays(self, before: Sequence[float], after: Sequence[float], dt: float) -> Judgement | None:
+        """`_one` by numpy."""
+        if cython.compiled:
+            return None  # not called there
         n = self.n
         z = normalised(np.array([*before, *after], dtype=np.float64), self._steady, self._scale)
         s, z, x_next = z[self._positions], z[: self.size], z[-n:]

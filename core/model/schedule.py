@@ -106,7 +106,8 @@ class Axis:
             return place[None], np.where(place < 0, np.nan, 1.0)[None]
         knots = np.array(self.knots)
         low = np.clip(np.searchsorted(knots, s, side="right") - 1, 0, len(knots) - 2)
-        high = np.asarray(weight_between(s, knots[low], knots[low + 1]))
+        with np.errstate(over="ignore"):
+            high = np.asarray(weight_between(s, knots[low], knots[low + 1]))
         places, weights = np.stack([low, low + 1]), np.stack([1.0 - high, high])
         unknown = np.isnan(s)
         if unknown.any():

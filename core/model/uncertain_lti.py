@@ -371,7 +371,8 @@ class UncertainLTI:
             part = slice(start, start + self._block)
             phi = regressors(z[:n, part], z[n : n + m, part])
             corners = () if self.schedule is None else self.schedule.corners(z[self._positions, part])
-            centre[:, part], half[:, part] = centre_and_half(*self.tables, phi, dt[part], *corners)
+            with np.errstate(over="ignore", invalid="ignore"):  # values that the arithmetic cannot carry give NaN
+                centre[:, part], half[:, part] = centre_and_half(*self.tables, phi, dt[part], *corners)
 
     def normalised_columns(self, steps: Transitions) -> Array:
         """[x; u; s] of transitions.
@@ -548,7 +549,8 @@ class UncertainLTI:
             Shapes do not fit.
         """
         centre, half = self.centre_and_half(x, u, dt, s)
-        return np.asarray(lower_of(centre, half, margin)), np.asarray(upper_of(centre, half, margin))
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(lower_of(centre, half, margin)), np.asarray(upper_of(centre, half, margin))
 
     # --- the nominal model on its own ---
 
