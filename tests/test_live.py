@@ -37,6 +37,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_processes import Diagnostics, World, open_world, until
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64
+from std_srvs.srv import Trigger
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 STATE, CONTROL = "/plant/state", "/plant/control"
@@ -302,11 +303,19 @@ def test_a_scheduled_model_gives_live_what_it_gives_offline(world: World, tmp_pa
     assert 10 < sum(v.unknown_regime for v in verdicts) < sum(v.judged for v in verdicts) - 10
     checked = EnvelopeMonitor(model).check(read_as_fitted(bag, UncertainLTI.load(path).signals))
     assert bits(checked.lower[checked.judged]) == bits([v.lower for v in verdicts if v.judged])
-    world.monitor(path, use_sim_time=True)
+    folder = tmp_path / "snapshots"
+    world.monitor(path, **{"use_sim_time": True, "snapshot.folder": str(folder), "snapshot.seconds": 600.0})
     outputs = Outputs.of(world)
     diagnostics = Diagnostics(world)
     world.command("play", bag, "--clock", "--lockstep", "envelope_monitor").succeed(120)
     outputs.hold_against(verdicts, ("a", "b"))
+    answer = world.call(Trigger, "/envelope_monitor/snapshot", Trigger.Request())
+    assert answer.success, answer.message
+    (snapshot,) = folder.glob("*.mcap")
+    again = offline(path, snapshot)
+    assert [v.status for v in again] == [v.status for v in verdicts]
+    assert [v.unknown_regime for v in again] == [v.unknown_regime for v in verdicts]
+    assert [bits(v.lower) for v in again if v.judged] == [bits(v.lower) for v in verdicts if v.judged]
     texts = " ".join(status.message for message in diagnostics.topic.messages for status in message.status)
     assert "regime not fitted" in texts and "the scheduling signal has a value that the model does not list" in texts
 
