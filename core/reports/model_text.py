@@ -93,7 +93,7 @@ def _scheduled_text(model: UncertainLTI) -> list[str]:
     """Regimes, then the elements of each block that has some of its own."""
     lines = regimes_text(model)
     own = [r for r, data in enumerate(model.block_data) if data.tied_to is None]
-    lines += [_elements(model.blocks[r], f"{model.block_name(r)}: A, B [1/s]") for r in own[:MOST_PRINTED]]
+    lines += [_elements(model.blocks[r], f"{r}: {model.block_name(r)}: A, B [1/s]") for r in own[:MOST_PRINTED]]
     if (more := len(own) - MOST_PRINTED) > 0:
         lines.append(f"  and the elements of {plural(more, 'more regime')}; --json has all")
     return lines
@@ -119,10 +119,11 @@ def regimes_text(model: UncertainLTI) -> list[str]:
     header = ["regime", "transitions", "elements of"]
     header += [f"{name}: mean width" for name in model.state_names] * widths
     rows = []
-    for block in blocks[:MOST_REGIMES]:
+    names = [f"{r}: {block['regime']}" for r, block in enumerate(blocks)]
+    for name, block in zip(names[:MOST_REGIMES], blocks, strict=False):
         transitions = "unknown" if block["transitions"] is None else str(block["transitions"])
-        row = [block["regime"], transitions if block["known"] else "0, not visited"]
-        row.append("its own" if block["tied_to"] is None else blocks[block["tied_to"]]["regime"])
+        row = [name, transitions if block["known"] else "0, not visited"]
+        row.append("its own" if block["tied_to"] is None else f"regime {block['tied_to']}")
         row += [number(w) for w in block["mean_width"] or [None] * model.n] * widths
         rows.append(row)
     lines = [
@@ -131,8 +132,8 @@ def regimes_text(model: UncertainLTI) -> list[str]:
         table(
             ("regime", "eigenvalues of A [1/s]", "time constants [s]"),
             [
-                [b["regime"], _eigenvalues(b["eigenvalues"]), ", ".join(_constant(v) for v in b["time_constants"])]
-                for b in blocks[:MOST_REGIMES]
+                [name, _eigenvalues(b["eigenvalues"]), ", ".join(_constant(v) for v in b["time_constants"])]
+                for name, b in zip(names[:MOST_REGIMES], blocks, strict=False)
             ],
         ),
     ]

@@ -94,7 +94,9 @@ def _reason(weight: str, about: str, text: str) -> dict[str, str]:
 def _fit_reasons(model: UncertainLTI) -> list[dict[str, str]]:
     messages = [str(message) for message in list_of(model.fit_summary.get("messages"))]
     # widths have a reason of their own below, from the recordings at hand too
-    found = [_reason(CARE, "fit", message) for message in messages if not message.startswith("the bounds are over")]
+    # and so have the blocks of a schedule, together
+    apart = ("the bounds are over", "the block at")
+    found = [_reason(CARE, "fit", message) for message in messages if not message.startswith(apart)]
     if not model.fit_summary:
         found.append(_reason(CARE, "fit", "the model file does not say how it was fitted"))
     return found
@@ -112,9 +114,7 @@ def _stability_reasons(model: UncertainLTI) -> list[dict[str, str]]:
 
 def _regime_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Regimes with little data, and verdicts in regimes that no recording of the fit visited."""
-    said = " ".join(str(message) for message in list_of(model.fit_summary.get("messages")))
-    found = [] if "too little data for elements" in said else blocks_in_words(model)  # else the fit reports it
-    reasons = [_reason(CARE, "regimes", text) for text in found]
+    reasons = [_reason(CARE, "regimes", text) for text in blocks_in_words(model)]
     judged = sum(r["verdicts"] for r in recordings)
     unknown = sum(r["unknown_regime"] for r in recordings)
     if judged and unknown:
