@@ -199,6 +199,8 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
     return best
 
 
+_ITERATIONS = 50
+"""Steps of the simplex method per variable: on degenerate programmes it may go round for ever, and most take under 5."""
 _REMEDIES: tuple[dict[str, Any], ...] = (
     {"simplex_scale_strategy": 2},
     {"presolve": "off"},
@@ -237,6 +239,8 @@ class Simplex:
         self._infinity = infinity
         self._size = len(cost)
         self._optimal = highspy.HighsModelStatus.kOptimal
+        self._endless = highspy.HighsModelStatus.kIterationLimit
+        self._highs.setOptionValue("simplex_iteration_limit", _ITERATIONS * (len(cost) + 100))
         for c, low, high in zip(cost, lower, upper, strict=True):
             self._highs.addVar(max(low, -infinity), min(high, infinity))
             self._highs.changeColCost(self._highs.getNumCol() - 1, c)
@@ -295,8 +299,10 @@ class Simplex:
             There is no optimum.
         """
         self._highs.run()
+        cycled = 0
         for remedy in _REMEDIES:
-            if self._highs.getModelStatus() == self._optimal:
+            cycled += self._highs.getModelStatus() == self._endless
+            if self._highs.getModelStatus() == self._optimal or cycled > 1:
                 break
             self._highs.clearSolver()  # a warm start can go astray; from scratch then
             for option, value in remedy.items():
