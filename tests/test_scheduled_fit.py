@@ -434,3 +434,15 @@ def test_a_scheduled_model_goes_to_its_file_and_back(tmp_path):
     model.save(tmp_path / "a.model.json")
     again = UncertainLTI.load(tmp_path / "a.model.json")
     assert (again.A == model.A).all() and again.block_data == model.block_data and again.schedule == model.schedule
+
+
+def test_without_additive_term_a_recording_at_rest_is_contained():
+    """At rest nothing but the noise would contain the rounding of a drift."""
+    t = np.arange(600) * 0.01
+    u = np.where((t > 2.0) & (t < 4.0), 1.0, 0.0)[:, None]
+    x = np.zeros((600, 1))
+    for k in range(599):
+        x[k + 1] = x[k] + 0.01 * (-(2.0 + x[k] ** 2) * x[k] + u[k])
+    model = fit(Transient(t, x, u), "qp", additive="none", schedule={"x1": [-0.1, 0.1, 0.3, 0.5]})
+    assert (model.c == 0.0).all() and model.fit_summary["violations"] == 0
+    assert model.fit_summary["mean_width"][0] < 0.3 * fit(Transient(t, x, u)).fit_summary["mean_width"][0]

@@ -12,7 +12,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Modes
-from uncertain_lti.proposal.scheduling import EXCESS, WANTED, choose_knots
+from uncertain_lti.proposal.scheduling import EXCESS_FOR_MUCH, WANTED, choose_knots
 from uncertain_lti.proposal.suggestion import promise, suggest_schedule, thinned
 from uncertain_lti.validation.fitted_model import validate_model
 
@@ -48,7 +48,7 @@ def test_a_plant_with_regimes_gets_knots_and_narrower_bounds_on_what_is_left_out
     (facts,) = model.fit_summary["schedule"]
     assert facts["chosen"] == 3 == model.schedule.blocks
     rows = {row["knots"]: row for row in facts["candidates"]}
-    assert rows[3]["width"] < 0.7 and rows[3]["excess"] <= EXCESS and rows[1]["width"] == 1
+    assert rows[3]["width"] < 0.3 and rows[3]["excess"] <= EXCESS_FOR_MUCH and rows[1]["width"] == 1
     inside = []
     for tested in (model, one):
         for steps in (run(seed).transitions() for seed in range(70, 80)):

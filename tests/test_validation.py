@@ -523,7 +523,7 @@ def test_a_rule_that_sees_little_is_warned_of(folder, capsys, monkeypatch):
     for size in (1e-6, 1.0):  # a fault of next to nothing is not seen by a rule that keeps to the target
         monkeypatch.setattr("uncertain_lti.validation.calibration.detection.__defaults__", (size,))
         capsys.readouterr()
-        assert main(["validate", model, "--false-alarms", "2000", "--output", target]) == 0
+        assert main(["validate", model, "--false-alarms", "2000", "--output", target, "--force"]) == 0
         lines[size] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning:")]
         written = UncertainLTI.load(target)
         found, rule = written.validation["calibration"], written.alarm_rule

@@ -87,8 +87,8 @@ def fit(
         Of a scheduled (piecewise-linear) model. A mapping has one or two signals, a state, a control or a further
         scheduling signal, each with its knots in recorded units, with `Modes`, or with how many knots: then from the
         least to the greatest recorded value, the inner ones where they shrink the largest residuals most. Default:
-        that of the signals file, else one block. With a schedule the drift c is always unknown: it moves the
-        steady state from knot to knot.
+        that of the signals file, else one block. With a schedule and an additive
+        term the drift c is unknown, too: it moves the steady state from knot to knot.
     discard : int or float, default 0
         Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
         their effect on the objective and listed in `model.fit_summary["discarded"]`, next to the widths with them.

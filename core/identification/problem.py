@@ -218,8 +218,9 @@ class Columns:
         """For an `additive` option.
 
         With a constant Δt, Δt·dc + v is one number: v takes it and dc is 0, because v is the one that still
-        holds when another recording has another Δt. With a schedule c is always unknown: it carries the steady state
-        from knot to knot.
+        holds when another recording has another Δt. With a schedule c is unknown beside every
+        additive term: it carries the steady state from knot to knot. Without such a term c is 0, as at rest its
+        rounding would have no half-width to lie in.
 
         Parameters
         ----------
@@ -243,7 +244,7 @@ class Columns:
         if additive not in CHOICES:
             raise FitError(f"additive is {additive!r}; it must be {CHOICES_TEXT}")
         names = {"none": "", "disturbance": "c dc", "noise": "v", "both": "c v" if constant_dt else "c dc v"}
-        drift = () if regimes is None else ("c",)
+        drift = () if regimes is None or additive == "none" else ("c",)
         return cls(frozenset((*names[additive].split(), *drift)), regimes)
 
 

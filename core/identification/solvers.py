@@ -200,7 +200,7 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
 
 
 _ITERATIONS = 50
-"""Steps of the simplex method per variable: on degenerate programmes it may go round for ever, and most take under 5."""
+"""Steps of the simplex method per variable: on degenerate programmes it may go round for ever; most take under 5."""
 _REMEDIES: tuple[dict[str, Any], ...] = (
     {"simplex_scale_strategy": 2},
     {"presolve": "off"},

@@ -75,7 +75,7 @@ def fit(
         least to the greatest recorded value, the inner ones where they shrink the largest residuals most; or with
         "auto": as many as the recordings carry, by what is left out of the fit (`choose_knots`), with the table in
         `model.fit_summary["schedule"]`. Default: that of the signals file, else one block. With a
-        schedule the drift c is always unknown: it moves the steady state from knot to knot.
+        schedule and an additive term the drift c is unknown, too: it moves the steady state from knot to knot.
     discard : int or float, default 0
         Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
         their effect on the objective and listed in `model.fit_summary["discarded"]`, next to the widths with them.

@@ -31,8 +31,10 @@ FOLDS = 10
 SLACK = 0.25
 """Share of what one knot leaves outside of a left-out part by which more may be outside: the other recordings do not
 represent such a part, and the narrower an envelope is, the more of it is outside."""
-EXCESS = 0.005
+EXCESS = 0.001
 """Share of all left-out transitions that may be outside beyond that, ..."""
+MUCH, EXCESS_FOR_MUCH = 0.3, 0.005
+"""... the mean width, relative to one knot, that is worth a greater one, and that one, ..."""
 WORSE = 0.01
 """... and share that may be if it is within the standard error of the comparison."""
 PAYS = 0.8
@@ -309,7 +311,8 @@ def choose_knots(
     Each number of COUNTS, and those of FURTHER while the last one is the best, is fitted to all recordings, which
     places the knots, and then without each recording, group, or block of a single recording, which is judged.
     Coverage comes first: a number is refused if more than EXCESS of the left-out transitions are outside beyond
-    1 + SLACK times those of one knot in the same part, unless the share outside exceeds that of one knot by less than
+    1 + SLACK times those of one knot in the same part (EXCESS_FOR_MUCH, where the widths are at most MUCH of one
+    knot's), unless the share outside exceeds that of one knot by less than
     its standard error, and by less than WORSE. Of those whose mean width (geometric over states and left-out parts) is
     at most PAYS of one knot's, the one with the least width is the best, and the fewest knots within one standard
     error of it are chosen. Standard errors are those of the jackknife over what was left out.
@@ -437,6 +440,8 @@ def _admissible(candidate: Candidate, base: Candidate, allowed: float) -> bool:
     if candidate.refused:
         return False
     more, error = candidate.more_outside(base)
+    if candidate.width[0] <= math.log(MUCH):
+        allowed = max(allowed, EXCESS_FOR_MUCH)
     return candidate.excess(base) <= allowed or more < min(error, WORSE)
 
 
