@@ -446,3 +446,17 @@ def test_without_additive_term_a_recording_at_rest_is_contained():
     model = fit(Transient(t, x, u), "qp", additive="none", schedule={"x1": [-0.1, 0.1, 0.3, 0.5]})
     assert (model.c == 0.0).all() and model.fit_summary["violations"] == 0
     assert model.fit_summary["mean_width"][0] < 0.3 * fit(Transient(t, x, u)).fit_summary["mean_width"][0]
+
+
+def test_knots_that_the_fit_places_keep_their_distance():
+    """A signal that mostly rests, with noise, has most of its quantiles within that noise."""
+    rng = np.random.default_rng(4)
+    t = np.arange(3000) * 0.01
+    u = np.where(np.abs(t - 20.0) < 5.0, np.sin(3.0 * t), 0.0)[:, None]
+    x = np.zeros((3000, 1))
+    for k in range(2999):
+        x[k + 1] = x[k] + 0.01 * (-(2.0 + 8.0 * np.tanh(4.0 * x[k]) ** 2) * x[k] + 2.0 * u[k])
+    recorded = x + rng.normal(0, 1e-4, x.shape)
+    model = fit(Transient(t, recorded, u), additive="noise", schedule={"x1": 5})
+    knots = np.array(model.schedule.axes[0].knots)
+    assert np.diff(knots).min() >= 0.24 * np.ptp(knots) / 4

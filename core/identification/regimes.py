@@ -22,6 +22,8 @@ LOOKED_AT = 20_000
 """Transitions that inner knots are chosen on, at most."""
 CANDIDATES = 16
 """Places that are tried for an inner knot, as many quantiles of the signal and as many at equal distances."""
+CLOSEST = 0.25
+"""Least distance of two knots that the fit places, as a share of that of evenly spaced ones."""
 RANK = 1e-12
 """Relative eigenvalue of a block's regressors, per column, below which a direction counts as never moved."""
 
@@ -368,10 +370,10 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
     knots = [least, most]
     even = np.linspace(0, 1, CANDIDATES + 2)[1:-1]
     seen = np.unique([*np.quantile(values, even, method="nearest"), *(least + (most - least) * even)]).tolist()
+    room = CLOSEST * (most - least) / (count - 1)  # two knots within noise of one another have nothing between them
     while len(knots) < count:
-        trials = [
-            (*_left(some, row, sorted([*knots, s]), stride), s) for s in seen if least < s < most and s not in knots
-        ]
+        apart = [s for s in seen if min(abs(s - k) for k in knots) >= room]
+        trials = [(*_left(some, row, sorted([*knots, s]), stride), s) for s in apart]
         # an end that is rarely reached need not keep the others from knots of their own
         trials = [trial for trial in trials if trial[0] <= 2]
         if not trials:
