@@ -401,7 +401,7 @@ VERSIONS = {
     f"{when}{how}, {heard}": ("monitor", f"{when}{how}", outputs)
     for how in ("", " uncompiled")
     for when in ("before", "now")
-    for heard, outputs in (("all outputs heard", OUTPUTS), ("~/violation heard", ["violation"]))
+    for heard, outputs in (("all outputs heard", TOPICS), ("~/violation heard", ["violation"]))
 }
 """The monitor of another checkout beside that of this one, by `--before`."""
 LIMITS = (
