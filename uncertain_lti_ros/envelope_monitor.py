@@ -42,7 +42,7 @@ _SUMMARY = (
     "~/violation is the alarm. Needs the parameter model. Services: ~/status, ~/reset, ~/reload, ~/snapshot "
     "(std_srvs/srv/Trigger) and those of a managed node."
 )
-_POLL = 0.05  # s between two polls of the middleware: who listens, publishers that changed
+_POLL = 0.1  # s between two polls of the middleware: who listens, publishers that changed
 _TICK = 0.2  # s between two runs of the periodic tasks
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
 _NOTE = 0.05  # s between two checks for changes to log

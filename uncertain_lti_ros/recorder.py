@@ -20,7 +20,7 @@ from uncertain_lti_ros.subscriptions import MatchedSubscription
 from uncertain_lti_ros.terminal import Progress, hush, say, seconds, tell
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
-_POLL = 0.05  # s between two polls of the middleware
+_POLL = 0.1  # s between two polls of the middleware
 _LOOK = 0.5  # s between two looks at the graph
 _CHUNK = 1 << 20  # bytes
 
