@@ -168,6 +168,34 @@ class Contents:
         return read_block(self.path, block)
 
 
+def stored_bytes(path: Path, block: Block) -> bytes:
+    """Bytes of a block as they are in the file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    block : Block
+        Of the file.
+
+    Returns
+    -------
+    bytes
+        Compressed where the file is; fewer than the block has where the file changed.
+
+    Raises
+    ------
+    BagError
+        The file cannot be read any more.
+    """
+    try:
+        with open(path, "rb", buffering=0) as stream:
+            stream.seek(block.offset)
+            return stream.read(block.size)
+    except OSError as error:
+        raise os_error(path, error) from None
+
+
 def read_block(path: Path, block: Block) -> bytes:
     """Records of a block that `scan` found.
 
@@ -189,13 +217,7 @@ def read_block(path: Path, block: Block) -> bytes:
         The file changed, or cannot be read any more.
     """
     assert not block.unchecked
-    try:
-        with open(path, "rb", buffering=0) as stream:
-            stream.seek(block.offset)
-            data = stream.read(block.size)
-    except OSError as error:
-        raise os_error(path, error) from None
-    records, _ = inflate(block.compression, memoryview(data), block.length)
+    records, _ = inflate(block.compression, memoryview(stored_bytes(path, block)), block.length)
     if len(records) < block.length:
         raise BagError(f"{path}: the file changed while it was read; read it again when it is written")
     return bytes(records[: block.length])

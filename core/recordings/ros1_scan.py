@@ -29,6 +29,7 @@ from uncertain_lti.recordings.mcap_records import (
     count,
     inflate,
     message_record,
+    stored_bytes,
 )
 from uncertain_lti.recordings.mcap_scan import most_inflated, most_records
 from uncertain_lti.recordings.message_types import Definition, define, lines_of, normal_name, ros2_text
@@ -90,12 +91,7 @@ class Ros1Bag(Contents):
         BagError
             The file changed, or cannot be read any more.
         """
-        try:
-            with open(self.path, "rb", buffering=0) as stream:
-                stream.seek(block.offset)
-                data = stream.read(block.size)
-        except OSError as error:
-            raise os_error(self.path, error) from None
+        data = stored_bytes(self.path, block)
         records, _ = _inflate(block.compression, data, block.length)
         if len(data) < block.size or len(records) < block.length:
             raise BagError(f"{self.path}: the file changed while it was read; read it again when it is written")
