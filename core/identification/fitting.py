@@ -57,59 +57,45 @@ def fit(
     alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> UncertainLTI:
-    """Fit dx/dt = (A ± ΔA) x + (B ± ΔB) u so that the one-step bounds contain every recorded sample.
-
-    Leibov (2006), eq. (10), the least sum of squared widths weighted by W, or eq. (11), the least largest width
-    per row. Ties: for (11) the least sum of squared widths among its optima; then, for both, the least sum of
-    squared distances of the bounds' centre from the recorded next sample.
+    """`uncertain_lti.fit` with a schedule that is known: nothing is chosen here by what is left out.
 
     Parameters
     ----------
     transients : Transient or sequence of Transient
-        Recordings, of any lengths, of the same states and controls; never joined to one another.
+        As in `uncertain_lti.fit`.
     criterion : {"qp", "lp"}
-        Eq. (10) or eq. (11).
-    weights : array (n,), (N, n), (N, n, n), or a list with one of the latter two per transient, optional
-        W(t_{k+1}) for step k of N; positive; full matrices symmetric positive definite. Off-diagonal elements
-        couple the rows in (10); (11) uses the diagonal. Default ones.
+        As in `uncertain_lti.fit`.
+    weights : array, or list of array, optional
+        As in `uncertain_lti.fit`.
     additive : {"none", "disturbance", "noise", "both"}, optional
-        Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise). Default:
-        that of the signals file, else none.
+        As in `uncertain_lti.fit`.
     operating_point : OperatingPoint, optional
-        Steady state and scales; default: those of the transients' signals, or values used as they are.
+        As in `uncertain_lti.fit`.
     transient_weights : sequence of float, optional
-        One factor per transient on the weights of all its samples.
+        As in `uncertain_lti.fit`.
     count : {"sample", "transient"}
-        In (10) and (11), every sample weighs the same, or every transient does, however long it is.
+        As in `uncertain_lti.fit`.
     structure : Structure, optional
-        Elements that are known, or bounded. Default: the rules of the signals file, if it has any.
+        As in `uncertain_lti.fit`.
     schedule : Schedule or mapping, optional
-        Of a scheduled (piecewise-linear) model. A mapping has one or two signals, a state, a control or a further
-        scheduling signal, each with its knots in recorded units, with `Modes`, or with how many knots: then from the
-        least to the greatest recorded value, the inner ones where they shrink the largest residuals most. Default:
-        that of the signals file, else one block. With a schedule and an additive
-        term the drift c is unknown, too: it moves the steady state from knot to knot.
+        As there, without "auto", which is refused.
     discard : int or float, default 0
-        Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
-        their effect on the objective and listed in `model.fit_summary["discarded"]`, next to the widths with them.
+        As in `uncertain_lti.fit`.
     method : {"working-set", "cvxpy"}
-        cvxpy states the whole problem as written (OSQP, HiGHS); slow, without tie-breaks, for comparison.
+        As in `uncertain_lti.fit`.
     describe_data : bool, default True
-        Say in `model.fit_summary["messages"]` what the user should know; a fit of many need not.
+        As in `uncertain_lti.fit`.
     seek_carriers : bool
-        Say there as well which few transitions make a state's envelope much wider than the others need. Takes several
-        times as long as the fit; beyond 200 000 transitions it is not sought.
+        As in `uncertain_lti.fit`.
     alarm_rule : AlarmRule, optional
-        Goes to the model file.
+        As in `uncertain_lti.fit`.
     progress : callable, optional
-        Called with one line of text per pass over the data, and per discard.
+        As in `uncertain_lti.fit`.
 
     Returns
     -------
     UncertainLTI
-        With zero training transitions outside its own `bounds`. `fit_summary["messages"]` says in words what the user
-        should know; `fit_summary["optimality_gap"]` is the relative distance of the objective from a lower bound of
-        the optimum, None if no bound was found.
+        As of `uncertain_lti.fit`.
 
     Raises
     ------
