@@ -29,6 +29,7 @@ from uncertain_lti_ros.arguments import declare, run_node
 from uncertain_lti_ros.diagnostics import Diagnostics, input_values
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.parameters import PARAMETERS, RULE
+from uncertain_lti_ros.polled_events import POLL
 from uncertain_lti_ros.process import living, spare_the_middleware
 from uncertain_lti_ros.publishers import Outputs
 from uncertain_lti_ros.sessions import make_session
@@ -42,7 +43,6 @@ _SUMMARY = (
     "~/violation is the alarm. Needs the parameter model. Services: ~/status, ~/reset, ~/reload, ~/snapshot "
     "(std_srvs/srv/Trigger) and those of a managed node."
 )
-_POLL = 0.1  # s between two polls of the middleware: who listens, publishers that changed
 _TICK = 0.2  # s between two runs of the periodic tasks
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
 _NOTE = 0.05  # s between two checks for changes to log
@@ -106,7 +106,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.add_post_set_parameters_callback(self._on_have_set)
         tick = min(_TICK, self.settings.real("heartbeat") / 4, self.settings.real("diagnostics_period") / 2)
         self.create_timer(tick, self.tick, clock=self._steady)
-        self.create_timer(_POLL, self._on_poll, clock=self._steady)
+        self.create_timer(POLL, self._on_poll, clock=self._steady)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
 

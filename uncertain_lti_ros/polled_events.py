@@ -13,6 +13,9 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
+POLL = 0.1
+"""s between two polls: who listens, and publishers that changed, are known that late at most."""
+
 
 class PolledEvents:
     """Event handlers of one publisher or subscription, outside the executor.

@@ -15,12 +15,12 @@ from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti_ros.messages import definition, message_class
+from uncertain_lti_ros.polled_events import POLL
 from uncertain_lti_ros.process import Life, living
 from uncertain_lti_ros.subscriptions import MatchedSubscription
 from uncertain_lti_ros.terminal import Progress, hush, say, seconds, tell
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
-_POLL = 0.1  # s between two polls of the middleware
 _LOOK = 0.5  # s between two looks at the graph
 _CHUNK = 1 << 20  # bytes
 
@@ -122,7 +122,7 @@ def _record(life: Life, subscriptions: list[MatchedSubscription], file: _File, d
     looked = flushed = polled = time.monotonic()
     while life.alive:
         now = time.monotonic()
-        if now - polled > _POLL:
+        if now - polled > POLL:
             polled = now
             for subscription in subscriptions:
                 subscription.poll()
