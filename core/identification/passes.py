@@ -267,7 +267,7 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
             visits = np.array([len(block)])
         else:
             psi = block.psi(columns) if constant else block.psi(columns) * block.dt
-            largest = columns.regimes.weights(block.z, block.s).argmax(axis=0)
+            largest = columns.regimes.main_block(block.z, block.s)
             visits = np.bincount(largest, minlength=columns.count)
         step = block.x_next - block.z[:n]
         weights = block.weights
@@ -749,7 +749,7 @@ def block_widths(part: Partition, d: Array) -> tuple[Array, Array]:
     total, largest = np.zeros((columns.count, part.n)), np.zeros((columns.count, part.n))
     for block in _pieces(part):
         width = _product(np.ascontiguousarray(2.0 * d.T), block.psi(columns)) * block.dt
-        which = columns.regimes.weights(block.z, block.s).argmax(axis=0)
+        which = columns.regimes.main_block(block.z, block.s)
         for r in np.unique(which):
             own = width[:, which == r]
             total[r] += own.sum(axis=1)

@@ -101,6 +101,23 @@ class Regimes:
         """
         return self.schedule.weights(self.vectors(z, s))
 
+    def main_block(self, z: Array, s: Array | None) -> NDArray[np.intp]:
+        """The block of the largest weight.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array of int (K,)
+            Numbers of blocks.
+        """
+        return self.schedule.main_block(self.vectors(z, s))
+
 
 @dataclass(frozen=True)
 class Columns:

@@ -213,10 +213,10 @@ def place(schedule: Schedule, block: int, signals: Sequence[Signal]) -> str:
     """
     named = {s.name: s for s in signals}
     parts = []
-    for axis, index in zip(schedule.axes, schedule.indices[block], strict=True):
-        signal = named[axis.signal]
-        value = float(signal.steady) + float(signal.scale) * axis.values[index]
-        parts.append(f"{axis.signal} {'= ' if axis.modes else ''}{value:.6g}{' ' + signal.unit if signal.unit else ''}")
+    at = zip(schedule.axes, schedule.recorded_values(signals), schedule.indices[block], strict=True)
+    for axis, values, index in at:
+        unit = named[axis.signal].unit
+        parts.append(f"{axis.signal} {'= ' if axis.modes else ''}{values[index]:.6g}{' ' + unit if unit else ''}")
     return ", ".join(parts)
 
 
@@ -402,9 +402,7 @@ def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tupl
     phi = columns.phi(problem.z_columns, problem.s_columns) * problem.dt
     step = problem.next_columns - problem.z_columns[: problem.n]
     gram = phi @ phi.T
-    visits = each * np.bincount(
-        regimes.weights(problem.z_columns, problem.s_columns).argmax(axis=0), minlength=len(knots)
-    )
+    visits = each * np.bincount(regimes.main_block(problem.z_columns, problem.s_columns), minlength=len(knots))
     lacks = [bool(reason) for reason in lacking(gram, visits, columns, problem.p)]
     unit = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
     ridge = 1e-12 * np.eye(len(gram))

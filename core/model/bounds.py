@@ -736,8 +736,7 @@ class Judge:
             if places[0, 0] < 0:
                 return None
             both, v = blended(both, places, weights)[..., 0], blended(v, places, weights)[..., 0]
-            reliable = self._known[places[:, 0]] | ~(weights[:, 0] > 0.0)
-            unknown = bool(self._schedule.beyond(s[:, None])[0]) or not bool(reliable.all())
+            unknown = bool(self._schedule.unknown(s[:, None], places, weights, self._known)[0])
         rate, spread = ordered_sum(both, self._phi)
         centre, half = centre_of(z[:n], dt, rate), half_of(dt, spread, v)
         lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)

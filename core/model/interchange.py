@@ -16,7 +16,6 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.bounds import normalised
-from uncertain_lti.model.bounds import recorded as in_recorded_units
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -228,8 +227,7 @@ def _cells(values: Sequence[Any]) -> NDArray[np.object_]:
 def _schedule_variables(model: Any) -> dict[str, Any]:
     """Variables of a scheduled model beside its arrays."""
     point, schedule = model.operating_point, model.schedule
-    places = model.scheduling_positions
-    values = [_in_recorded_units(model, axis, i) for axis, i in zip(schedule.axes, places, strict=True)]
+    values = schedule.recorded_values(model.signals.signals)
     facts = model.block_data
     return {
         "schedule_signals": _cells([axis.signal for axis in schedule.axes]),
@@ -243,12 +241,6 @@ def _schedule_variables(model: Any) -> dict[str, Any]:
         "s_steady": point.s_s[:, None],
         "s_scale": point.S[:, None],
     }
-
-
-def _in_recorded_units(model: Any, axis: Axis, i: int) -> Array:
-    """Knots or modes of one axis whose signal is the i-th of [x; u; s]."""
-    point = model.operating_point
-    return np.asarray(in_recorded_units(np.array(axis.values), point.steady[i], point.scale[i]))
 
 
 def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
@@ -380,9 +372,10 @@ def _block_rows(data: dict[str, Any], R: int) -> list[tuple[float, float]]:
 
 def _changed(model: Any, kinds: Sequence[str], values: Sequence[Array]) -> Schedule:
     """The schedule of `model_json`, with the knots or modes that were changed since; the others keep their bits."""
-    axes = []
-    for axis, i, kind, there in zip(model.schedule.axes, model.scheduling_positions, kinds, values, strict=True):
-        point, written = model.operating_point, _in_recorded_units(model, axis, i)
+    axes, point, schedule = [], model.operating_point, model.schedule
+    before = schedule.recorded_values(model.signals.signals)
+    each = zip(schedule.axes, before, model.scheduling_positions, kinds, values, strict=True)
+    for axis, written, i, kind, there in each:
         at = normalised(there, point.steady[i], point.scale[i])
         if len(there) == len(written):
             at = np.where(there == written, axis.values, at)

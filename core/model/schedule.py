@@ -25,7 +25,8 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
-from uncertain_lti.model.bounds import weight_between
+from uncertain_lti.model.bounds import recorded, weight_between
+from uncertain_lti.signals.signal_map import Signal
 
 MOST_AXES = 2
 """Scheduling signals at most."""
@@ -244,6 +245,49 @@ class Schedule:
         dense[:, places[0] < 0] = np.nan
         return dense
 
+    def main_block(self, s: ArrayLike) -> NDArray[np.intp]:
+        """The block that has the largest weight, of two alike the first.
+
+        Parameters
+        ----------
+        s : array (axes, K)
+            Scheduling vectors, normalised.
+
+        Returns
+        -------
+        array of int (K,)
+            Numbers of blocks; -1 where a mode is not listed or a value is NaN.
+        """
+        places, weights = self.corners(s)
+        found: NDArray[np.intp] = np.take_along_axis(places, np.argmax(weights, axis=0)[None], axis=0)[0]
+        return found
+
+    def unknown(
+        self, s: ArrayLike, places: NDArray[np.intp], weights: Array, known: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Whether the regime is unknown: s lies beyond its end knots, or no recording visited a block that holds.
+
+        Compiled code has the same in `Judge._blend`.
+
+        Parameters
+        ----------
+        s : array (axes, K)
+            Scheduling vectors, normalised.
+        places : array of int (C, K)
+            Of `corners`.
+        weights : array (C, K)
+            Of `corners`.
+        known : array of bool (blocks,)
+            Blocks that a recording visited.
+
+        Returns
+        -------
+        array of bool (K,)
+            True where no bound can be trusted.
+        """
+        unknown: NDArray[np.bool_] = self.beyond(s) | ((weights > 0) & ~known[places]).any(axis=0)
+        return unknown
+
     def beyond(self, s: ArrayLike) -> NDArray[np.bool_]:
         """Whether s lies beyond the end knots of some axis, where the blocks of the end are used.
 
@@ -263,6 +307,27 @@ class Schedule:
             if axis.knots:
                 left |= (values < axis.knots[0]) | (values > axis.knots[-1])
         return left
+
+    def recorded_values(self, signals: Sequence[Signal]) -> list[Array]:
+        """Knots or modes in recorded units.
+
+        Parameters
+        ----------
+        signals : sequence of Signal
+            With the scheduling signals, their steady states and scales.
+
+        Returns
+        -------
+        list of array (knots or modes,)
+            One per axis.
+        """
+        named = {signal.name: signal for signal in signals}
+        return [
+            np.asarray(
+                recorded(np.array(axis.values), float(named[axis.signal].steady), float(named[axis.signal].scale))
+            )
+            for axis in self.axes
+        ]
 
     @property
     def words(self) -> str:

@@ -17,7 +17,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.bounds import Judge, blended, centre_and_half, lower_of, normalised, recorded, upper_of
+from uncertain_lti.model.bounds import Judge, blended, centre_and_half, lower_of, normalised, upper_of
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
 from uncertain_lti.model.operating_point import OperatingPoint
@@ -413,7 +413,7 @@ class UncertainLTI:
         s = z[self._positions]
         places, weights = self.schedule.corners(s)
         known = np.array([data.known for data in self.block_data])
-        return places[0] >= 0, self.schedule.beyond(s) | ((weights > 0) & ~known[places]).any(axis=0)
+        return places[0] >= 0, self.schedule.unknown(s, places, weights, known)
 
     @property
     def scheduling_positions(self) -> tuple[int, ...]:
@@ -435,10 +435,7 @@ class UncertainLTI:
         """
         if self.schedule is None:
             return np.zeros(z.shape[1], dtype=np.intp)
-        places, weights = self.schedule.corners(z[self._positions])
-        largest = np.argmax(weights, axis=0)
-        found: NDArray[np.intp] = np.take_along_axis(places, largest[None], axis=0)[0]
-        return found
+        return self.schedule.main_block(z[self._positions])
 
     def why_unknown(self, values: Sequence[float]) -> str:
         """In words, why the regime of a sample is unknown.
@@ -458,10 +455,10 @@ class UncertainLTI:
         found = []
         point = self.operating_point
         z = normalised(np.asarray(values, dtype=np.float64), point.steady, point.scale)[self._positions]
-        for axis, i, s in zip(self.schedule.axes, self._positions, z.tolist(), strict=True):
-            ends = recorded(np.array([axis.values[0], axis.values[-1]]), point.steady[i], point.scale[i])
+        knots = self.schedule.recorded_values(self.signals.signals)
+        for axis, at, i, s in zip(self.schedule.axes, knots, self._positions, z.tolist(), strict=True):
             if axis.knots and not axis.knots[0] <= s <= axis.knots[-1]:
-                found.append(f"{axis.signal} = {values[i]:.6g} is beyond its knots {ends[0]:.6g} to {ends[1]:.6g}")
+                found.append(f"{axis.signal} = {values[i]:.6g} is beyond its knots {at[0]:.6g} to {at[-1]:.6g}")
         places, weights = (a[:, 0] for a in self.schedule.corners(z[:, None]))
         for r in places[(weights > 0) & (places >= 0)].tolist():
             if not self.block_data[r].known:
@@ -483,12 +480,9 @@ class UncertainLTI:
         """
         if self.schedule is None:
             return ""
-        point, signals = self.operating_point, self.signals.signals
-        parts = []
-        for axis, place, i in zip(self.schedule.axes, self.schedule.indices[r], self._positions, strict=True):
-            value = float(recorded(axis.values[place], float(point.steady[i]), float(point.scale[i])))
-            parts.append(f"{axis.signal} = {value:.6g} {signals[i].unit}".rstrip())
-        return ", ".join(parts)
+        signals = self.signals.signals
+        at = zip(self.schedule.recorded_values(signals), self.schedule.indices[r], self._positions, strict=True)
+        return ", ".join(f"{signals[i].name} = {values[k]:.6g} {signals[i].unit}".rstrip() for values, k, i in at)
 
     def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
         """What judges one transition after another by the bounds of this model.

@@ -368,9 +368,8 @@ def knots_of(model: UncertainLTI, signal: str) -> list[float]:
     """
     if model.schedule is None:
         return []
-    named = {s.name: s for s in model.signals.signals}
-    steady, scale = float(named[signal].steady), float(named[signal].scale)
-    return [steady + scale * v for axis in model.schedule.axes if axis.signal == signal for v in axis.values]
+    at = zip(model.schedule.axes, model.schedule.recorded_values(model.signals.signals), strict=True)
+    return [value for axis, values in at if axis.signal == signal for value in values.tolist()]
 
 
 def _fold(transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI, folds: int) -> Fold:

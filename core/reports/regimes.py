@@ -41,18 +41,16 @@ def block_facts(model: UncertainLTI) -> list[dict[str, Any]]:
         return []
     point = model.operating_point
     fitted = list_of(model.fit_summary.get("blocks"))
+    knots = model.schedule.recorded_values(model.signals.signals)
     facts = []
     for r, (data, values) in enumerate(zip(model.block_data, model.eigenvalues(), strict=True)):
         said = fitted[r] if r < len(fitted) and isinstance(fitted[r], Mapping) else {}
         widths = [numbers_of(said.get(key), model.n) for key in ("mean_width", "max_width")]
-        axes = zip(model.schedule.axes, model.schedule.indices[r], model.scheduling_positions, strict=True)
+        axes = zip(model.schedule.axes, knots, model.schedule.indices[r], strict=True)
         facts.append(
             {
                 "regime": model.block_name(r),
-                "at": {
-                    axis.signal: float(recorded(axis.values[k], float(point.steady[i]), float(point.scale[i])))
-                    for axis, k, i in axes
-                },
+                "at": {axis.signal: float(values_of[k]) for axis, values_of, k in axes},
                 "transitions": data.transitions,
                 "tied_to": data.tied_to,
                 "known": data.known,

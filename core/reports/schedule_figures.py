@@ -13,7 +13,6 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.bounds import recorded
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.reports.drawing import (
@@ -117,9 +116,7 @@ def _across(schedule: Schedule) -> tuple[int, int | None]:
 
 def _values(model: UncertainLTI, k: int) -> Array:
     """Knots or modes of one axis in recorded units."""
-    schedule, i = _schedule(model), model.scheduling_positions[k]
-    point = model.operating_point
-    return np.asarray(recorded(np.array(schedule.axes[k].values), point.steady[i], point.scale[i]))
+    return _schedule(model).recorded_values(model.signals.signals)[k]
 
 
 def _axis_name(model: UncertainLTI, k: int) -> str:
@@ -289,7 +286,7 @@ def _elements_map(model: UncertainLTI, nominal: Array, half: Array, columns: Seq
 
 def _block_labels(model: UncertainLTI) -> list[str]:
     """Values of the scheduling signals of each block."""
-    values = [_values(model, k) for k in range(len(_schedule(model).axes))]
+    values = _schedule(model).recorded_values(model.signals.signals)
     return [", ".join(_value(values[k][place]) for k, place in enumerate(index)) for index in _schedule(model).indices]
 
 
