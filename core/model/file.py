@@ -19,6 +19,7 @@ from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
+from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked
 from uncertain_lti.signals.signal_map import SignalMap
@@ -60,7 +61,7 @@ def structure(model: Any) -> dict[str, Any]:
     s = model.sampling
     arrays = [name for name in ARRAYS if name in _IN_EVERY_FILE or getattr(model, name).any()]
     scheduled = model.schedule is not None
-    newer = scheduled or model.domain.measure is not None or model.signals.table is not None
+    newer = scheduled or model.domain.measure is not None or model.signals.table is not None or bool(model.horizons)
     regimes: dict[str, Any] = {}
     if scheduled:
         regimes["schedule"] = model.schedule.to_list()
@@ -88,6 +89,7 @@ def structure(model: Any) -> dict[str, Any]:
         }
         | ({} if model.signals.table is None else {"table": model.signals.table.to_dict()}),
         **(regimes if scheduled else {name: getattr(model, name).tolist() for name in arrays}),
+        **({"horizons": [horizon.to_dict() for horizon in model.horizons]} if model.horizons else {}),
         "domain": {
             name: [v if math.isfinite(v) else None for v in getattr(model.domain, name).tolist()]
             for name in ("x_min", "x_max", "u_min", "u_max")
@@ -133,6 +135,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     scheduled = data["format"] != FORMATS[0] and "schedule" in data
     known = {"format", "states", "controls", "sampling", "domain", "alarm", "fit", "validation"}
     known |= {"schedule", "scheduling", "blocks"} if scheduled else set(ARRAYS)
+    known |= {"horizons"} if data["format"] != FORMATS[0] else set()
     for name in ("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)):
         if name not in data:
             raise ModelError(f"field '{name}' is missing; fit the model again")
@@ -177,6 +180,8 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     if not scheduled:
         checked(data["A"], "A", (n, n))  # against the names, before A says how many rows the others have
         checked(data["B"], "B", (n, m))
+    blocks = regimes["schedule"].blocks if scheduled else None
+    horizons = Horizon.list_from(data["horizons"], n, m, blocks) if "horizons" in data else ()
     domain = None
     if "domain" in data:
         sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
@@ -197,6 +202,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     return {
         **arrays,
         **regimes,
+        "horizons": horizons,
         "signals": signals,
         "sampling": sampling,
         "domain": domain,

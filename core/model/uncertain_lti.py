@@ -20,6 +20,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.bounds import Judge, blended, centre_and_half, lower_of, normalised, upper_of
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
+from uncertain_lti.model.horizon import Horizon, checked_horizons
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
@@ -61,6 +62,8 @@ class UncertainLTI:
         Weights of the blocks; None for one block.
     block_data : sequence of BlockData, optional
         What the fit knows of each block; default nothing.
+    horizons : sequence of Horizon, optional
+        Envelopes over several steps; default none. The model has them sorted, the shortest first.
     signals : SignalMap, optional
         Names, topics, operating point; default names x1, x2, ..., u1, u2, ... and values used as they are.
     sampling : Sampling, optional
@@ -92,6 +95,7 @@ class UncertainLTI:
         *,
         schedule: Schedule | None = None,
         block_data: Sequence[BlockData] | None = None,
+        horizons: Sequence[Horizon] = (),
         signals: SignalMap | None = None,
         sampling: Sampling | None = None,
         domain: Domain | None = None,
@@ -126,6 +130,7 @@ class UncertainLTI:
             setattr(self, name, checked(value, name, shape, half_width))
         for name in ARRAYS:
             getattr(self, name).flags.writeable = False
+        self.horizons = checked_horizons(horizons, self.A.shape, m)
         if signals is None:
             signals = SignalMap(
                 tuple(Signal(f"x{i + 1}", "", f"x{i + 1}") for i in range(n)),
@@ -256,6 +261,8 @@ class UncertainLTI:
             text += f": {', '.join(self.control_names)}"
         if self.schedule is not None:
             text += f"; {plural(self.schedule.blocks, 'block')} over {self.schedule.words}"
+        if self.horizons:
+            text += f"; horizons of {', '.join(str(horizon.steps) for horizon in self.horizons)} steps"
         if "criterion" in self.fit_summary:
             count = plural(self.fit_summary.get("transitions"), "transition")
             text += f"; fitted by {self.fit_summary['criterion']} to {count}"
@@ -683,8 +690,8 @@ class UncertainLTI:
         arguments = {
             name: getattr(self, name)
             for name in (
-                *ARRAYS, "schedule", "block_data", "signals", "sampling", "domain", "alarm_rule", "fit_summary",
-                "validation",
+                *ARRAYS, "schedule", "block_data", "horizons", "signals", "sampling", "domain", "alarm_rule",
+                "fit_summary", "validation",
             )
         }  # fmt: skip
         return UncertainLTI(**{**arguments, **changes})

@@ -175,6 +175,11 @@ class Verdict:
         """Where between its bounds the sample lies (n,)."""
         return np.array(self.numbers("utilisation"), dtype=np.float64)
 
+    @property
+    def horizon_utilisation(self) -> Array:
+        """The same for one step and for each of the model's horizons (H, n); NaN where a window is broken."""
+        return self.utilisation[None]
+
 
 @cache
 def _packer(n: int) -> Callable[..., bytes]:
@@ -268,6 +273,11 @@ class Verdicts:
             for k in np.flatnonzero(which):
                 kinds[k] = kind
         return kinds
+
+    @property
+    def horizon_utilisation(self) -> Array:
+        """Utilisation for one step and for each of the model's horizons (N+1, H, n); NaN where a window is broken."""
+        return self.utilisation[:, None]
 
     @property
     def state(self) -> Array:

@@ -1,0 +1,221 @@
+"""Horizon: the envelope of the state several steps after a measured one.
+
+The nominal model is run from the measured x_k with the recorded controls over h steps to x̂; with T = Σ Δt_j and the
+mean control ū = Σ Δt_j u_j / T,
+
+    centre = x̂ + T (A' x_k + B' ū + c')
+    half   = T (ΔA |x_k| + ΔB |ū| + Δc) + v
+
+The sum is a small correction of the run, by elements of the horizon's own. With a schedule the run is blended at every
+step by the recorded scheduling vector, and the elements of the horizon by that at the start.
+"""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked, tables
+
+Widths = Literal["growing", "constant"]
+"""Half-widths that grow with |x| and |u|, or are the same everywhere."""
+MOST_STEPS = 10_000
+"""Steps of a horizon at most: so many runs are under way at a time."""
+
+
+class Horizon:
+    """Elements of the envelope after a number of steps.
+
+    Parameters
+    ----------
+    steps : int
+        h, at least 2.
+    A : array (n, n), or (R, n, n) with a schedule, and so for those that follow
+        Correction of the centre, A', 1/s.
+    B : array (n, m)
+        B', 1/s.
+    dA : array (n, n)
+        Half-widths on |x_k|, 1/s.
+    dB : array (n, m)
+        Half-widths on |ū|, 1/s.
+    c : array (n,), optional
+        c', 1/s; 0 by default.
+    dc : array (n,), optional
+        Half-width, 1/s; 0 by default.
+    v : array (n,), optional
+        Half-width that T does not multiply, normalised; 0 by default.
+    widths : {"growing", "constant"}, default "growing"
+        Constant if dA, dB and dc are 0.
+
+    Raises
+    ------
+    ModelError
+        The steps or the widths are not such, shapes do not fit, a number is not finite, or a half-width is negative.
+    """
+
+    def __init__(
+        self,
+        steps: int,
+        A: ArrayLike,
+        B: ArrayLike,
+        dA: ArrayLike,
+        dB: ArrayLike,
+        c: ArrayLike | None = None,
+        dc: ArrayLike | None = None,
+        v: ArrayLike | None = None,
+        widths: Widths = "growing",
+    ) -> None:
+        if isinstance(steps, bool) or not isinstance(steps, int) or not 2 <= steps <= MOST_STEPS:
+            raise ModelError(f"horizons: steps is {steps!r}; it must be a whole number, 2 to {MOST_STEPS}")
+        if widths not in get_args(Widths):
+            raise ModelError(f"horizon of {steps} steps: widths is {widths!r}; it must be growing or constant")
+        self.steps, self.widths = steps, widths
+        here = f"horizon of {steps} steps: "
+        self.A: Array = checked(A, f"{here}A", None)
+        self.B: Array
+        self.dA: Array
+        self.dB: Array
+        self.c: Array
+        self.dc: Array
+        self.v: Array
+        if self.A.ndim not in (2, 3) or self.A.shape[-1] != self.A.shape[-2] or not self.A.size:
+            raise ModelError(f"{here}A has shape {self.A.shape}; it must be square, once for each block of a schedule")
+        lead, n = self.A.shape[:-2], self.A.shape[-1]
+        given: dict[str, Any] = {"A": A, "B": B, "dA": dA, "dB": dB, "c": c, "dc": dc, "v": v}
+        whole = checked(B, f"{here}B", None)
+        m = whole.shape[-1] if whole.size else 0
+        for name in ARRAYS:
+            shape = (*lead, *SHAPES[name].shape(n, m))
+            value = np.zeros(shape) if given[name] is None and name not in REQUIRED else given[name]
+            array = checked(value, f"{here}{name}", shape, name in HALF_WIDTHS)
+            array.flags.writeable = False
+            setattr(self, name, array)
+        if widths == "constant" and (self.dA.any() or self.dB.any() or self.dc.any()):
+            raise ModelError(
+                f"horizon of {steps} steps: widths are constant, and dA, dB or dc is not 0; call it growing"
+            )
+
+    def __repr__(self) -> str:
+        return f"Horizon({self.steps} steps, {self.widths} half-widths)"
+
+    @property
+    def lead(self) -> tuple[int, ...]:
+        """Number of blocks, (R,); () without a schedule."""
+        return self.A.shape[:-2]
+
+    @cached_property
+    def tables(self) -> tuple[Array, Array, Array]:
+        """Nominal elements and half-widths side by side, and what T does not multiply (`terms.tables`)."""
+        return tables({name: getattr(self, name) for name in ARRAYS})
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it is in a model file.
+
+        Returns
+        -------
+        dict
+            Steps, widths, and the arrays of each block.
+        """
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        if not self.lead:
+            arrays = {name: value[None] for name, value in arrays.items()}
+        blocks = [{name: value[r].tolist() for name, value in arrays.items()} for r in range(len(arrays["v"]))]
+        return {"steps": self.steps, "widths": self.widths, "blocks": blocks}
+
+    @classmethod
+    def list_from(cls, data: Any, n: int, m: int, blocks: int | None) -> tuple[Horizon, ...]:
+        """From a model file.
+
+        Parameters
+        ----------
+        data : Any
+            A list of what `to_dict` gives.
+        n : int
+            Number of states.
+        m : int
+            Number of controls.
+        blocks : int or None
+            Number of blocks of the schedule; None without one.
+
+        Returns
+        -------
+        tuple of Horizon
+            As listed.
+
+        Raises
+        ------
+        ModelError
+            It is not that; names the field.
+        """
+        if not isinstance(data, list):
+            raise ModelError("field 'horizons' is not a list of horizons")
+        found = []
+        for i, entry in enumerate(data):
+            here = f"horizons[{i}]"
+            if not isinstance(entry, dict) or "steps" not in entry or "blocks" not in entry:
+                raise ModelError(f"field '{here}' must be an object with 'steps', 'widths' and 'blocks'")
+            if unknown := set(entry) - {"steps", "widths", "blocks"}:
+                raise ModelError(f"unknown field '{here}.{min(unknown)}'; known are blocks, steps, widths")
+            parts = entry["blocks"]
+            if not isinstance(parts, list) or len(parts) != (blocks or 1):
+                raise ModelError(f"field '{here}.blocks' must be a list of {plural(blocks or 1, 'block')}")
+            arrays: dict[str, list[Array]] = {name: [] for name in ARRAYS}
+            for r, part in enumerate(parts):
+                if not isinstance(part, dict):
+                    raise ModelError(f"field '{here}.blocks[{r}]' is not an object")
+                if unknown := set(part) - set(ARRAYS):
+                    raise ModelError(
+                        f"unknown field '{here}.blocks[{r}].{min(unknown)}'; known are {', '.join(ARRAYS)}"
+                    )
+                for name in ARRAYS:
+                    shape = SHAPES[name].shape(n, m)
+                    if name not in part and name in REQUIRED:
+                        raise ModelError(f"field '{here}.blocks[{r}].{name}' is missing; fit the model again")
+                    value = np.zeros(shape) if part.get(name) is None else part[name]
+                    arrays[name].append(checked(value, f"{here}.blocks[{r}].{name}", shape, name in HALF_WIDTHS))
+            stacked = {name: values[0] if blocks is None else np.stack(values) for name, values in arrays.items()}
+            found.append(cls(entry["steps"], **stacked, widths=entry.get("widths", "growing")))
+        return tuple(found)
+
+
+def checked_horizons(horizons: Sequence[Horizon], shape: tuple[int, ...], m: int) -> tuple[Horizon, ...]:
+    """Horizons of one model, the shortest first.
+
+    Parameters
+    ----------
+    horizons : sequence of Horizon
+        In any order.
+    shape : tuple of int
+        Of the model's A.
+    m : int
+        Number of controls.
+
+    Returns
+    -------
+    tuple of Horizon
+        Sorted by their steps.
+
+    Raises
+    ------
+    ModelError
+        Two have as many steps, or one does not fit the model.
+    """
+    ordered = tuple(sorted(horizons, key=lambda horizon: horizon.steps))
+    steps = [horizon.steps for horizon in ordered]
+    if len(set(steps)) < len(steps):
+        raise ModelError(f"horizons: two have as many steps, {reprlib.repr(steps)}; give each once")
+    for horizon in ordered:
+        if horizon.A.shape != shape or horizon.B.shape != (*shape[:-1], m):
+            raise ModelError(
+                f"horizon of {horizon.steps} steps: A {horizon.A.shape} and B {horizon.B.shape} do not fit the model, "
+                f"whose A is {shape}, with {plural(m, 'control')}"
+            )
+    return ordered
