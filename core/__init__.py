@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from uncertain_lti.sampling.reading import read_transients as read_transients
     from uncertain_lti.sampling.transient import Transient as Transient
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
-    from uncertain_lti.validation.left_out import validate as validate
+    from uncertain_lti.validation.fitted_model import validate as validate
 
 __version__ = "0.1.0"
 
@@ -27,7 +27,7 @@ _HOME = {
     "UncertainLTI": "model.uncertain_lti",
     "fit": "proposal.fitting",
     "read_transients": "sampling.reading",
-    "validate": "validation.left_out",
+    "validate": "validation.fitted_model",
 }
 
 __all__ = sorted(_HOME)

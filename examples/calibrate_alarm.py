@@ -17,7 +17,7 @@ def main() -> None:
     runs = read_transients([bags / f"turbofan_{n}.mcap" for n in names], ROOT / "config" / "signals" / "turbofan.yaml")
     model = fit(runs, criterion="lp", additive="noise")
 
-    validation = validate(runs, blocks=10, full=model, criterion="lp", additive="noise")
+    validation = validate(model, runs, blocks=10)
     calibration = calibrate(validation, TARGET)
     print(calibration.words)
     if calibration.alarm_rule is None:

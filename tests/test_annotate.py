@@ -215,7 +215,7 @@ def nothing_said():
 
     nothing = Transient(np.empty(0), np.empty((0, 5)), np.empty((0, 4)))
     none = np.empty(0, dtype=np.int64)
-    return EnvelopeMonitor(leibov2006()).check(nothing), Decisions(none, none, none == 0)
+    return EnvelopeMonitor(leibov2006()).check(nothing), Decisions(none, none, none == 0, none)
 
 
 # --- layouts of files -----------------------------------------------------------------------------------------

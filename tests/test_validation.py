@@ -12,10 +12,12 @@ from engine_bag import engine_bag
 from scipy import stats
 from tanks import DT, Tanks
 
+import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.reports.validation_text import validation_text
 from uncertain_lti.validation.blocks import cut, remaining_spans
 from uncertain_lti.validation.calibration import calibrate, detection
 from uncertain_lti.validation.fitted_model import leave_out_with_fit, validate_model
@@ -644,3 +646,47 @@ def test_gas_turbine_recordings_do_not_repeat_one_another_and_validation_says_so
     assert apart["inside_interval"][1] - apart["inside_interval"][0] > 0.9
     blocks = validate(read_transients([folder / "ex_1.mcap", folder / "ex_20.mcap"], signals), blocks=5).to_dict()
     assert blocks["inside"] > 0.99
+
+
+# --- one call ---
+
+
+def test_a_model_is_validated_with_its_own_settings(runs):
+    """validate(model, runs) is validate(runs, ...) with every setting of the fit given again by hand."""
+    model = fit(runs[:6], "lp", additive="noise", schedule={"x1": 2}, alarm_rule=AlarmRule(2, 3), count="transient")
+    mine = uncertain_lti.validate(model, runs[:6], confidence=0.8).to_dict()
+    by_hand = validate(
+        runs[:6], full=model, criterion="lp", additive="noise", count="transient", confidence=0.8
+    ).to_dict()
+    assert mine == by_hand and mine["false_alarms"][0]["violations"] == 2
+    other = validate(runs[:6], criterion="qp", additive="noise").to_dict()
+    assert mine["states"] != other["states"]
+    assert (
+        uncertain_lti.validate(runs[:6], additive="noise").to_dict() == validate(runs[:6], additive="noise").to_dict()
+    )
+
+
+def test_a_model_is_not_validated_with_other_settings_or_nothing(runs):
+    model = fit(runs[:3], additive="noise")
+    with pytest.raises(FitError, match=r"give the recordings .* validate\(model, runs\)"):
+        uncertain_lti.validate(model)
+    with pytest.raises(FitError, match="criterion: a model is validated with its own settings"):
+        uncertain_lti.validate(model, runs[:3], criterion="lp")
+    with pytest.raises(FitError, match="twice"):
+        uncertain_lti.validate(runs[:3], runs[:3])
+
+
+def test_each_part_is_reported(validation, runs):
+    data = validation.to_dict()
+    for g, (found, run) in enumerate(zip(data["part"], runs, strict=True)):
+        model = fit(runs[:g] + runs[g + 1 :], additive="noise")
+        verdicts = EnvelopeMonitor(model, 2, 3).check(run)
+        largest = np.nanmax(np.abs(verdicts.utilisation), axis=0)
+        assert found["alarms"] == np.count_nonzero(np.diff(verdicts.alarm.astype(int)) == 1)
+        assert (
+            found["farthest"] == pytest.approx(largest.max()) and found["farthest_state"] == f"x{largest.argmax() + 1}"
+        )
+        assert found["alarm_share"] == pytest.approx(verdicts.alarm.mean() * 101 / 100)
+    text = validation_text(data)
+    assert all(run.name in text for run in runs)
+    assert "and 5 more recordings" in validation_text({**data, "part": data["part"] * 2 + data["part"][:1]})

@@ -19,6 +19,7 @@ from uncertain_lti.cli.command import (
     print_notes,
     print_summary,
 )
+from uncertain_lti.cli.deployed import add_rule_arguments, check_recording, deployed_monitor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,11 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
     parser.add_argument("bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag, tables) and folders")
-    parser.add_argument("--violations", type=int, help="alarm: number of violations (default: the model's)")
-    parser.add_argument(
-        "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"
-    )
-    parser.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
+    add_rule_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
     parser.add_argument(
         "--write",
@@ -65,15 +62,13 @@ def run(options: argparse.Namespace) -> int:
     UncertainLTIError
         The model or the only recording cannot be read, or a copy cannot be written.
     """
-    from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.base.english import plural
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.check_data import check_data, outcome
     from uncertain_lti.reports.check_text import check_text
-    from uncertain_lti.sampling.reading import read_as_fitted_with_decisions
 
     model = load_model(options.model)
-    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
+    deployed = deployed_monitor(options, model)
     bags = group_recordings(options.bags, layout=model.signals.table)
     copies: Sequence[Path | None] = [None] * len(bags)
     if options.write is not None:
@@ -85,21 +80,20 @@ def run(options: argparse.Namespace) -> int:
     for bag, copy in zip(bags, copies, strict=True):
         try:
             reading = options.progress.iterate("reading")
-            transient, decisions = read_as_fitted_with_decisions(bag, model.signals, reading)
+            verdicts, decisions = check_recording(deployed, bag, reading)
         except (BagError, SignalError) as error:
             if len(bags) == 1:
                 raise
             refused.append({"recording": str(bag.path), "error": str(error)})
             complain("check", str(error))
             continue
-        print_notes(options, transient.notes)
-        verdicts = monitor.check(transient)
+        print_notes(options, verdicts.transient.notes)
         data = check_data(model, verdicts, samples=options.json)
         results.append(data)
-        print_summary(options, check_text(data))
+        print_summary(options, check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
         if copy is not None:
             writing = options.progress.iterate("writing")
-            made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, monitor.rule, writing)
+            made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, deployed.monitor.rule, writing)
             print_notes(options, made.notes)
             data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
             print_summary(
@@ -112,7 +106,15 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         of_all = "unknown" if refused and status != ALARM else outcome(results)
         ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}
-        print_json({"model": options.model, **ended, "recordings": results, "not_checked": refused})
+        print_json(
+            {
+                "model": options.model,
+                "deployed": deployed.words(),
+                **ended,
+                "recordings": results,
+                "not_checked": refused,
+            }
+        )
     return status
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, print_json, print_notes, print_summary
+from uncertain_lti.cli.deployed import add_rule_arguments, check_recording, deployed_monitor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag, tables) and folders to check against it"
     )
+    add_rule_arguments(parser)
     parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
     parser.add_argument("--json", action="store_true", help="print the same facts as JSON")
 
@@ -41,23 +43,21 @@ def run(options: argparse.Namespace) -> int:
     UncertainLTIError
         The model or a recording cannot be read, or the page cannot be written.
     """
-    from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.findings import findings
     from uncertain_lti.reports.findings_text import findings_text
     from uncertain_lti.reports.page_file import page_target
-    from uncertain_lti.sampling.reading import read_as_fitted
 
     model = load_model(options.model)
     bags = group_recordings(options.bags, layout=model.signals.table)
     output = page_target(options.output or (None if options.json else "report.html"), options.model, bags)
-    monitor = EnvelopeMonitor(model)
+    deployed = deployed_monitor(options, model)
     checked = []
     for bag in bags:
-        transient = read_as_fitted(bag, model.signals, options.progress.iterate("reading"))
-        print_notes(options, transient.notes)
-        checked.append(monitor.check(transient))
-    facts = findings(model, options.model, checked, monitor.rule)
+        verdicts, _ = check_recording(deployed, bag, options.progress.iterate("reading"))
+        print_notes(options, verdicts.transient.notes)
+        checked.append(verdicts)
+    facts = findings(model, options.model, checked, deployed.monitor.rule, deployed.words())
     print_summary(options, findings_text(facts))
     if output is not None:
         from uncertain_lti.reports.html import html_report

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.signals.field_path import FieldPath
@@ -94,6 +98,21 @@ class Condition:
         return f"{self.topic} {self.field.text} {self.operator} {self.value:g}"
 
 
+class Armed(NamedTuple):
+    """Which samples of a recording may raise the alarm.
+
+    Parameters
+    ----------
+    counts : array (N+1,) of bool
+        Whether the verdict on the sample counts; otherwise there is no alarm after it.
+    cleared : array (N+1,) of bool
+        Whether the alarm starts over before the verdict on the sample.
+    """
+
+    counts: NDArray[np.bool_]
+    cleared: NDArray[np.bool_]
+
+
 class Arming:
     """Whether a verdict may raise the alarm.
 
@@ -180,6 +199,45 @@ class Arming:
         if self._from is None:
             self._from = t_ns + self._grace
         return t_ns >= self._from
+
+    def over(
+        self,
+        t_ns: NDArray[np.int64],
+        before: NDArray[np.intp] | Sequence[int] = (),
+        values: ArrayLike = (),
+    ) -> Armed:
+        """`learn` and `at` over the samples of a recording, as the live session calls them one after the other.
+
+        Parameters
+        ----------
+        t_ns : array (N+1,) of int
+            Instants of the samples, ns; a step back starts the grace time over.
+        before : array (K,) of int
+            Samples decided before each value of the condition's field came, in order.
+        values : array (K,)
+            These values.
+
+        Returns
+        -------
+        Armed
+            Of each sample.
+        """
+        count = len(t_ns)
+        if self.condition is None and not self._grace:
+            return Armed(np.ones(count, dtype=bool), np.zeros(count, dtype=bool))
+        counts, cleared = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+        arrived = zip(np.asarray(before).tolist(), np.asarray(values, dtype=np.float64).tolist(), strict=True)
+        due, value = next(arrived, (count, 0.0))
+        last = None
+        for k, instant in enumerate(t_ns.tolist()):
+            while due <= k:
+                self.learn(value)
+                cleared[k] |= not self.on
+                due, value = next(arrived, (count, 0.0))
+            if last is not None and instant < last:
+                self.restart()
+            counts[k], last = self.at(instant), instant
+        return Armed(counts, cleared | ~counts)
 
     def why_off(self) -> str:
         """Why alarms do not count, in words; empty if they do.

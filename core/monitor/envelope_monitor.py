@@ -30,6 +30,7 @@ from uncertain_lti.model.bounds import (
 )
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import AlarmStatistic, AlarmWindow, raised
+from uncertain_lti.monitor.arming import Armed
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
@@ -215,6 +216,8 @@ class Verdicts:
     unknown_regime : array (N+1,) of bool
         A scheduling signal lies beyond the end knots, or no recording visited the regime; then the sample counts as
         outside the domain, too.
+    asked : array (N+1,) of bool, optional
+        Whether a verdict was asked for; default all.
     """
 
     transient: Transient
@@ -228,6 +231,7 @@ class Verdicts:
     unfitted_step: NDArray[np.bool_]
     unlisted_mode: NDArray[np.bool_]
     unknown_regime: NDArray[np.bool_]
+    asked: NDArray[np.bool_] | None = None
 
     def __repr__(self) -> str:
         judged, left = int(self.judged.sum()), int(self.violated.sum())
@@ -262,8 +266,8 @@ class Verdicts:
         Returns
         -------
         list of Status
-            N+1, as of `Transient.statuses`, with STEP where a step is out of the range of the fit, and MODE where the
-            model lists no such mode.
+            N+1, as of `Transient.statuses`, with STEP where a step is out of the range of the fit, MODE where the
+            model lists no such mode, and UNASKED where no verdict was asked for.
         """
         kinds = self.transient.statuses()
         for k in np.flatnonzero(~self.judged):
@@ -272,6 +276,9 @@ class Verdicts:
         for which, kind in ((self.unfitted_step, Status.STEP), (self.unlisted_mode, Status.MODE)):
             for k in np.flatnonzero(which):
                 kinds[k] = kind
+        if self.asked is not None:
+            for k in np.flatnonzero(~self.asked):
+                kinds[k] = Status.UNASKED
         return kinds
 
     @property
@@ -289,6 +296,20 @@ class Verdicts:
         """Whether some state left its bounds, (N+1,)."""
         left: NDArray[np.bool_] = (self.flags == 1.0).any(axis=1)
         return left
+
+
+def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int, int]]:
+    """[start, stop) of samples over which the alarm goes on from a cleared one; others raise none."""
+    count = len(t_ns)
+    restarts = np.zeros(count, dtype=bool)
+    restarts[1:] = np.diff(t_ns) < 0
+    counts = np.ones(count, dtype=bool)
+    if armed is not None:
+        counts, restarts = armed.counts, restarts | armed.cleared
+    edges = np.flatnonzero(restarts | np.append(True, counts[1:] != counts[:-1])[:count])
+    if not count:
+        return []
+    return [(int(a), int(b)) for a, b in zip(edges, [*edges[1:], count], strict=True) if counts[a]]
 
 
 class EnvelopeMonitor:
@@ -456,13 +477,15 @@ class EnvelopeMonitor:
             window.push(judgement.violation)
         return Verdict(step, window.alarm, judgement)
 
-    def check(self, transient: Transient) -> Verdicts:
+    def check(self, transient: Transient, armed: Armed | None = None) -> Verdicts:
         """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.
 
         Parameters
         ----------
         transient : Transient
             In recorded units.
+        armed : Armed, optional
+            Which samples may raise the alarm, of `Arming.over`; default all.
 
         Returns
         -------
@@ -515,8 +538,7 @@ class EnvelopeMonitor:
         outside[arrival] = unknown | model.domain.outside(z[:n].T, z[n : n + model.m].T)
         violated = ((flags == 1.0) & self._counted).any(axis=1)
         alarm = np.zeros(count, dtype=bool)
-        resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
-        for start, stop in zip([0, *resets], [*resets, count], strict=True):
+        for start, stop in _alarm_spans(transient.t_ns, armed):
             after = raised(violated[start:stop][judged[start:stop]], self.rule)
             held = np.concatenate([[False], after])  # without a verdict the alarm stays as it was
             alarm[start:stop] = held[np.cumsum(judged[start:stop])]

@@ -11,6 +11,7 @@ from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Arming, Condition
+from uncertain_lti.monitor.deployed import condition_words
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
@@ -85,8 +86,25 @@ class Rule:
         ModelError
             The two do not fit.
         """
-        masked = [name.strip() for name in self.masked.split(",") if name.strip()]
-        return EnvelopeMonitor(model, self.violations or None, self.window or None, self.margin or None, masked)
+        return EnvelopeMonitor(
+            model, self.violations or None, self.window or None, self.margin or None, listed_states(self.masked)
+        )
+
+
+def listed_states(text: str) -> list[str]:
+    """Names of states, separated by commas.
+
+    Parameters
+    ----------
+    text : str
+        Of the parameter `masked`.
+
+    Returns
+    -------
+    list of str
+        The names.
+    """
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 @dataclass(frozen=True)
@@ -744,9 +762,7 @@ class Session:
         rule = self.rule
         parts = [f"alarm when {self.rule_text()}", f"margin {self.monitor.rule.margin:g}"]
         parts += [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
-        parts += [f"as long as {self.arming.condition}"] if self.arming.condition else []
-        parts += [f"grace {rule.grace:g} s"] if rule.grace else []
-        parts += ["latched"] if rule.latch else []
+        parts += condition_words(self.arming.condition, rule.grace, rule.latch)
         return ", ".join(parts)
 
     def _report_state(self, i: int, name: str, period: Period, without: float, timeout: float) -> Report:

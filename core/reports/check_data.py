@@ -49,6 +49,8 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     t = transient.t_ns
     judged = int(verdicts.judged.sum())
     odd = [(int(verdicts.unfitted_step.sum()), Status.STEP), (int(verdicts.unlisted_mode.sum()), Status.MODE)]
+    if verdicts.asked is not None:
+        odd.append((int((~verdicts.asked).sum()), Status.UNASKED))
     width = np.where(verdicts.judged[:, None], verdicts.upper - verdicts.lower, np.nan)
     states = {}
     for i, name in enumerate(model.state_names):

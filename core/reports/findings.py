@@ -34,6 +34,7 @@ def findings(
     model_file: str | os.PathLike[str],
     checked: Sequence[Verdicts],
     rule: AlarmRule | None = None,
+    conditions: str = "",
 ) -> dict[str, Any]:
     """Facts about a model and about recordings that were checked against it.
 
@@ -47,6 +48,8 @@ def findings(
         One per recording, of `EnvelopeMonitor.check`.
     rule : AlarmRule, optional
         The alarm rule of the check; default the model's.
+    conditions : str, default ""
+        What else the alarm depended on, in words.
 
     Returns
     -------
@@ -69,7 +72,12 @@ def findings(
         "rely": {"answer": answer(for_and_against), "reasons": for_and_against},
         "happened": [_happened(r) for r in recordings],
         "alarm": any(r["alarm"] for r in recordings),
-        "rule": {"violations": rule.violations, "window": rule.window, "margin": rule.margin},
+        "rule": {
+            "violations": rule.violations,
+            "window": rule.window,
+            "margin": rule.margin,
+            "conditions": conditions,
+        },
         "model": _model(model, model_file),
         "validation": validation,
         "recordings": recordings,

@@ -146,10 +146,11 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
     if rely["answer"] == NO and look == "bad":
         items += '<li class="soft">The model is not to be relied on: the machine may be well, and the model wrong.</li>'
     rule = facts["rule"]
+    conditions = f", {rule['conditions']}" if rule["conditions"] else ""
     return (
         f"<header><h1>{_text(name)}</h1>"
         f'<p class="soft">{_text(_summary(facts))}. Alarm rule: {_rule(rule)}, margin '
-        f"{number(rule['margin'])}.</p>"
+        f"{number(rule['margin'])}{_text(conditions)}.</p>"
         '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a>'
         + '<a href="#regimes">Regimes</a>'
         * bool(facts["model"]["regimes"])

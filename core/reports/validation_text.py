@@ -8,6 +8,9 @@ from typing import Any
 from uncertain_lti.base.english import plural
 from uncertain_lti.reports.tables import number, table
 
+MOST_PARTS = 20
+"""Recordings or blocks that the table of each names, those with most alarms first."""
+
 
 def validation_text(data: dict[str, Any]) -> str:
     """Summary of `Validation.to_dict()`, with the calibration if there is one, for a person.
@@ -74,6 +77,7 @@ def validation_text(data: dict[str, Any]) -> str:
                 ],
             )
         )
+    lines += _each(data, what)
     if "condition" in data:
         lines.append(data["condition"])
     lines.append(data["scenario"]["words"])
@@ -82,6 +86,29 @@ def validation_text(data: dict[str, Any]) -> str:
         if warning := data["calibration"].get("warning"):  # files written before it was stored have none
             lines.append(f"warning: {warning}")
     return "\n".join(lines + [f"note: {note}" for note in data["notes"]])
+
+
+def _each(data: dict[str, Any], what: str) -> list[str]:
+    """What was found on each part, those with most alarms and violations first."""
+    parts = [p for p in data.get("part", []) if "alarms" in p]  # files written before they were counted have none
+    if not parts:
+        return []
+    worst = sorted(parts, key=lambda p: (-p["alarms"], -p["violated"] / max(p["verdicts"], 1)))
+    rows = [
+        [
+            p["name"],
+            str(p["verdicts"]),
+            f"{1 - p['violated'] / p['verdicts']:.3%}" if p["verdicts"] else "-",
+            f"{p['outside_domain'] / p['verdicts']:.2%}" if p["verdicts"] else "-",
+            str(p["alarms"]),
+            "-" if p["alarm_share"] is None else f"{p['alarm_share']:.3%}",
+            "-" if p["farthest"] is None else f"{p['farthest_state']}, {p['farthest']:.3g} x",
+        ]
+        for p in worst[:MOST_PARTS]
+    ]
+    header = (what, "verdicts", "inside", "outside domain", "alarms", "time in alarm", "farthest, in half-widths")
+    more = len(parts) - MOST_PARTS
+    return [table(header, rows), *([f"  and {plural(more, f'more {what}')}; --json has all"] if more > 0 else [])]
 
 
 def left_out_text(data: dict[str, Any]) -> str:

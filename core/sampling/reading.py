@@ -328,6 +328,53 @@ def read_as_fitted_with_decisions(
     return sample(stream, signals, progress), decisions
 
 
+def read_field(
+    recording: Recording, signals: SignalMap, decisions: Decisions, topic: str, field: FieldPath
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """A field of any topic, and after which samples of the same recording its values came.
+
+    Parameters
+    ----------
+    recording : Recording
+        The recording.
+    signals : SignalMap
+        Of the model.
+    decisions : Decisions
+        Of `read_as_fitted_with_decisions`.
+    topic : str
+        Topic of the field.
+    field : FieldPath
+        The field.
+
+    Returns
+    -------
+    array (K,) of int
+        Samples that were decided before each message came.
+    array (K,)
+        The values; NaN where a message has no such number.
+
+    Raises
+    ------
+    BagError
+        The recording lacks the topic, or it cannot be decoded.
+    SignalError
+        The field is not in the message type, or is not one number.
+    """
+    if topic not in recording.topics:
+        raise BagError(no_topic(recording, topic))
+    field.check(topic, recording.topics[topic].type, recording.type_fields(topic))
+    clock = signals.clock or ""
+    topics, paths = [topic], [[field]]
+    if clock != topic:
+        topics.append(clock)
+        paths.append([FieldPath(signals.signals[signals.on(clock)[0]].field)])
+    columns = recording.columns(topics, paths)
+    of_field = columns.topic == 0
+    is_clock = of_field if clock == topic else ~of_field
+    came = np.cumsum(is_clock)[of_field] - (clock == topic)  # clock messages before it; it goes with its own
+    return np.searchsorted(decisions.by[~decisions.dropped], came), columns.values[0][:, 0]
+
+
 def _stream_for_model(
     recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> Stream:

@@ -66,11 +66,14 @@ class Decisions:
         Its own instant, ns.
     dropped : array (M,) of bool
         It made no sample. The others are the samples of `sample_arrays`, one after the other.
+    by : array (M,) of int
+        Which clock message decided it, counted in order of arrival.
     """
 
     arrival: Integers
     t_ns: Integers
     dropped: Mask
+    by: Integers
 
 
 class _BackwardError(Exception):
@@ -148,7 +151,7 @@ def decided(
         by[kept[-1:]] = len(instants)
     order = np.lexsort((np.arange(len(by)), ~dropped, by))
     order = order[by[order] < len(instants)]
-    return Decisions(clock.arrival[by[order]], instants[order], dropped[order])
+    return Decisions(clock.arrival[by[order]], instants[order], dropped[order], by[order])
 
 
 @dataclass(frozen=True)

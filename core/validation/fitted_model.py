@@ -12,13 +12,58 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.validation import left_out
 from uncertain_lti.validation.blocks import BLOCKS
 from uncertain_lti.validation.groups import resolve_groups
-from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.result import Validation
 
 LIMIT = 1e9
 """Elements of all left-out problems together up to which a fit leaves out as well: some minutes."""
+
+
+def validate(
+    subject: UncertainLTI | Sequence[Transient] | Transient,
+    transients: Sequence[Transient] | Transient | None = None,
+    **options: Any,
+) -> Validation:
+    """Leave out one recording or group at a time, fit to the others, and judge what was left out.
+
+    `validate(model, runs)` fits with the model's own settings: criterion, additive terms, structure, discards, schedule
+    and the groups of its fit. `validate(runs)` fits as `fit(runs)` does.
+
+    Parameters
+    ----------
+    subject : UncertainLTI, Transient or sequence of Transient
+        A fitted model; or the recordings.
+    transients : Transient or sequence of Transient, optional
+        With a model, the recordings that it was fitted to.
+    **options : object
+        With a model those of `validate_model` (blocks, gap, groups, confidence, progress); else those of
+        `left_out.validate`, which takes those of `fit` as well (criterion, additive, ...).
+
+    Returns
+    -------
+    Validation
+        The parts, each judged by the model that was fitted without it.
+
+    Raises
+    ------
+    FitError
+        As of `validate_model` and `left_out.validate`; or a model is given without recordings, or recordings twice.
+    """
+    if isinstance(subject, UncertainLTI):
+        if transients is None:
+            raise FitError("a model alone says nothing; give the recordings it was fitted to: validate(model, runs)")
+        runs = [transients] if isinstance(transients, Transient) else list(transients)
+        if further := sorted(set(options) - {"blocks", "gap", "groups", "confidence", "progress"}):
+            raise FitError(
+                f"{', '.join(further)}: a model is validated with its own settings; leave this out, or give the "
+                f"recordings alone: validate(runs, {further[0]}=...)"
+            )
+        return validate_model(subject, runs, **options)
+    if transients is not None:
+        raise FitError("recordings are given twice; write validate(model, runs) or validate(runs)")
+    return left_out.validate(subject, **options)
 
 
 def validate_model(
@@ -43,25 +88,26 @@ def validate_model(
     transients : sequence of Transient
         The recordings it was fitted to.
     blocks : int, optional
-        As in `validate`.
+        As in `left_out.validate`.
     gap : float, optional
-        As in `validate`.
+        As in `left_out.validate`.
     groups : sequence or str, optional
-        As in `validate`; "none" leaves out single recordings nevertheless.
+        As in `left_out.validate`; "none" leaves out single recordings nevertheless.
     confidence : float, default 0.9
-        As in `validate`.
+        As in `left_out.validate`.
     progress : callable, optional
-        As in `validate`.
+        As in `left_out.validate`.
 
     Returns
     -------
     Validation
-        As of `validate`.
+        As of `left_out.validate`.
 
     Raises
     ------
     FitError
-        As of `validate`; or the model does not state how it was fitted, or a fit to the recordings gives another model.
+        As of `left_out.validate`; or the model does not state how it was fitted, or a fit to the recordings gives
+        another model.
     """
     if isinstance(groups, str) and groups == "none":
         groups = None
@@ -75,7 +121,7 @@ def validate_model(
             "these recordings do not give this model again, so what was left out of them would say nothing about it; "
             "name the recordings it was fitted to, or fit it again"
         )
-    return validate(
+    return left_out.validate(
         transients,
         operating_point=model.operating_point,
         alarm_rule=model.alarm_rule,
@@ -108,7 +154,7 @@ def leave_out_with_fit(
     model : UncertainLTI
         Fitted to them.
     groups : sequence or str, optional
-        As in `validate`.
+        As in `left_out.validate`.
     progress : callable, optional
         Called with one line of text per fit.
     limit : float, default LIMIT
@@ -135,7 +181,7 @@ def leave_out_with_fit(
     if model.fit_summary.get("weights", "ones") != "ones":
         return {"not_done": "the weights belong to the samples; use validate() from Python"}
     try:
-        return validate(
+        return left_out.validate(
             transients,
             operating_point=model.operating_point,
             alarm_rule=model.alarm_rule,

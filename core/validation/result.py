@@ -172,11 +172,29 @@ def summary(validation: Validation) -> dict[str, Any]:
         "states": states,
         "false_alarms": alarms,
         "scenario": scenario(model, parts, v.what, v.confidence),
-        "part": [
-            {"name": p.name, "verdicts": p.judged, "violated": p.violated, "outside_domain": p.outside_domain}
-            for p in parts
-        ],
+        "part": [_part(p, model) for p in parts],
         "notes": _notes(v),
+    }
+
+
+def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
+    """What was found on one part: counts, alarms of the model's rule, and the state that went farthest."""
+    rule = model.alarm_rule
+    farthest: dict[str, Any] = {"farthest": None, "farthest_state": None}
+    if part.judged:
+        k, i = np.unravel_index(int(np.argmax(np.abs(part.utilisation))), part.utilisation.shape)
+        value = abs(float(part.utilisation[k, i]))
+        farthest = {"farthest": value if math.isfinite(value) else None, "farthest_state": model.state_names[int(i)]}
+    return {
+        "name": part.name,
+        "verdicts": part.judged,
+        "violated": part.violated,
+        "outside_domain": part.outside_domain,
+        "alarms": part.alarms(rule),
+        "alarm_share": float(part.dt[part.level(rule.violations, rule.window) > rule.margin].sum() / part.dt.sum())
+        if part.judged
+        else None,
+        **farthest,
     }
 
 

@@ -1,0 +1,122 @@
+"""Options of `check` and `report` that say how the monitor is deployed, and the check that takes them."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from uncertain_lti import UncertainLTI
+    from uncertain_lti.monitor.deployed import DeployedMonitor
+    from uncertain_lti.monitor.envelope_monitor import Verdicts
+    from uncertain_lti.recordings.recording import Progress, Recording
+    from uncertain_lti.sampling.sampler_arrays import Decisions
+
+
+def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the alarm rule, as the node has them as parameters.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
+    parser.add_argument("--violations", type=int, help="alarm: number of violations (default: the model's)")
+    parser.add_argument(
+        "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"
+    )
+    parser.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
+    parser.add_argument(
+        "--masked", default="", metavar="STATES", help="states, separated by commas, that never raise the alarm"
+    )
+    parser.add_argument(
+        "--enable",
+        default="",
+        metavar="CONDITION",
+        help="no alarm unless this holds: TOPIC FIELD OPERATOR NUMBER, such as '/engine/mode data == 3'",
+    )
+    parser.add_argument(
+        "--grace",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="no alarm for so many s after the first sample, a reset, and after --enable began to hold",
+    )
+    parser.add_argument("--latch", action="store_true", help="an alarm lasts to the end of the recording")
+    parser.add_argument(
+        "--from", dest="start", type=float, metavar="S", help="judge from so many s after the first sample on"
+    )
+    parser.add_argument(
+        "--to", dest="stop", type=float, metavar="S", help="judge up to so many s after the first sample"
+    )
+
+
+def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> DeployedMonitor:
+    """The monitor that the options of `add_rule_arguments` describe.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments.
+    model : UncertainLTI
+        The model.
+
+    Returns
+    -------
+    DeployedMonitor
+        With a cleared alarm.
+
+    Raises
+    ------
+    ModelError
+        An option does not fit the model, or is out of range.
+    """
+    from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.monitor.arming import Condition
+    from uncertain_lti.monitor.deployed import DeployedMonitor
+    from uncertain_lti.monitor.session import listed_states
+
+    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin, listed_states(options.masked))
+    return DeployedMonitor(
+        monitor, Condition.parse(options.enable), options.grace, options.latch, options.start, options.stop
+    )
+
+
+def check_recording(
+    deployed: DeployedMonitor, recording: Recording, progress: Progress | None = None
+) -> tuple[Verdicts, Decisions]:
+    """Read one recording and judge it as the node would.
+
+    Parameters
+    ----------
+    deployed : DeployedMonitor
+        Of `deployed_monitor`.
+    recording : Recording
+        The recording.
+    progress : Progress, optional
+        As in `read_transients`.
+
+    Returns
+    -------
+    Verdicts
+        Of every sample.
+    Decisions
+        Of every clock message.
+
+    Raises
+    ------
+    BagError
+        The recording cannot be read, or lacks a topic.
+    SignalError
+        The model or the condition does not fit the recording.
+    ModelError
+        No sample lies in the time asked for.
+    """
+    from uncertain_lti.sampling.reading import read_as_fitted_with_decisions, read_field
+
+    signals = deployed.monitor.model.signals
+    transient, decisions = read_as_fitted_with_decisions(recording, signals, progress)
+    if (condition := deployed.condition) is None:
+        return deployed.check(transient), decisions
+    heard = read_field(recording, signals, decisions, condition.topic, condition.field)
+    return deployed.check(transient, *heard), decisions

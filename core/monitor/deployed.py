@@ -1,0 +1,167 @@
+"""DeployedMonitor: judges a recording as the node would, with everything that keeps its alarm quiet or raised."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.monitor.arming import Arming, Condition
+from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdicts
+from uncertain_lti.sampling.instants import to_ns
+from uncertain_lti.sampling.transient import Transient
+
+LONGEST_GRACE = 86400.0
+"""s; that of the node's parameter."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DeployedMonitor:
+    """A monitor with the conditions of its deployment.
+
+    Parameters
+    ----------
+    monitor : EnvelopeMonitor
+        With rule and masked states.
+    condition : Condition, optional
+        No alarm unless it holds.
+    grace : float, default 0.0
+        No alarm this long, s, after the first sample, after time jumped back, and after the condition began to hold.
+    latch : bool, default False
+        An alarm lasts to the end.
+    start : float, optional
+        Only samples from here on are judged, s after the first sample of the recording: as if the node were started
+        then, with the condition known.
+    stop : float, optional
+        Only samples up to here are judged, s after the first sample.
+
+    Raises
+    ------
+    ModelError
+        A time is out of range.
+    """
+
+    monitor: EnvelopeMonitor
+    condition: Condition | None = None
+    grace: float = 0.0
+    latch: bool = False
+    start: float | None = None
+    stop: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.grace <= LONGEST_GRACE:
+            raise ModelError(f"grace is {self.grace}; it must be 0 to {LONGEST_GRACE:g} s")
+        for name, value in (("from", self.start), ("to", self.stop)):
+            if value is not None and not math.isfinite(value):
+                raise ModelError(f"{name} is {value}; give seconds after the first sample")
+        if self.start is not None and self.stop is not None and not self.start < self.stop:
+            raise ModelError(f"from {self.start:g} s to {self.stop:g} s leaves nothing to judge; give a later end")
+
+    def check(
+        self, transient: Transient, before: NDArray[np.intp] | Sequence[int] = (), values: ArrayLike = ()
+    ) -> Verdicts:
+        """Verdicts over a recording with the alarm that the node would have published.
+
+        Parameters
+        ----------
+        transient : Transient
+            In recorded units.
+        before : array (K,) of int
+            Samples decided before each value of the condition's field came, of `read_field`.
+        values : array (K,)
+            These values.
+
+        Returns
+        -------
+        Verdicts
+            One row per sample; without a verdict outside `start` to `stop`.
+
+        Raises
+        ------
+        ModelError
+            As `EnvelopeMonitor.check`; or no sample lies between `start` and `stop`.
+        """
+        t, count = transient.t, len(transient)
+        inside = np.ones(count, dtype=bool)
+        if self.start is not None:
+            inside &= t >= self.start
+        if self.stop is not None:
+            inside &= t <= self.stop
+        a, b = 0, count
+        if not inside.all():
+            if not inside.any():
+                raise ModelError(f"{transient.name}: no sample lies between the times asked for; it has {t[-1]:g} s")
+            chosen = np.flatnonzero(inside)
+            a, b = int(chosen[0]), int(chosen[-1]) + 1
+        part = transient if (a, b) == (0, count) else transient.replace(slice(a, b))
+        arming = Arming(self.condition, to_ns(self.grace))
+        came, heard = np.asarray(before, dtype=np.intp) - a, np.asarray(values, dtype=np.float64)
+        for value in heard[came < 0][-1:].tolist():
+            arming.learn(value)
+        later = came >= 0
+        verdicts = self.monitor.check(part, arming.over(part.t_ns, came[later], heard[later]))
+        if part is not transient:
+            verdicts = _padded(verdicts, transient, a, b)
+        if self.latch:
+            verdicts = dataclasses.replace(verdicts, alarm=np.logical_or.accumulate(verdicts.alarm))
+        return verdicts
+
+    def words(self) -> str:
+        """What differs from a monitor without conditions.
+
+        Returns
+        -------
+        str
+            Clauses; empty if nothing does.
+        """
+        return ", ".join(
+            [
+                *([f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []),
+                *condition_words(self.condition, self.grace, self.latch),
+                *([] if self.start is None else [f"from {self.start:g} s"]),
+                *([] if self.stop is None else [f"to {self.stop:g} s"]),
+            ]
+        )
+
+
+def condition_words(condition: Condition | None, grace: float, latch: bool) -> list[str]:
+    """When an alarm counts and how long it lasts, in words.
+
+    Parameters
+    ----------
+    condition : Condition or None
+        No alarm unless it holds.
+    grace : float
+        Time of grace, s.
+    latch : bool
+        Whether an alarm lasts.
+
+    Returns
+    -------
+    list of str
+        A clause for each that is set.
+    """
+    return [
+        *([f"as long as {condition}"] if condition else []),
+        *([f"grace {grace:g} s"] if grace else []),
+        *(["latched"] if latch else []),
+    ]
+
+
+def _padded(verdicts: Verdicts, whole: Transient, start: int, stop: int) -> Verdicts:
+    """Verdicts on samples start..stop-1 as rows of the whole recording, without a verdict elsewhere."""
+    changes: dict[str, object] = {"transient": whole}
+    for field in dataclasses.fields(verdicts):
+        values = getattr(verdicts, field.name)
+        if isinstance(values, np.ndarray):
+            full = np.full((len(whole), *values.shape[1:]), np.nan if values.dtype.kind == "f" else 0, values.dtype)
+            full[start:stop] = values
+            changes[field.name] = full
+    asked = np.zeros(len(whole), dtype=bool)
+    asked[start:stop] = True
+    changes["asked"] = asked
+    return dataclasses.replace(verdicts, **changes)  # type: ignore[arg-type]

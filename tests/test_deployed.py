@@ -1,0 +1,173 @@
+"""The rule of a deployment, tried on a recording: the alarm that the live session raises on the same messages."""
+
+import json
+
+import numpy as np
+import pytest
+from bag_writer import JAZZY, Message, Topic, cdr, header, write
+from engine_bag import joint_state
+
+from uncertain_lti import EnvelopeMonitor, fit, read_transients
+from uncertain_lti.cli.main import main
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.monitor.arming import Arming, Condition
+from uncertain_lti.monitor.session import Rule, Session, topic_types
+from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.message_reader import MessageReader
+from uncertain_lti.sampling.status import Status
+
+SIGNALS = """
+states:
+  - {name: fan, topic: /engine/state, field: "position[fan_speed]"}
+  - {name: core, topic: /engine/state, field: "position[compressor_speed]"}
+  - {name: hot, topic: TEMPERATURE, field: "FIELD"}
+controls:
+  - {name: fuel, topic: /engine/control, field: "position[main_fuel_flow]"}
+  - {name: area, topic: /engine/control, field: "position[nozzle_throat_area]"}
+"""
+FAN, CORE, HOT = "fan_speed", "compressor_speed", "turbine_exit_total_temperature"
+
+
+def record(path, modes, seed=1, steps=300, fault_at=None):
+    """A run of the published engine, with modes {sample: value} that come just before that sample's state."""
+    plant = transient(steps, seed, start_ns=10**18, fault_at=fault_at)
+    messages = []
+    for k, t in enumerate(plant.t_ns.tolist()):
+        for value in modes.get(k, ()):
+            messages.append(Message("/mode", t - 1, cdr("std_msgs/msg/UInt8", data=value), t - 1))
+        x = dict(zip(plant.state_names, plant.x[k], strict=True))
+        hot = cdr("sensor_msgs/msg/Temperature", header=header(t), temperature=x[HOT], variance=0.0)
+        messages.append(Message("/engine/hot", t, hot, t))
+        messages.append(Message(STATE_TOPIC, t, joint_state(plant.state_names, plant.x[k], t), t))
+        messages.append(Message(CONTROL_TOPIC, t, joint_state(plant.control_names, plant.u[k], t), t))
+    kinds = {STATE_TOPIC: "sensor_msgs/msg/JointState", CONTROL_TOPIC: "sensor_msgs/msg/JointState"}
+    kinds |= {"/engine/hot": "sensor_msgs/msg/Temperature", "/mode": "std_msgs/msg/UInt8"}
+    return write([Topic(name, kind) for name, kind in kinds.items()], messages).save(path)
+
+
+@pytest.fixture(scope="module", params=["one topic", "two topics"])
+def machine(request, tmp_path_factory):
+    """A model, its file, and a recording with a fault and changing modes; states on one topic or on two."""
+    folder = tmp_path_factory.mktemp("deployed")
+    topic, field = (
+        ("/engine/hot", "temperature") if request.param == "two topics" else (STATE_TOPIC, f"position[{HOT}]")
+    )
+    (folder / "signals.yaml").write_text(SIGNALS.replace("TEMPERATURE", topic).replace("FIELD", field))
+    record(folder / "healthy.mcap", {0: [3]})
+    modes = {20: [3], 100: [1], 130: [3], 190: [1, 3], 220: [1], 221: [3]}
+    record(folder / "run.mcap", modes, seed=2, fault_at=60)
+    model = fit(read_transients(folder / "healthy.mcap", folder / "signals.yaml"), alarm_rule=AlarmRule(2, 5))
+    model.save(folder / "m.model.json")
+    return model, folder
+
+
+def live(model, bag, rule):
+    """Instants at which the session has an alarm, and all instants that it judged."""
+    fields = {t: bag.type_fields(t) for t in bag.topics}
+    of_type = {info.type: fields[t] for t, info in bag.topics.items()}
+
+    def type_fields(name):
+        return next(f for f in [of_type.get(name), *of_type.values()] if f is not None)(name)
+
+    def reader(name, paths):
+        return MessageReader(name, paths, type_fields, lambda data: JAZZY.deserialize_cdr(data, name))
+
+    session = Session(model, rule, topic_types(model, "the model", type_fields), type_fields, reader, 0.0)
+    if rule.enable and not session.enable_type:
+        session.found_enable_type(bag.topics[session.enable_topic].type)
+    found = []
+    for message in bag.raw_messages():
+        verdicts, _ = session.take(message.channel.topic, message.log_time_ns, message.data, 0.0)
+        found += [(v.t_ns, v.alarm or session.latched) for v in verdicts if not v.status.dropped]
+    return found
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"masked": "fan, hot"},
+        {"enable": "/mode data == 3"},
+        {"enable": "/mode data == 3", "grace": 0.4},
+        {"grace": 2.0},
+        {"latch": True},
+        {"enable": "/engine/state position[fan_speed] > 0.01", "latch": True},
+    ],
+)
+def test_a_recording_is_judged_as_the_session_judges_its_messages(machine, options, capsys):
+    model, folder = machine
+    expected = live(model, Bag(folder / "run.mcap"), Rule(**options))
+    words = [w for k, v in options.items() for w in ([f"--{k}"] if v is True else [f"--{k}", str(v)])]
+    status = main(["check", str(folder / "m.model.json"), str(folder / "run.mcap"), "--json", *words])
+    data = json.loads(capsys.readouterr().out)
+    found = [(v["t_ns"], v["alarm"]) for v in data["recordings"][0]["verdict_per_sample"]]
+    assert found == expected
+    raised = [alarm for _, alarm in expected]
+    assert status == int(any(raised)) and 0 < sum(raised) < len(raised)
+    assert main(["report", str(folder / "m.model.json"), str(folder / "run.mcap"), "--json", *words]) == status
+    report = json.loads(capsys.readouterr().out)
+    assert report["recordings"][0]["alarms"] == data["recordings"][0]["alarms"]
+    assert report["rule"]["conditions"] == data["deployed"]
+
+
+def test_from_and_to_judge_that_time_alone(machine, capsys):
+    model, folder = machine
+    name = [str(folder / "m.model.json"), str(folder / "run.mcap")]
+    (run,) = read_transients(folder / "run.mcap", model.signals)
+    whole = EnvelopeMonitor(model).check(run)
+    assert main(["check", *name, "--from", "1.0", "--to", "1.5", "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)["recordings"][0]
+    inside = (run.t >= 1.0) & (run.t <= 1.5)
+    first = int(np.flatnonzero(inside)[0])
+    assert data["verdicts"] == inside.sum() - 1
+    assert f"{(~inside).sum()} {Status.UNASKED.value}" in data["no_verdict"]
+    assert all(
+        v["flags"] == [None] * 3 for v, there in zip(data["verdict_per_sample"], inside, strict=True) if not there
+    )
+    k = first + 5
+    assert data["verdict_per_sample"][k]["lower"] == whole.lower[k].tolist()  # the time of a row stays its own
+    assert data["verdict_per_sample"][k]["t_ns"] == run.t_ns[k]
+    assert main(["check", *name, "--from", "3.0"]) == 1
+    said = capsys.readouterr().out
+    assert "from 3 s" in said and "first at" in said
+    first_alarm = float(said.split("first at ")[1].split()[0])
+    assert first_alarm >= 3.0
+    out = folder / "copy.mcap"
+    out.unlink(missing_ok=True)
+    assert main(["check", *name, "--from", "3.0", "--write", str(out)]) == 1
+    assert out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--masked", "nobody"], "masked state 'nobody' is not in the model"),
+        (["--enable", "mode is 3"], "write TOPIC FIELD OPERATOR NUMBER"),
+        (["--enable", "/nowhere data == 3"], "there is no topic /nowhere"),
+        (["--enable", "/mode date == 3"], "date"),
+        (["--grace", "-1"], "grace is -1"),
+        (["--grace", "nan"], "grace is nan"),
+        (["--from", "5", "--to", "4"], "leaves nothing to judge"),
+        (["--from", "1e6"], "no sample lies between"),
+    ],
+)
+@pytest.mark.parametrize("command", ["check", "report"])
+def test_what_cannot_be_deployed_is_refused(machine, command, options, words, capsys, tmp_path, monkeypatch):
+    _, folder = machine
+    monkeypatch.chdir(tmp_path)
+    assert main([command, str(folder / "m.model.json"), str(folder / "run.mcap"), *options]) == 2
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1, said
+
+
+def test_a_looped_recording_starts_the_grace_over():
+    """Of arrays: the alarm may count again after the grace, in each pass."""
+    t_ns = np.array([0, 1, 2, 3, 0, 1, 2, 3], dtype=np.int64) * 10**9
+    armed = Arming(None, 2 * 10**9).over(t_ns)
+    assert armed.counts.tolist() == [False, False, True, True, False, False, True, True]
+    assert armed.cleared.tolist() == [True, True, False, False, True, True, False, False]
+    condition = Condition.parse("/mode data == 1")
+    armed = Arming(condition, 0).over(t_ns[:4], [1, 3, 3], [1.0, 0.0, 1.0])
+    assert armed.counts.tolist() == [False, True, True, True]
+    assert armed.cleared.tolist() == [True, False, False, True]  # it went off and on between two samples
