@@ -335,7 +335,7 @@ def fit_fleet(
             model, describe_on, sums, mean_width, max_width, transients, few, discarded if criterion == "qp" else None
         )
         facts["messages"] += _distance(gap)
-    return model.replace(fit_summary=facts)
+    return model.replace(fit_summary=facts, residuals=fleet.residuals(model))
 
 
 def _block_facts(

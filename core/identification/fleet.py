@@ -15,6 +15,7 @@ from uncertain_lti.identification import passes
 from uncertain_lti.identification.passes import Candidate, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Columns, Partition, Problem
 from uncertain_lti.model.domain import Occupancy, cells_for
+from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 T = TypeVar("T")
@@ -173,6 +174,28 @@ class Fleet:
         """
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
+
+    def residuals(self, model: UncertainLTI) -> Residuals:
+        """Mean and covariance of what the centre of one step leaves unexplained.
+
+        Parameters
+        ----------
+        model : UncertainLTI
+            Gives the centre.
+
+        Returns
+        -------
+        Residuals
+            Over all partitions.
+        """
+        results = self.map(passes.residual_sums, self._same(model))
+        mean = np.sum([r[0] for r in results], axis=0) / self.N
+        products = np.sum([r[1] for r in results], axis=0) / self.N
+        covariance = products - np.outer(mean, mean)
+        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        if values[0] < 0.0:  # by rounding
+            covariance = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        return Residuals(mean, 0.5 * (covariance + covariance.T))
 
     def block_widths(self, d: Array) -> tuple[Array, Array]:
         """Widths at the transitions of each block; see `passes.block_widths`.

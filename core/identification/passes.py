@@ -727,6 +727,33 @@ def _judged_in_doubt(block: Block, model: UncertainLTI, known: Array) -> Judged 
     return Judged(outside, largest, largest * np.sqrt(block.weights))
 
 
+def residual_sums(part: Partition, model: UncertainLTI) -> tuple[Array, Array]:
+    """Sums of the residual of every transition, r = x_next - centre, and of its products.
+
+    Parameters
+    ----------
+    part : Partition
+        The transitions.
+    model : UncertainLTI
+        Gives the centre.
+
+    Returns
+    -------
+    array (n,)
+        Σ r.
+    array (n, n)
+        Σ r rᵀ.
+    """
+    total, products = np.zeros(part.n), np.zeros((part.n, part.n))
+    for block in _pieces(part):
+        centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
+        model.columns_centre_and_half(block.signals, block.dt, centre, half)
+        r = block.x_next - centre
+        total += r.sum(axis=1)
+        products += _gram(r, r)
+    return total, products
+
+
 def block_widths(part: Partition, d: Array) -> tuple[Array, Array]:
     """Widths per step at the transitions of each block, those of which it has the largest weight.
 

@@ -1,20 +1,35 @@
-"""AlarmRule: which verdicts raise the alarm."""
+"""Alarm rules: which verdicts, and which statistics of them over a window, raise the alarm."""
 
 from __future__ import annotations
 
+import math
 import reprlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.base.limits import LARGEST, LONGEST_S
+from uncertain_lti.model.horizon import MOST_STEPS
 
 LONGEST_WINDOW = 1_000_000
 """Verdicts that the alarm looks at, at most."""
+MOST_RULES = 64
+"""Rules of one model, at most."""
+CONTAINMENT = "containment"
+"""Kind of `AlarmRule`."""
+PER_STATE = ("energy", "mean", "ewma", "cusum")
+"""Kinds of `StatisticRule` that look at the utilisation of each state."""
+JOINT = "chi2"
+"""Kind of `StatisticRule` that looks at the one-step residuals of all states together."""
+KINDS = (*PER_STATE, JOINT)
+"""Kinds of `StatisticRule`."""
 
 
 @dataclass(frozen=True)
 class AlarmRule:
-    """The alarm is raised while `violations` of the last `window` verdicts are violations.
+    """Containment: the alarm is raised while `violations` of the last `window` verdicts are violations.
 
     Parameters
     ----------
@@ -24,16 +39,19 @@ class AlarmRule:
         n of the rule, in verdicts.
     margin : float, default 1.0
         Multiplies the half-widths of the bounds that are judged.
+    horizon : int, default 1
+        Steps of the bounds that are judged.
 
     Raises
     ------
     ModelError
-        Not 1 <= violations <= window <= LONGEST_WINDOW, or the margin is not positive.
+        Not 1 <= violations <= window <= LONGEST_WINDOW, or the margin or the horizon is not positive.
     """
 
     violations: int = 1
     window: int = 1
     margin: float = 1.0
+    horizon: int = 1
 
     def __post_init__(self) -> None:
         whole = isinstance(self.violations, int) and isinstance(self.window, int)
@@ -46,3 +64,305 @@ class AlarmRule:
             raise ModelError(
                 f"alarm: margin is {self.margin}; it must be a positive number, {1 / LARGEST:g} to {LARGEST:g}"
             )
+        _check_horizon(self.horizon)
+
+    @property
+    def kind(self) -> str:
+        """`containment`."""
+        return CONTAINMENT
+
+    @property
+    def words(self) -> str:
+        """The rule in words, without its margin."""
+        over = "" if self.horizon == 1 else f" over {self.horizon} steps"
+        return f"at least {self.violations} of {self.window} verdicts violated{over}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The rule as the model file holds it.
+
+        Returns
+        -------
+        dict
+            Plain data.
+        """
+        return {
+            "kind": self.kind,
+            "horizon": self.horizon,
+            "violations": self.violations,
+            "window": self.window,
+            "margin": self.margin,
+        }
+
+
+@dataclass(frozen=True)
+class StatisticRule:
+    r"""A statistic of the verdicts over a window: the alarm is raised while it exceeds its threshold.
+
+    With the utilisation :math:`u_k` of one state (at the horizon), the step :math:`Δt_k` that ends at verdict k and
+    the window T:
+
+    - ``energy``: :math:`\sum u_k^2 Δt_k / T` over the last T seconds under verdict;
+    - ``mean``: :math:`|\sum u_k Δt_k / T|` over the same;
+    - ``ewma``: :math:`|e_k|` of the low-pass :math:`e_k = e_{k-1} + (u_k - e_{k-1}) Δt_k / (T + Δt_k)`;
+    - ``cusum``: the larger of :math:`s_k^± = \max(0, s_{k-1}^± + (± u_k - a) Δt_k / T)`, with a the allowance;
+    - ``chi2``: :math:`\sum (r_k - \bar r)^T C^{-1} (r_k - \bar r) Δt_k / T` of the one-step residuals of all states
+      together, with the mean and the covariance of `UncertainLTI.residuals`.
+
+    Parameters
+    ----------
+    kind : {"energy", "mean", "ewma", "cusum", "chi2"}
+        The statistic.
+    window_s : float
+        T, s.
+    threshold : float or sequence of float (n,)
+        What raises the alarm if it is exceeded: of every state, or of each.
+    horizon : int, default 1
+        Steps of the bounds whose utilisation it takes; chi2 takes those of one step.
+    allowance : float, default 0.0
+        a of ``cusum``: the utilisation that adds nothing.
+
+    Raises
+    ------
+    ModelError
+        The kind is none of these, or a number is out of range.
+    """
+
+    kind: str
+    window_s: float
+    threshold: float | tuple[float, ...]
+    horizon: int = 1
+    allowance: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ModelError(
+                f"alarm: kind is {reprlib.repr(self.kind)}; it must be one of {', '.join((CONTAINMENT, *KINDS))}"
+            )
+        if not (_number(self.window_s) and 0.0 < self.window_s <= LONGEST_S):
+            raise ModelError(
+                f"alarm: window_s of {self.kind} is {reprlib.repr(self.window_s)}; it must be a positive number of "
+                f"seconds, at most {LONGEST_S:g}"
+            )
+        each = self.threshold if isinstance(self.threshold, (list, tuple)) else (self.threshold,)
+        if not each or not all(_number(t) and 1 / LARGEST <= t <= LARGEST for t in each):
+            raise ModelError(
+                f"alarm: threshold of {self.kind} is {reprlib.repr(self.threshold)}; it must be a positive number, or "
+                f"one for each state, {1 / LARGEST:g} to {LARGEST:g}"
+            )
+        if isinstance(self.threshold, (list, tuple)):
+            if self.kind == JOINT:
+                raise ModelError("alarm: chi2 is one number for all states, so its threshold must be one number")
+            object.__setattr__(self, "threshold", tuple(map(float, self.threshold)))
+        _check_horizon(self.horizon)
+        if self.kind == JOINT and self.horizon != 1:
+            raise ModelError("alarm: chi2 takes the residuals of one step; leave its horizon out")
+        if not (_number(self.allowance) and 0.0 <= self.allowance <= LARGEST):
+            raise ModelError(
+                f"alarm: allowance is {reprlib.repr(self.allowance)}; it must be a number, 0 to {LARGEST:g}"
+            )
+        if self.allowance and self.kind != "cusum":
+            raise ModelError(f"alarm: allowance goes with cusum; leave it out of {self.kind}")
+
+    def thresholds(self, n: int) -> tuple[float, ...]:
+        """The threshold of each state, or the one of chi2.
+
+        Parameters
+        ----------
+        n : int
+            Number of states.
+
+        Returns
+        -------
+        tuple of float (n,), or (1,) of chi2
+            Positive.
+
+        Raises
+        ------
+        ModelError
+            There are thresholds for another number of states.
+        """
+        if self.kind == JOINT:
+            return (float(self.threshold),)  # type: ignore[arg-type]  # checked above
+        if not isinstance(self.threshold, tuple):
+            return (float(self.threshold),) * n
+        if len(self.threshold) != n:
+            raise ModelError(
+                f"alarm: {self.kind} has {plural(len(self.threshold), 'threshold')} for {plural(n, 'state')}"
+            )
+        return self.threshold
+
+    @property
+    def words(self) -> str:
+        """The rule in words."""
+        over = "" if self.horizon == 1 else f" at {self.horizon} steps"
+        what = {
+            "energy": f"mean square of the utilisation{over}",
+            "mean": f"mean of the utilisation{over}",
+            "ewma": f"moving average of the utilisation{over}",
+            "cusum": f"cumulative sum of the utilisation{over}",
+            JOINT: "chi-square of the residuals",
+        }[self.kind]
+        limits = self.threshold if isinstance(self.threshold, tuple) else (self.threshold,)
+        low, high = f"{min(limits):.3g}", f"{max(limits):.3g}"
+        return f"{what} over {self.window_s:.3g} s above {low if low == high else f'{low} to {high}'}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The rule as the model file holds it.
+
+        Returns
+        -------
+        dict
+            Plain data.
+        """
+        threshold = list(self.threshold) if isinstance(self.threshold, tuple) else self.threshold
+        found = {"kind": self.kind, "horizon": self.horizon, "window_s": self.window_s, "threshold": threshold}
+        return found | ({"allowance": self.allowance} if self.kind == "cusum" else {})
+
+
+Rule = AlarmRule | StatisticRule
+"""One rule of an alarm."""
+
+
+def labels(rules: Sequence[Rule]) -> tuple[str, ...]:
+    """What each rule is called: its kind, `@` its horizon if that is not 1, and `#2` if it is the second of that name.
+
+    Parameters
+    ----------
+    rules : sequence of Rule
+        Of one alarm.
+
+    Returns
+    -------
+    tuple of str
+        One per rule, all different.
+    """
+    found: list[str] = []
+    seen: dict[str, int] = {}
+    for rule in rules:
+        label = rule.kind if rule.horizon == 1 else f"{rule.kind}@{rule.horizon}"
+        seen[label] = number = seen.get(label, 0) + 1
+        found.append(label if number == 1 else f"{label}#{number}")
+    return tuple(found)
+
+
+def containment(rules: Iterable[Rule]) -> AlarmRule | None:
+    """The rule that judges one-step bounds.
+
+    Parameters
+    ----------
+    rules : iterable of Rule
+        Of one alarm.
+
+    Returns
+    -------
+    AlarmRule or None
+        None if there is none.
+    """
+    return next((rule for rule in rules if isinstance(rule, AlarmRule) and rule.horizon == 1), None)
+
+
+def with_containment(rules: Sequence[Rule], rule: AlarmRule) -> tuple[Rule, ...]:
+    """The rules with another one for one-step bounds.
+
+    Parameters
+    ----------
+    rules : sequence of Rule
+        Of one alarm.
+    rule : AlarmRule
+        In place of theirs; the first if there is none.
+
+    Returns
+    -------
+    tuple of Rule
+        As many, or one more.
+    """
+    before = containment(rules)
+    return tuple(rule if r is before else r for r in rules) if before is not None else (rule, *rules)
+
+
+def checked_rules(rules: Sequence[Rule]) -> tuple[Rule, ...]:
+    """The rules of one alarm.
+
+    Parameters
+    ----------
+    rules : sequence of Rule
+        At most one of them judges one-step bounds.
+
+    Returns
+    -------
+    tuple of Rule
+        The same.
+
+    Raises
+    ------
+    ModelError
+        There is none, or too many.
+    """
+    rules = tuple(rules)
+    if not 1 <= len(rules) <= MOST_RULES:
+        raise ModelError(f"alarm: {plural(len(rules), 'rule')}; an alarm has 1 to {MOST_RULES}")
+    if sum(isinstance(rule, AlarmRule) and rule.horizon == 1 for rule in rules) > 1:
+        raise ModelError("alarm: two containment rules for one step; flags need one margin, so leave one out")
+    return rules
+
+
+def rule_from_dict(data: Any, name: str = "alarm.rules") -> Rule:
+    """A rule as the model file holds it.
+
+    Parameters
+    ----------
+    data : object
+        As JSON gives it.
+    name : str
+        What errors call it.
+
+    Returns
+    -------
+    Rule
+        The rule.
+
+    Raises
+    ------
+    ModelError
+        It is not of that form; names the field.
+    """
+    if not isinstance(data, Mapping):
+        raise ModelError(f"field '{name}' is not an object")
+    kind = data.get("kind")
+    if kind not in (CONTAINMENT, *KINDS):
+        raise ModelError(
+            f"field '{name}.kind' is {reprlib.repr(kind)}; it must be one of {', '.join((CONTAINMENT, *KINDS))}"
+        )
+    needed = ("violations", "window", "margin") if kind == CONTAINMENT else ("window_s", "threshold")
+    known = {"kind", "horizon", *needed} | ({"allowance"} if kind == "cusum" else set())
+    for key in data:
+        if key not in known:
+            raise ModelError(f"unknown field '{name}.{reprlib.repr(key)[1:-1]}'; known are {', '.join(sorted(known))}")
+    for key in needed:
+        if key not in data:
+            raise ModelError(f"field '{name}.{key}' is missing; {kind} needs {' and '.join(needed)}")
+    for key in ("violations", "window", "horizon"):
+        if key in data and (isinstance(data[key], bool) or not isinstance(data[key], int)):
+            raise ModelError(f"field '{name}.{key}' is {reprlib.repr(data[key])}; it must be a whole number")
+    if "margin" in data and not _number(data["margin"]):
+        raise ModelError(f"field '{name}.margin' is {reprlib.repr(data['margin'])}; it must be a positive number")
+    values = {key: value for key, value in data.items() if key != "kind"}
+    try:
+        return AlarmRule(**values) if kind == CONTAINMENT else StatisticRule(kind, **values)
+    except ModelError as error:
+        raise ModelError(f"field '{name}': {str(error).removeprefix('alarm: ')}") from None
+
+
+def _number(value: Any) -> bool:
+    try:
+        return not isinstance(value, bool) and isinstance(value, (int, float)) and math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+def _check_horizon(horizon: Any) -> None:
+    whole = isinstance(horizon, int) and not isinstance(horizon, bool)
+    if not (whole and 1 <= horizon <= MOST_STEPS):
+        raise ModelError(
+            f"alarm: horizon is {reprlib.repr(horizon)}; it must be a whole number of steps, 1 to {MOST_STEPS}"
+        )

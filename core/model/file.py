@@ -17,9 +17,10 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.horizon import Horizon
+from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked
 from uncertain_lti.signals.signal_map import SignalMap
@@ -61,7 +62,9 @@ def structure(model: Any) -> dict[str, Any]:
     s = model.sampling
     arrays = [name for name in ARRAYS if name in _IN_EVERY_FILE or getattr(model, name).any()]
     scheduled = model.schedule is not None
+    one_rule = model.alarm == (model.alarm_rule,)
     newer = scheduled or model.domain.measure is not None or model.signals.table is not None or bool(model.horizons)
+    newer = newer or not one_rule or model.residuals is not None
     regimes: dict[str, Any] = {}
     if scheduled:
         regimes["schedule"] = model.schedule.to_list()
@@ -95,11 +98,14 @@ def structure(model: Any) -> dict[str, Any]:
             for name in ("x_min", "x_max", "u_min", "u_max")
         }
         | ({} if model.domain.measure is None else {"measure": model.domain.measure.to_dict()}),
+        **({} if model.residuals is None else {"residuals": model.residuals.to_dict()}),
         "alarm": {
             "violations": model.alarm_rule.violations,
             "window": model.alarm_rule.window,
             "margin": model.alarm_rule.margin,
-        },
+        }
+        if one_rule
+        else {"rules": [rule.to_dict() for rule in model.alarm]},
         "fit": _plain({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
         "validation": _plain(model.validation),
     }
@@ -135,7 +141,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     scheduled = data["format"] != FORMATS[0] and "schedule" in data
     known = {"format", "states", "controls", "sampling", "domain", "alarm", "fit", "validation"}
     known |= {"schedule", "scheduling", "blocks"} if scheduled else set(ARRAYS)
-    known |= {"horizons"} if data["format"] != FORMATS[0] else set()
+    known |= {"horizons", "residuals"} if data["format"] != FORMATS[0] else set()
     for name in ("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)):
         if name not in data:
             raise ModelError(f"field '{name}' is missing; fit the model again")
@@ -193,12 +199,6 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
         measure = Occupancy.from_dict(box["measure"], n + m) if box.get("measure") is not None else None
         domain = Domain(**limits, measure=measure)
-    alarm = _object(data.get("alarm", {}), "alarm", {f.name for f in fields(AlarmRule)})
-    for key in ("violations", "window"):
-        if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
-            raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
-    if "margin" in alarm:
-        alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
     return {
         **arrays,
         **regimes,
@@ -206,10 +206,35 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         "signals": signals,
         "sampling": sampling,
         "domain": domain,
-        "alarm_rule": AlarmRule(**alarm),
+        "alarm": _alarm(data.get("alarm", {}), data["format"] != FORMATS[0]),
+        "residuals": _residuals(data["residuals"]) if "residuals" in data else None,
         "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in _object(data.get("fit", {}), "fit").items()},
         "validation": _object(data.get("validation", {}), "validation"),
     }
+
+
+def _alarm(data: Any, newer: bool) -> tuple[Rule, ...]:
+    """Rules of the alarm: a list of them, or the one of format 1."""
+    if newer and isinstance(data, dict) and "rules" in data:
+        rules = _object(data, "alarm", {"rules"})["rules"]
+        if not isinstance(rules, list):
+            raise ModelError("field 'alarm.rules' must be a list of rules")
+        return checked_rules([rule_from_dict(rule, f"alarm.rules[{i}]") for i, rule in enumerate(rules)])
+    alarm = _object(data, "alarm", {"violations", "window", "margin"})
+    for key in ("violations", "window"):
+        if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
+            raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
+    if "margin" in alarm:
+        alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
+    return (AlarmRule(**alarm),)
+
+
+def _residuals(data: Any) -> Residuals:
+    found = _object(data, "residuals", {"mean", "covariance"})
+    for name in ("mean", "covariance"):
+        if name not in found:
+            raise ModelError(f"field 'residuals.{name}' is missing; fit the model again")
+    return Residuals(**found)
 
 
 def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -16,12 +16,21 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import (
+    JOINT,
+    AlarmRule,
+    Rule,
+    StatisticRule,
+    checked_rules,
+    containment,
+    with_containment,
+)
 from uncertain_lti.model.bounds import Judge, blended, centre_and_half, lower_of, normalised, upper_of
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
 from uncertain_lti.model.horizon import Horizon, checked_horizons
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
 from uncertain_lti.sampling.transient import Transient, Transitions
@@ -71,7 +80,11 @@ class UncertainLTI:
     domain : Domain, optional
         Ranges seen in the fit; default none.
     alarm_rule : AlarmRule, optional
-        Default `AlarmRule()`.
+        Containment of one step: in place of that of `alarm`; default `AlarmRule()` where neither is given.
+    alarm : sequence of AlarmRule or StatisticRule, optional
+        Every rule that raises the alarm; default the containment of one step alone.
+    residuals : Residuals, optional
+        Of the recordings of the fit; default unknown.
     fit_summary : mapping, optional
         How the model was fitted; plain data that goes to the file as it is.
     validation : mapping, optional
@@ -100,6 +113,8 @@ class UncertainLTI:
         sampling: Sampling | None = None,
         domain: Domain | None = None,
         alarm_rule: AlarmRule | None = None,
+        alarm: Sequence[Rule] | None = None,
+        residuals: Residuals | None = None,
         fit_summary: Mapping[str, Any] | None = None,
         validation: Mapping[str, Any] | None = None,
     ) -> None:
@@ -155,11 +170,36 @@ class UncertainLTI:
         self.sampling = sampling or _sampling(signals)
         unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
         self.domain = domain or unbounded
-        self.alarm_rule = alarm_rule or AlarmRule()
+        self.residuals = residuals
+        self.alarm = self._alarm(alarm, alarm_rule)
         self.fit_summary = dict(fit_summary or {})
         self.validation = dict(validation or {})
         self.tables = tables({name: getattr(self, name) for name in ARRAYS})
         self._block = max(1, _BLOCK // (n * (n + m + 1)))
+
+    def _alarm(self, alarm: Sequence[Rule] | None, alarm_rule: AlarmRule | None) -> tuple[Rule, ...]:
+        rules = (alarm_rule or AlarmRule(),) if alarm is None else checked_rules(alarm)
+        if alarm is not None and alarm_rule is not None:
+            rules = with_containment(rules, alarm_rule)
+        if self.residuals is not None and len(self.residuals.mean) != self.n:
+            raise ModelError(f"residuals of {plural(len(self.residuals.mean), 'state')} for {plural(self.n, 'state')}")
+        horizons = {1, *(h.steps for h in self.horizons)}
+        for rule in rules:
+            if rule.horizon not in horizons:
+                raise ModelError(
+                    f"alarm: {rule.kind} is at {plural(rule.horizon, 'step')}, and the model has bounds over "
+                    f"{', '.join(map(str, sorted(horizons)))}; choose one of them"
+                )
+            if isinstance(rule, StatisticRule):
+                rule.thresholds(self.n)
+            if rule.kind == JOINT and self.residuals is None:
+                raise ModelError("alarm: chi2 needs the covariance of the residuals; fit the model again")
+        return rules
+
+    @property
+    def alarm_rule(self) -> AlarmRule:
+        """Containment of one step; `AlarmRule()` where `alarm` has none, so that nothing but flags follows from it."""
+        return containment(self.alarm) or AlarmRule()
 
     @property
     def n(self) -> int:
@@ -278,8 +318,9 @@ class UncertainLTI:
                 for s, w in zip(self.signals.states[:MOST], np.ravel(facts["mean_width_recorded"]), strict=False)
             ]
             below.append(f"mean one-step width: {', '.join(widths)}" + ", …" * (self.n > MOST))
-        rule = self.alarm_rule
-        below.append(f"alarm: {rule.violations} of {plural(rule.window, 'verdict')}, margin {number_text(rule.margin)}")
+        for rule in self.alarm:
+            margin = f", margin {number_text(rule.margin)}" if isinstance(rule, AlarmRule) else ""
+            below.append(f"alarm: {rule.words}{margin}")
         below += [f"note: {message}" for message in facts.get("messages", [])]
         return html_table(repr(self), header, rows, below)
 
@@ -690,7 +731,7 @@ class UncertainLTI:
         arguments = {
             name: getattr(self, name)
             for name in (
-                *ARRAYS, "schedule", "block_data", "horizons", "signals", "sampling", "domain", "alarm_rule",
+                *ARRAYS, "schedule", "block_data", "horizons", "signals", "sampling", "domain", "alarm", "residuals",
                 "fit_summary", "validation",
             )
         }  # fmt: skip

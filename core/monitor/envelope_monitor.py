@@ -353,6 +353,11 @@ class EnvelopeMonitor:
         masked: Sequence[str] = (),
     ) -> None:
         rule = model.alarm_rule
+        for other in model.alarm:
+            if other is not rule:
+                raise ModelError(
+                    f"alarm: {other.kind} at {plural(other.horizon, 'step')} cannot be watched yet; leave it out"
+                )
         self.model = model
         self.rule = AlarmRule(
             rule.violations if violations is None else violations,

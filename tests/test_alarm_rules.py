@@ -1,0 +1,172 @@
+"""Rules of the alarm: in the model, and in its file."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from uncertain_lti import Transient, UncertainLTI, fit
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
+from uncertain_lti.model.horizon import Horizon
+from uncertain_lti.model.residuals import Residuals
+
+ZEROS = np.zeros((2, 2))
+RULES = (
+    AlarmRule(2, 5, 1.5),
+    StatisticRule("energy", 0.5, (0.2, 0.3)),
+    StatisticRule("energy", 0.1, 0.5),
+    StatisticRule("cusum", 1.0, 2.0, horizon=4, allowance=0.25),
+    StatisticRule("chi2", 0.5, 7.0),
+    AlarmRule(3, 4, 2.0, horizon=4),
+)
+
+
+def two_states(**options: Any) -> UncertainLTI:
+    return UncertainLTI(
+        -np.eye(2), np.zeros((2, 0)), ZEROS, np.zeros((2, 0)), v=[0.1, 0.2],
+        horizons=[Horizon(4, ZEROS, np.zeros((2, 0)), ZEROS, np.zeros((2, 0)), v=[0.3, 0.3], widths="constant")],
+        residuals=Residuals([0.0, 0.1], [[1.0, 0.5], [0.5, 2.0]]), **options,
+    )  # fmt: skip
+
+
+def test_rules_and_residuals_go_through_the_file(tmp_path: Path) -> None:
+    model = two_states(alarm=RULES)
+    model.save(tmp_path / "m.json")
+    again = UncertainLTI.load(tmp_path / "m.json")
+    assert again.alarm == RULES and again.alarm_rule == RULES[0]
+    assert again.residuals is not None and model.residuals is not None
+    assert np.array_equal(again.residuals.covariance, model.residuals.covariance)
+    assert json.loads((tmp_path / "m.json").read_text())["format"] == "uncertain-lti/2"
+    assert labels(RULES) == ("containment", "energy", "energy#2", "cusum@4", "chi2", "containment@4")
+
+
+def test_one_rule_for_one_step_stays_in_format_1() -> None:
+    model = two_states(alarm_rule=AlarmRule(2, 3)).replace(horizons=(), residuals=None)
+    data = model.to_dict()
+    assert data["format"] == "uncertain-lti/1" and data["alarm"] == {"violations": 2, "window": 3, "margin": 1.0}
+    with pytest.raises(ModelError, match="unknown field 'alarm.rules'"):
+        UncertainLTI.from_dict({**data, "alarm": {"rules": []}})
+
+
+def test_the_containment_rule_is_replaced_among_the_others() -> None:
+    model = two_states(alarm=RULES).replace(alarm_rule=AlarmRule(1, 2))
+    assert model.alarm == (AlarmRule(1, 2), *RULES[1:])
+    assert two_states(alarm=RULES[1:]).alarm_rule == AlarmRule(), "flags have margin 1 without a rule of their own"
+
+
+@pytest.mark.parametrize(
+    ("alarm", "words"),
+    [
+        ([], "0 rules; an alarm has 1 to"),
+        ([AlarmRule(), AlarmRule(2, 2)], "two containment rules for one step"),
+        ([StatisticRule("mean", 1.0, 1.0, horizon=3)], "mean is at 3 steps, and the model has bounds over 1, 4"),
+        ([StatisticRule("mean", 1.0, (1.0,) * 3)], "mean has 3 thresholds for 2 states"),
+    ],
+)
+def test_an_alarm_that_cannot_be_is_refused(alarm: list[Any], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        two_states(alarm=alarm)
+
+
+def test_chi2_needs_the_covariance() -> None:
+    with pytest.raises(ModelError, match="chi2 needs the covariance"):
+        two_states().replace(residuals=None, alarm=[StatisticRule("chi2", 1.0, 1.0)])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"kind": "median"}, "kind.* is 'median'; it must be one of containment, energy"),
+        ({"window_s": 0}, "window_s of energy is 0"),
+        ({"window_s": True}, "window_s of energy is True"),
+        ({"window_s": 1e10}, "window_s of energy is"),
+        ({"threshold": -1}, "threshold of energy is -1"),
+        ({"threshold": [1.0, None]}, "threshold of energy"),
+        ({"threshold": []}, "threshold of energy"),
+        ({"threshold": "1"}, "threshold of energy is '1'"),
+        ({"horizon": 0}, "horizon is 0"),
+        ({"horizon": 1.5}, r"horizon' is 1.5; it must be a whole number"),
+        ({"allowance": 0.1}, "unknown field 'alarm.rules\\[0\\].allowance'"),
+        ({"margin": 1.0}, "unknown field 'alarm.rules\\[0\\].margin'"),
+    ],
+)
+def test_a_rule_of_a_file_that_cannot_be_is_refused_by_name(change: dict[str, Any], words: str) -> None:
+    data = two_states().to_dict()
+    rule = {"kind": "energy", "window_s": 1.0, "threshold": 0.5}
+    data["alarm"] = {"rules": [rule]}
+    assert UncertainLTI.from_dict(data).alarm == (StatisticRule("energy", 1.0, 0.5),)
+    with pytest.raises(ModelError, match=words) as error:
+        UncertainLTI.from_dict({**data, "alarm": {"rules": [{**rule, **change}]}})
+    assert "alarm.rules[0]" in str(error.value) and len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("rules", "words"),
+    [
+        (7, "must be a list"),
+        ([7], r"alarm.rules\[0\]' is not an object"),
+        ([{"kind": "chi2", "window_s": 1.0}], r"rules\[0\].threshold' is missing"),
+        ([{"kind": "chi2", "window_s": 1.0, "threshold": [1.0, 1.0]}], "chi2 is one number for all states"),
+        ([{"kind": "chi2", "window_s": 1.0, "threshold": 1.0, "horizon": 4}], "chi2 takes the residuals of one step"),
+        ([{"kind": "cusum", "window_s": 1.0, "threshold": 1.0, "allowance": -1}], "allowance is -1"),
+        ([{"kind": "containment", "violations": 1, "window": 1, "margin": "x"}], r"rules\[0\].margin' is 'x'"),
+        ([{"kind": "containment", "violations": 2, "window": 1, "margin": 1}], "violations is 2 of window 1"),
+    ],
+)
+def test_rules_of_a_file_that_cannot_be_are_refused(rules: Any, words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        UncertainLTI.from_dict({**two_states().to_dict(), "alarm": {"rules": rules}})
+
+
+@pytest.mark.parametrize(
+    ("residuals", "words"),
+    [
+        ({"mean": [0.0, 0.0]}, "residuals.covariance' is missing"),
+        ({"mean": [0.0], "covariance": [[1.0]]}, "residuals of 1 state for 2 states"),
+        ({"mean": [0.0, 0.0], "covariance": [[1.0, 2.0], [0.0, 1.0]]}, "not symmetric"),
+        ({"mean": [0.0, 0.0], "covariance": [[1.0, 2.0], [2.0, 1.0]]}, "negative variance"),
+        ({"mean": [0.0, 0.0], "covariance": [[1.0, 0.0]]}, "has shape"),
+    ],
+)
+def test_residuals_that_cannot_be_are_refused(residuals: Any, words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        UncertainLTI.from_dict({**two_states().to_dict(), "residuals": residuals})
+
+
+@pytest.mark.parametrize("counted", [(True, True, True), (True, False, True), (False, False, True)])
+def test_whitening_gives_the_quadratic_form(counted: tuple[bool, ...]) -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    C, r, on = root @ root.T, rng.normal(size=3), np.flatnonzero(counted)
+    white = Residuals(np.zeros(3), C).whitening(counted) @ r
+    assert white @ white == pytest.approx(r[on] @ np.linalg.solve(C[np.ix_(on, on)], r[on]))
+
+
+def test_a_state_that_follows_from_others_adds_nothing_to_the_chi_square() -> None:
+    C = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    white = Residuals(np.zeros(3), C).whitening([True] * 3)
+    assert np.array_equal(white, [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]])
+
+
+@pytest.mark.parametrize("scheduled", [False, True])
+def test_the_fit_stores_mean_and_covariance_of_its_residuals(scheduled: bool) -> None:
+    rng = np.random.default_rng(4)
+    x = np.cumsum(rng.normal(size=(300, 2)) * [1.0, 3.0], axis=0) * 0.01
+    run = Transient(np.arange(300) * 0.1, x, rng.normal(size=(300, 1)))
+    model = fit([run], additive="noise", schedule={"x1": [-0.2, 0.2]} if scheduled else None)
+    steps = run.transitions()
+    centre, _ = model.centre_and_half(steps.x, steps.u, steps.dt)
+    r = steps.x_next - centre
+    assert model.residuals is not None
+    assert model.residuals.mean == pytest.approx(r.mean(axis=0), abs=1e-12)
+    assert model.residuals.covariance == pytest.approx(np.cov(r.T, bias=True), rel=1e-9)
+    assert model.residuals.covariance[1, 1] > 4 * model.residuals.covariance[0, 0]
+
+
+def test_labels_of_one_alarm_are_all_different() -> None:
+    rule = StatisticRule("mean", 1.0, 1.0)
+    assert labels([rule, replace(rule, window_s=2.0), replace(rule, horizon=9)]) == ("mean", "mean#2", "mean@9")
