@@ -1,5 +1,7 @@
 """The report: its answers follow from the facts, it is one page that needs nothing else, and files never speak HTML."""
 
+import base64
+import io
 import json
 import math
 from dataclasses import replace
@@ -11,11 +13,12 @@ import pytest
 from engine_bag import SIGNALS, engine_bag
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.cli.main import main
 from uncertain_lti.reports.findings import APART, MOST_EPISODES, findings
-from uncertain_lti.reports.html import MOST_DRAWN, _first_screen, html_report
+from uncertain_lti.reports.html import MOST_DRAWN, _close_up, _figure, _first_screen, _name, html_report
 from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, YES
 from uncertain_lti.reports.tables import beyond
 from uncertain_lti.validation.left_out import validate
@@ -36,7 +39,7 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attrs):
         self.tags.add(tag)
         self.attributes += [(tag, name, value or "") for name, value in attrs]
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "wbr", "input"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -265,6 +268,63 @@ def test_endless_violations_stay_one_page():
     assert len(text) < 3_000_000 and text.count("<tr>") < 200
 
 
+def blip_and_fault():
+    """A single violated sample at 1 s, and a fault from 6 s to 7 s that moves a state at every sample."""
+    x = np.zeros((1000, 2))
+    x[100, 0], x[600:700, 1] = 1.0, np.where(np.arange(100) % 2, 3.0, -3.0)
+    model = by_hand()
+    verdicts = EnvelopeMonitor(model).check(Transient(np.arange(1000) * 0.01, x, np.zeros((1000, 1)), name="r/run_1"))
+    return model, verdicts, findings(model, "m", [verdicts])
+
+
+def test_the_closer_look_is_at_the_fault_not_at_the_first_sample_outside():
+    _, verdicts, facts = blip_and_fault()
+    assert [e["first"]["t"] for e in facts["recordings"][0]["episodes"]] == [1.0, 6.0]
+    episode, low, high = _close_up(verdicts, facts["recordings"][0])
+    assert episode["first"]["t"] == 6.0 and low < 6.0 < 6.9 < high < 8.0
+
+
+def test_figures_say_what_they_show():
+    model, verdicts, facts = blip_and_fault()
+    page = Page(html_report(model, [verdicts], facts))
+    alts = [value for tag, name, value in page.attributes if (tag, name) == ("img", "alt") and value]
+    assert len(alts) == 5 == len(set(alts))
+    assert "x2 101 times from 6 s, x1 2 times from 1 s" in alts[0] and "raised 2 times, first at 1 s" in alts[0]
+    assert "101 verdicts violated, with an alarm. Outside its bounds first: x2." in alts[1]
+    assert "x2 12" in alts[2] and "from noise" in alts[3]
+
+
+def test_figures_are_sharp_and_in_their_colours():
+    """Two dots of an image to one of the page; whole colours, also of scales; cut where nothing is drawn."""
+    from uncertain_lti.reports import figures
+
+    rng = np.random.default_rng(0)
+    model = by_hand(12).replace(A=rng.normal(size=(12, 12)), dA=rng.uniform(size=(12, 12)))
+    run = Transient(np.arange(300) * 0.01, rng.normal(size=(300, 12)), np.zeros((300, 1)))
+    verdicts = EnvelopeMonitor(model).check(run)
+    for figure, least in (
+        (figures.matrices_figure(model), 2),
+        (figures.envelope_figure(model, verdicts, model.state_names[:5]), 5),
+        (figures.utilisation_figure(model, verdicts), 1),
+    ):
+        page, strips = Page(_figure(figure, "c")), []
+        for tag, name, value in page.attributes:
+            if (tag, name) == ("img", "src"):
+                image = Image.open(io.BytesIO(base64.b64decode(value.partition(",")[2])))
+                strips.append(np.asarray(image.convert("RGB")))
+        size = [float(v) for tag, name, v in page.attributes if tag == "img" and name in ("width", "height")]
+        assert [side / 2 for strip in strips for side in (strip.shape[1], strip.shape[0])] == size
+        assert len(strips) == least and all((strip[[0, -1]] == 255).all() for strip in strips)
+        drawn = figures.pixels(figure, 210).astype(int)
+        assert np.abs(np.concatenate(strips) - drawn).max() <= 20
+
+
+def test_names_break_between_words():
+    name = "turbine_exit_total_pressure"
+    assert _name(name) == "turbine_<wbr>exit_<wbr>total_<wbr>pressure" and _name("/a//b") == "/<wbr>a//<wbr>b"
+    assert Page(_name(HOSTILE)).tags == {"wbr"}
+
+
 def test_no_verdict_is_no_good_news():
     model = by_hand()
     verdicts = [EnvelopeMonitor(model).check(Transient([0.0], [[0.0, 0.0]], [[0.0]]))]
@@ -287,7 +347,7 @@ def test_fifty_states_and_forty_recordings():
     ]
     text = html_report(model, verdicts, findings(model, "m", verdicts))
     needs_nothing_else(Page(text))
-    assert len(text) < 12_000_000 and text.count("<img") <= 3 * MOST_DRAWN + 3
+    assert len(text) < 12_000_000 and text.count("<figure") <= 3 * MOST_DRAWN + 3
 
 
 def test_bad_places_are_one_sentence(engine, tmp_path, capsys):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -41,6 +44,40 @@ def new_figure(width: float, height: float) -> Any:
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
+
+
+def between_rows(figure: Any, image: NDArray[np.uint8]) -> list[int]:
+    """Where an image of a figure can be cut between two rows of its panels.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        The figure.
+    image : array (height, width, 3) of uint8
+        Its pixels.
+
+    Returns
+    -------
+    list of int
+        Rows of pixels from the top, each in the middle of the widest blank stripe between two rows of panels.
+    """
+    spans = sorted((axis.get_position().y0, axis.get_position().y1) for axis in figure.axes)
+    joined: list[tuple[float, float]] = []
+    for low, high in spans:
+        if joined and low <= joined[-1][1]:
+            joined[-1] = joined[-1][0], max(joined[-1][1], high)
+        else:
+            joined.append((low, high))
+    blank = (image == 255).all(axis=(1, 2))
+    cuts = []
+    for (_, below), (above, _) in reversed(list(itertools.pairwise(joined))):
+        begin, end = (math.ceil(len(image) * (1 - y)) for y in (above, below))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], blank[begin:end], [False]]).astype(np.int8)))
+        stripes = edges.reshape(-1, 2)
+        if len(stripes):
+            first, stop = stripes[np.diff(stripes, axis=1)[:, 0].argmax()]
+            cuts.append(begin + int(first + stop) // 2)
+    return cuts
 
 
 def elements(model: UncertainLTI) -> tuple[Array, Array, list[str]]:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Integers
 from uncertain_lti.base.errors import ModelError
@@ -396,6 +397,29 @@ def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) 
             raise ModelError(f"{path}: no image is written as '{kind}'; end the name in .png, .svg or .pdf")
         with whole_file(path) as stream:
             figure.savefig(stream, dpi=dpi, format=kind)
+
+
+def pixels(figure: Any, dpi: int = 110) -> NDArray[np.uint8]:
+    """Draw a figure.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        Of this module.
+    dpi : int, default 110
+        Dots per inch; a figure's size is in inches.
+
+    Returns
+    -------
+    array (height, width, 3) of uint8
+        Red, green and blue.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names may be in any script
+        figure.set_dpi(dpi)
+        figure.canvas.draw()
+    drawn: NDArray[np.uint8] = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+    return drawn
 
 
 # --- pieces ----------------------------------------------------------------------------------------------------------

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from html import escape
@@ -21,11 +23,13 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.recording import Progress
+from uncertain_lti.reports import alt_texts, schedule_figures
 from uncertain_lti.reports import figures as plots
-from uncertain_lti.reports import schedule_figures
+from uncertain_lti.reports.drawing import between_rows
 from uncertain_lti.reports.findings import APART
 from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, WEIGHTS, YES
 from uncertain_lti.reports.tables import beyond, number, shortened
+from uncertain_lti.reports.width_budget import width_budget
 
 MOST_DRAWN = 8
 """Recordings with figures of their own; those with most violations."""
@@ -33,20 +37,22 @@ _MOST_STATES = 8
 _MOST_ROWS = 40
 _MOST_EPISODES = 20
 _DPI = 105
-_COLOURS = 96
+_DENSITY = 2
+"""Dots of an image to each one of the page, for screens that have as many."""
 
 _ANSWER = {YES: "Yes", CARE: "With care", UNKNOWN: "Unknown", NO: "No"}
 _STATE = {"quiet": "nothing", "violations": "violations", "alarm": "alarm", "unknown": "no verdict"}
 
 _STYLE = """
-:root { --line: #d5d9de; --ink: #1b1f24; --soft: #57606a; --good: #00684a; --care: #8a5a00; --bad: #a83b00; }
+:root { color-scheme: light dark; --line: #d5d9de; --ink: #1b1f24; --soft: #57606a; --good: #00684a; --care: #8a5a00;
+  --bad: #a83b00; --link: #0550ae; --page: #fff; }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1060px; padding: 1.2rem; color: var(--ink); background: #fff;
-  font: 15px/1.5 system-ui, "Segoe UI", "Liberation Sans", sans-serif; overflow-wrap: anywhere; }
+body { margin: 0 auto; max-width: 1060px; padding: 1.2rem; color: var(--ink); background: var(--page);
+  font: 15px/1.5 system-ui, "Segoe UI", "Liberation Sans", sans-serif; overflow-wrap: break-word; }
 h1 { font-size: 1.35rem; margin: 0 0 .2rem; } h2 { font-size: 1.1rem; margin: 2rem 0 .5rem; padding-top: .6rem;
   border-top: 1px solid var(--line); } h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
 p { margin: .4rem 0; } .soft { color: var(--soft); } code { font-family: ui-monospace, monospace; font-size: .85em; }
-.cards { display: grid; grid-template-columns: 1fr 1fr; gap: 1rem; margin-top: .8rem; }
+.cards { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 1rem; margin-top: .8rem; }
 .card { border: 1px solid var(--line); border-top: 5px solid var(--soft); border-radius: 4px; padding: .7rem 1rem; }
 .card h2 { border: 0; margin: 0; padding: 0; font-size: .95rem; color: var(--soft); font-weight: 600; }
 .answer { font-size: 1.7rem; font-weight: 700; line-height: 1.25; margin: 0 0 .3rem; }
@@ -56,14 +62,27 @@ p { margin: .4rem 0; } .soft { color: var(--soft); } code { font-family: ui-mono
 ul { margin: .3rem 0; padding-left: 0; list-style: none; } li { margin: .35rem 0; }
 .table { overflow-x: auto; } table { border-collapse: collapse; font-size: .87rem; margin: .4rem 0; }
 th, td { padding: .22rem .6rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: top;
-  font-variant-numeric: tabular-nums; overflow-wrap: normal; }
+  font-variant-numeric: tabular-nums; }
 th { font-weight: 600; color: var(--soft); } th:first-child, td:first-child, .left { text-align: left; }
-td:first-child { min-width: 6.5rem; max-width: 24rem; overflow-wrap: anywhere; }
-figure { margin: .8rem 0; } img { max-width: 100%; height: auto; } figcaption { font-size: .85rem; color: var(--soft); }
-nav a { margin-right: 1rem; } a { color: #0550ae; }
-@media (max-width: 720px) { .cards { grid-template-columns: 1fr; } body { padding: .7rem; } }
-@media print { body { max-width: none; padding: 0; font-size: 10.5pt; } nav { display: none; }
-  figure, tr, .card { break-inside: avoid; } h2, h3 { break-after: avoid; } .table { overflow: visible; } }
+td:first-child { min-width: 6.5rem; max-width: 24rem; } td code { overflow-wrap: anywhere; }
+.left > code { display: block; min-width: 9rem; }
+figure { margin: .8rem 0; } figcaption { font-size: .85rem; color: var(--soft); }
+figure label { display: block; overflow-x: auto; position: relative; }
+figure img { display: block; max-width: 100%; height: auto; }
+figure input { position: absolute; opacity: 0; } label:focus-within { outline: 1px dotted var(--soft); }
+figure label:has(input:checked) img { max-width: none; }
+nav a { margin-right: 1rem; } a { color: var(--link); }
+.tap { display: none; }
+@media (max-width: 720px) { .cards { grid-template-columns: minmax(0, 1fr); } body { padding: .7rem; }
+  .tap { display: inline; } figure label { cursor: zoom-in; } figure label:has(input:checked) { cursor: zoom-out; } }
+@media screen and (prefers-color-scheme: dark) {
+  :root { --line: #3a3f45; --ink: #e6e6e6; --soft: #a2a9b1; --good: #3fce9d; --care: #e0ab4a; --bad: #ff9159;
+    --link: #79b8ff; --page: #1a1a1a; }
+  figure img { filter: invert(.8980392) hue-rotate(180deg); } }
+@media print { body { max-width: none; padding: 0; font-size: 10.5pt; } nav, .tap { display: none; }
+  figure label:has(input:checked) img { max-width: 100%; } figure img, tr, .card { break-inside: avoid; }
+  h2, h3 { break-after: avoid; } figcaption { break-before: avoid; } .table { overflow: visible; }
+  table { font-size: .72rem; } th, td { padding: .15rem .35rem; } td:first-child { min-width: 0; } }
 """
 
 
@@ -138,7 +157,7 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
         what, look = "Unknown", "care"
     order = sorted(happened, key=lambda h: ["alarm", "unknown", "violations", "quiet"].index(h["state"]))
     items = "".join(
-        f"<li><b>{_text(os.path.basename(h['recording']) or h['recording'])}</b>: {_text(h['text'])}.</li>"
+        f"<li><b>{_name(os.path.basename(h['recording']) or h['recording'])}</b>: {_text(h['text'])}.</li>"
         for h in order[:5]
     )
     if len(order) > 5:
@@ -198,7 +217,7 @@ def _all_recordings(model: UncertainLTI, checked: Sequence[Verdicts], facts: Map
     if len(recordings) > 1:
         rows = [
             [
-                _text(os.path.basename(r["recording"])),
+                _name(os.path.basename(r["recording"])),
                 str(r["verdicts"]),
                 str(r["violated"]),
                 str(r["episode_count"]),
@@ -207,7 +226,8 @@ def _all_recordings(model: UncertainLTI, checked: Sequence[Verdicts], facts: Map
             for r, h in zip(recordings, facts["happened"], strict=True)
         ]
         parts.append(_table(("recording", "verdicts", "violated", "episodes", "what"), rows, most=200))
-        parts.append(_figure(plots.coverage_figure(model, checked), "Violated shares, recording by recording"))
+        figure = plots.coverage_figure(model, checked)
+        parts.append(_figure(figure, "Violated shares, recording by recording", alt_texts.coverage_text(recordings)))
     if len(recordings) > MOST_DRAWN:
         parts.append(f'<p class="soft">Drawn are the {MOST_DRAWN} recordings with most violations.</p>')
     return "\n".join(parts)
@@ -215,7 +235,7 @@ def _all_recordings(model: UncertainLTI, checked: Sequence[Verdicts], facts: Map
 
 def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]) -> str:
     states = facts["states"]
-    parts = [f"<h3>{_text(os.path.basename(facts['recording']) or facts['recording'])}</h3>"]
+    parts = [f"<h3>{_name(os.path.basename(facts['recording']) or facts['recording'])}</h3>"]
     silent = f" Without a verdict, or not used: {', '.join(facts['no_verdict'])}." if facts["no_verdict"] else ""
     parts.append(
         f"<p>{plural(facts['samples'], 'sample')} over {number(facts['seconds'])} s, "
@@ -231,41 +251,50 @@ def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]
     parts.append(
         _figure(
             plots.envelope_figure(model, verdicts, shown),
-            f"{some}Recorded values between their one-step bounds; marks: violated, at the foot of a panel as well.",
+            f"{some}Recorded values between their one-step bounds; marks: violated, at the foot of a panel as well",
+            alt_texts.envelope_text(facts, shown),
         )
     )
     if facts["episodes"]:
         parts.append(_episodes(facts))
-    span = _close_up(verdicts, facts)
-    if span is not None:
-        bad = [name for name in shown if states[name]["violations"]]
+    closer = _close_up(verdicts, facts)
+    if closer is not None:
+        episode, *span = closer
+        bad = [name for name in shown if name in episode["states"]]
         parts.append(
             _figure(
-                plots.envelope_figure(model, verdicts, bad, span=span),
-                "The first episode of the alarm, or of all, closer",
+                plots.envelope_figure(model, verdicts, bad, span=(span[0], span[1])),
+                f"Closer: {alt_texts.episode_text(episode)}",
+                alt_texts.beginning_text(episode),
             )
         )
     parts.append(
         _figure(
             plots.utilisation_figure(model, verdicts),
             "Utilisation: where between its bounds each sample lay, -1 and 1 at the bounds",
+            alt_texts.utilisation_text(facts, model.state_names),
         )
     )
     return "\n".join(parts)
 
 
-def _close_up(verdicts: Verdicts, facts: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Time around the first episode with an alarm, or the first one, where that is little of the whole; s."""
-    episodes = facts["episodes"]
+def _close_up(verdicts: Verdicts, facts: Mapping[str, Any]) -> tuple[Mapping[str, Any], float, float] | None:
+    """The episode that is worth a closer look, and time around it in s, where that is little of the whole.
+
+    It is the first that has at least a tenth of the violated verdicts of the largest, among those with an alarm if
+    there are any: a single sample long before a fault is not what happened.
+    """
     t = verdicts.transient.t
+    episodes = [e for e in facts["episodes"] if e["alarm"]] or facts["episodes"]
     if not episodes or (t[1:] < t[:-1]).any():
         return None
-    episode = next((e for e in episodes if e["alarm"]), episodes[0])
+    most = max(e["verdicts_violated"] for e in episodes)
+    episode = next(e for e in episodes if 10 * e["verdicts_violated"] >= most)
     begin, end = episode["first"]["t"], min(episode["last"]["t"], episode["first"]["t"] + 0.1 * float(t[-1]))
     step = float(t[-1]) / max(len(t) - 1, 1)
     room = max(40 * step, 0.3 * (end - begin))
-    span = max(begin - room, 0.0), min(end + room, float(t[-1]))
-    return span if span[1] - span[0] < 0.5 * float(t[-1]) else None
+    low, high = max(begin - room, 0.0), min(end + room, float(t[-1]))
+    return (episode, low, high) if high - low < 0.5 * float(t[-1]) else None
 
 
 def _episodes(facts: Mapping[str, Any]) -> str:
@@ -306,7 +335,7 @@ def _tightness(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[
         worst = [s["worst"]["utilisation"] for s in here if s["violations"]]
         rows.append(
             [
-                _text(state["name"]) + (f" [{_text(state['unit'])}]" if state["unit"] else ""),
+                _name(state["name"]) + (f" [{_text(state['unit'])}]" if state["unit"] else ""),
                 number(state["mean_width"]),
                 number(width),
                 number(max((s["max_width"] for s in here if s["max_width"] is not None), default=None)),
@@ -329,12 +358,14 @@ def _tightness(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[
     ]
     try:
         figure = plots.budget_figure(model, [v.transient for v in checked])
-        parts.append(_figure(figure, "Which element contributes how much of the mean width of each state"))
+        shows = alt_texts.budget_text(model, *width_budget(model, [v.transient for v in checked])[::2])
+        parts.append(_figure(figure, "Which element contributes how much of the mean width of each state", shows))
     except ModelError:
         pass  # no transition: the reasons above say so
     if model.schedule is None:
         figure = plots.matrices_figure(model)
-        parts.append(_figure(figure, "The matrices and their half-widths, for normalised quantities"))
+        caption = "The matrices and their half-widths, for normalised quantities"
+        parts.append(_figure(figure, caption, alt_texts.matrices_text(model)))
     return "\n".join(parts)
 
 
@@ -407,7 +438,7 @@ def _trust(facts: Mapping[str, Any]) -> str:
         )
         rows = [
             [
-                _text(name),
+                _name(name),
                 "-" if s["inside"] is None else f"{s['inside']:.3%}",
                 str(s["parts_inside"]),
                 number(s["mean_width_left_out"]),
@@ -438,11 +469,11 @@ def _trust(facts: Mapping[str, Any]) -> str:
 
 def _origin(facts: Mapping[str, Any]) -> str:
     model = facts["model"]
-    rows = [["model checked with", _text(model["file"]), _code(model["sha256"] or "none")]]
-    rows += [["fitted to", _text(s["file"]), _code(s["sha256"])] for s in model["sources"]]
-    rows += [["checked", _text(f["file"]), _code(f["sha256"])] for r in facts["recordings"] for f in r["files"]]
+    rows = [["model checked with", _name(model["file"]), _code(model["sha256"] or "none")]]
+    rows += [["fitted to", _name(s["file"]), _code(s["sha256"])] for s in model["sources"]]
+    rows += [["checked", _name(f["file"]), _code(f["sha256"])] for r in facts["recordings"] for f in r["files"]]
     signals = [
-        [kind, _text(s["name"]), _text(s["unit"] or "-"), _text(s["topic"] or "-"), _code(s["field"])]
+        [kind, _name(s["name"]), _text(s["unit"] or "-"), _name(s["topic"] or "-"), _code(s["field"])]
         for kind, group in (
             ("state", model["states"]),
             ("control", model["controls"]),
@@ -479,6 +510,11 @@ def _text(value: object) -> str:
     return escape("".join(c if c.isprintable() or c == " " else "\N{REPLACEMENT CHARACTER}" for c in str(value)))
 
 
+def _name(value: object) -> str:
+    """A name as text of the page: where a line must end inside it, it ends after a low line, a slash or a dash."""
+    return "<wbr>".join(map(_text, re.split(r"(?<=[_/-])(?=[^_/-])", str(value))))
+
+
 def _code(value: object) -> str:
     return f"<code>{_text(value)}</code>"
 
@@ -504,14 +540,26 @@ def _table(
     return f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>{more}'
 
 
-def _figure(figure: Any, caption: str) -> str:
-    stream = io.BytesIO()
-    plots.save(figure, stream, _DPI)
-    small = io.BytesIO()  # few colours: a quarter of the bytes
-    Image.open(stream).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
-    data = base64.b64encode(small.getvalue()).decode("ascii")
-    width, height = (round(side * _DPI) for side in figure.get_size_inches())
+def _figure(figure: Any, caption: str, shows: str = "") -> str:
+    """An image of a figure, which a tap enlarges; `shows` says what is seen in it to those who do not see it.
+
+    The image is in strips, one per row of panels, so that a page that is printed can end between two of them.
+    """
+    image = plots.pixels(figure, _DPI * _DENSITY)
+    height, width, _ = image.shape
+    # 256 colours, none of them far from one drawn (median cut turns a scale grey beside much white): half the bytes
+    coloured = Image.fromarray(image).quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    edges = [0, *between_rows(figure, image), height]
+    strips = []
+    for k, (top, bottom) in enumerate(itertools.pairwise(edges)):
+        piece = io.BytesIO()
+        coloured.crop((0, top, width, bottom)).save(piece, "PNG")
+        alt = _text(f"{caption}. {shows}" if shows else caption) if not k else ""
+        strips.append(
+            f'<img src="data:image/png;base64,{base64.b64encode(piece.getvalue()).decode("ascii")}" alt="{alt}" '
+            f'width="{width / _DENSITY:g}" height="{(bottom - top) / _DENSITY:g}">'
+        )
     return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{_text(caption)}" width="{width}" height="{height}">'
-        f"<figcaption>{_text(caption)}</figcaption></figure>"
+        f'<figure><label><input type="checkbox" aria-label="enlarge the figure">{"".join(strips)}</label>'
+        f'<figcaption>{_text(caption)} <span class="tap">(tap to enlarge)</span></figcaption></figure>'
     )
