@@ -8,6 +8,8 @@ import pytest
 
 pytest.importorskip("scipy", reason="scipy, which integrates the turbofan, is not installed")
 
+from turbofan_fleet import simulate_fleet
+
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
@@ -277,6 +279,31 @@ def test_a_fault_shows_from_its_onset_and_not_before(kind):
         assert np.abs((faulty.x[onset] - healthy.x[onset]) / operating_point().X).max() > 1e-5
 
 
+@pytest.mark.parametrize("kind", ["fan_damage", "compressor_wear", "sensor_bias", "sensor_drift"])
+def test_a_fault_of_twice_the_size_moves_the_readings_twice_as_far(kind):
+    def moved(size: float) -> np.ndarray:
+        return (simulate(Run(21, fault=Fault(kind, 0.1, size))).x - operating_point().x_s) / operating_point().X
+
+    single, double = moved(1.0), moved(2.0)
+    assert np.abs(single).max() > 1e-6
+    assert double == pytest.approx(2.0 * single, rel=0.1, abs=0.02 * float(np.abs(single).max()))
+
+
+def test_many_runs_at_once_are_the_runs_one_by_one():
+    kinds = (None, *(Fault(kind, 0.25) for kind in KINDS))
+    lever = ((0.0, 68.0), (0.2, 68.0), (0.2, 66.0), (0.4, 64.0))
+    runs = [Run(25, lever=lever, ramps=True, noise=1e-4, seed=i, fault=fault) for i, fault in enumerate(kinds)]
+    for run, found in zip(runs, simulate_fleet(runs), strict=True):
+        one = simulate(run)
+        assert np.abs((found.x - one.x) / operating_point().X).max() < 1e-6, run.fault
+        assert np.abs((found.u - one.u) / operating_point().U).max() < 1e-6, run.fault
+
+
+def test_runs_that_are_simulated_together_have_one_length():
+    with pytest.raises(UncertainLTIError, match="one length"):
+        simulate_fleet([Run(5), Run(6)])
+
+
 def test_a_stuck_actuator_is_recorded_as_the_command_it_ignores():
     lever = ((0.0, 68.0), (0.5, 62.0))
     run = simulate(Run(161, lever=lever, fault=Fault("nozzle_stuck", 0.25)))
@@ -291,6 +318,8 @@ def test_impossible_requests_are_refused_in_a_sentence(plant):
     for call, words in (
         (lambda: trim(70.0), "PLA is 70"),
         (lambda: Fault("gremlins", 1.0), "no fault 'gremlins'"),
+        (lambda: Fault("fan_damage", 1.0, 0.0), "positive"),
+        (lambda: Fault("fuel_stuck", 1.0, 2.0), "has no size"),
         (lambda: make_run("loop"), "no manoeuvre 'loop'"),
         (lambda: make_run("check", amplitude=0.1), "amplitude"),
         (lambda: make_run("pulses"), "amplitude"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,19 +36,28 @@ class Fault:
         One of KINDS.
     at : float
         Onset, s after the first sample.
+    size : float, default 1.0
+        Of the fault, over the size that KINDS states: 2 is a bias, a drift, a rate of wear or a loss twice as large.
 
     Raises
     ------
     UncertainLTIError
-        The kind is not one of KINDS.
+        The kind is not one of KINDS, the size is not positive, or it is other than 1 for an actuator that is stuck.
     """
 
     kind: str
     at: float
+    size: float = 1.0
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise UncertainLTIError(f"turbofan: there is no fault '{self.kind}'; there are {', '.join(KINDS)}")
+        if not 0.0 < self.size < math.inf:
+            raise UncertainLTIError(f"turbofan: a fault of size {self.size:g}; it must be a positive number")
+        if self.size != 1.0 and self.kind.endswith("stuck"):
+            raise UncertainLTIError(
+                f"turbofan: {self.kind} of size {self.size:g}; what is stuck has no size, leave it 1"
+            )
 
     def first_sample(self, dt: float) -> int:
         """The first sample that can show it: a sensor's at the onset, anything else one step later.
@@ -79,9 +89,9 @@ class Fault:
             Both factors 1 before the onset, and for faults of other parts.
         """
         if self.kind == "compressor_wear" and t > self.at:
-            return Health(compressor=1.0 - min(WEAR * (t - self.at), WORST_WEAR))
+            return Health(compressor=1.0 - self.size * min(WEAR * (t - self.at), WORST_WEAR))
         if self.kind == "fan_damage" and t >= self.at:
-            return Health(fan=1.0 - DAMAGE)
+            return Health(fan=1.0 - self.size * DAMAGE)
         return Health()
 
     def reading(self, t: float, x: Array, X: Array) -> Array:
@@ -106,10 +116,10 @@ class Fault:
         x = x.copy()
         if self.kind == "sensor_bias":
             i = STATES.index("compressor_exit_total_pressure")
-            x[i] += BIAS * X[i]
+            x[i] += self.size * BIAS * X[i]
         else:
             i = STATES.index("turbine_exit_total_temperature")
-            x[i] += DRIFT * (t - self.at) * X[i]
+            x[i] += self.size * DRIFT * (t - self.at) * X[i]
         return x
 
     def stuck(self, t: float) -> int | None:
