@@ -11,6 +11,7 @@ import subprocess
 import sys
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -575,6 +576,8 @@ OPTIONS = (
     {"angles"},
     {"several"},
     {"delays", "angles", "several"},
+    {"memories", "angles"},
+    {"memories", "several"},
     {"enable on the clock", "delays"},
     {"enable on a control", "several"},
     {"enable elsewhere"},
@@ -598,17 +601,27 @@ def saved_with(path: Path, options: set[str], rng: np.random.Generator, alarm: A
         Signal("u0", CONTROL, "position[u0]", type=VECTOR, max_hold=hold, delay=3 if "delays" in options else 0),
         Signal("level", "/level", "data", type="std_msgs/msg/Int32", delay=1 if "delays" in options else 0),
     ]
+    if "memories" in options:
+        states[0] = replace(states[0], valid=(-0.1, 0.2))
+        controls[1] = replace(controls[1], ignore=(2.0,))
+        controls += [
+            Signal("x0_before", STATE, "lag(position[x0], 2)", type=VECTOR),
+            Signal("x1_rate", STATE, f"rate({states[1].field})", scale=50.0, type=VECTOR),
+            Signal("u0_change", CONTROL, "diff(position[u0])", type=VECTOR, max_hold=hold),
+        ]
     if "several" not in options:
         controls.append(Signal("tilt", IMU, "pitch(orientation)", type="sensor_msgs/msg/Imu", max_hold=hold))
     n, m = len(states), len(controls)
     time = {STATE: "header", CONTROL: "header", IMU: "header", "/level": "log"}
     signals = SignalMap(tuple(states), tuple(controls), clock=STATE, max_gap=0.055, min_step=0.002, time=time)
+    step = 0.0101 if "memories" in options else None
+    signals = replace(signals, step=step or "recorded")
     model = UncertainLTI(
         rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.uniform(0, 0.3, (n, n)), rng.uniform(0, 0.3, (n, m)),
         v=np.array([0.18, 0.5, 0.6, 0.22][:n]),
         domain=Domain(np.full(n, -3.0), np.full(n, 3.0), np.full(m, -3.0), np.full(m, 3.0)),
         signals=signals,
-        sampling=Sampling(STATE, VECTOR, time, dt_median=0.01, max_gap=0.055),
+        sampling=Sampling(STATE, VECTOR, time, dt_median=0.01, max_gap=0.055, step=step),
         alarm_rule=alarm,
     )  # fmt: skip
     model.save(path)

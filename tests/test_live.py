@@ -55,7 +55,10 @@ def world(tmp_path: Path) -> Iterator[World]:
 # --- a model and recordings made by hand --------------------------------------------------------------------
 
 
-def by_hand(time: str = "header", max_hold: float | None = 0.5, **options: Any) -> UncertainLTI:
+def by_hand(
+    time: str = "header", max_hold: float | None = 0.5, remembers: bool = False, **options: Any
+) -> UncertainLTI:
+    """remembers: with lag, diff and rate, values that do not count, and a constant step."""
     """Two states on a JointState, controls on a Vector3Stamped (header time) or a Float64 (log time)."""
     if time == "header":
         state = [(STATE, JOINT_STATE, "position[a]"), (STATE, JOINT_STATE, "position[b]")]
@@ -74,6 +77,16 @@ def by_hand(time: str = "header", max_hold: float | None = 0.5, **options: Any) 
             for name, (topic, kind, path) in zip(names[1], control, strict=False)
         ),
     )
+    if remembers:
+        a, b = signals.states
+        p, q = signals.controls
+        memories = [
+            replace(a, name="a_before", field="lag(position[a], 2)"),
+            replace(b, name="b_rate", field="rate(position[b])"),
+            replace(q, name="q_change", field="diff(vector.y)"),
+        ]
+        a, p = replace(a, valid=(0.24, 0.45)), replace(p, valid=(-0.7, math.inf))
+        signals = SignalMap((a, b), (p, q, *memories))
     n, m = len(signals.states), len(signals.controls)
     rng = np.random.default_rng(7)
     clock = signals.states[0].topic
@@ -83,7 +96,9 @@ def by_hand(time: str = "header", max_hold: float | None = 0.5, **options: Any) 
         time=dict.fromkeys(signals.topics, time),
         dt_median=STEP_NS * 1e-9,
         max_gap=2.5 * STEP_NS * 1e-9,
+        step=1.01 * STEP_NS * 1e-9 if remembers else None,
     )
+    signals = replace(signals, step=sampling.step or "recorded")
     model = UncertainLTI(
         rng.normal(size=(n, n)) - 2.0 * np.eye(n),
         rng.normal(size=(n, m)),
@@ -252,6 +267,20 @@ def test_header_time_gives_live_what_it_gives_offline(world: World, tmp_path: Pa
     status = world.status()
     assert status["verdicts"] == sum(v.judged for v in verdicts)
     assert sum(status["lost"].values()) == 0 and status["received"].keys() == {STATE, CONTROL}
+
+
+def test_memories_limits_and_a_constant_step_give_live_what_they_give_offline(world: World, tmp_path: Path) -> None:
+    model = by_hand(alarm_rule=AlarmRule(2, 5), remembers=True)
+    path = saved(model, tmp_path)
+    verdicts = offline(path, header_bag(by_hand(), tmp_path / "run.mcap", 300))
+    assert sum(v.judged for v in verdicts) > 100 and {v.status for v in verdicts} >= {Status.OK, Status.MISSING}
+    checked = EnvelopeMonitor(model).check(read_as_fitted(tmp_path / "run.mcap", UncertainLTI.load(path).signals))
+    assert checked.transient.counters.of("invalid").keys() == {"a", "a_before", "p"}
+    assert bits(checked.lower[checked.judged]) == bits([v.lower for v in verdicts if v.judged])
+    world.monitor(path)
+    outputs = Outputs.of(world)
+    world.command("play", tmp_path / "run.mcap", "--rate", 2.0).succeed(60)
+    outputs.hold_against(verdicts, ("a", "b"))
 
 
 def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import math
 import os
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -313,9 +314,14 @@ def models(draw: st.DrawFn) -> UncertainLTI:
             "pkg/msg/Type",
             None if i < n else draw(st.none() | st.floats(0, 1e9)),
             0 if i < n else draw(st.integers(0, 5)),
+            draw(st.sampled_from([None, (-1.5, 2.0), (0.0, INF), (-INF, 1e9)])),
+            draw(st.sampled_from([(), (2.146e9,), (-1.0, 0.1)])),
         )
         for i in range(n + m)
     ]
+    memories = draw(st.lists(st.sampled_from(["lag(d[0], 2)", "diff(d[0])", "rate(u)"]), max_size=m, unique=True))
+    for i, field in enumerate(memories, start=n):
+        given[i] = replace(given[i], topic="/x", field=field, delay=0)
     signals = SignalMap(
         tuple(given[:n]),
         tuple(given[n:]),
@@ -323,11 +329,12 @@ def models(draw: st.DrawFn) -> UncertainLTI:
         max_gap=draw(seconds),
         min_step=draw(st.floats(0, 1)),
         max_skew=draw(st.none() | seconds),
-        time={"/x": "header"} | ({"/u": "log"} if m else {}),
+        step=draw(st.sampled_from(["recorded", 0.002])),
+        time={"/x": "header"} | ({"/u": "log"} if m > len(memories) else {}),
     )
-    sampling = Sampling(
-        "/x", "pkg/msg/Type", signals.time, 0.1, 0.05, 0.2, signals.max_gap, signals.min_step, signals.max_skew
-    )
+    step = None if signals.step == "recorded" else signals.step
+    limits = signals.max_gap, signals.min_step, signals.max_skew, step
+    sampling = Sampling("/x", "pkg/msg/Type", signals.time, 0.1, 0.05, 0.2, *limits)
     box = [draw(hnp.arrays(float, k, elements=number)) for k in (n, n, m, m)]
     if draw(st.booleans()):
         box[0][0] = -INF

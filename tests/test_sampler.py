@@ -108,6 +108,8 @@ class Reference:
                     continue
                 else:
                     status, dt = (Status.GAP if step > self.max_gap else Status.OK), step * 1e-9
+                    if status is Status.OK and self.signals.step != "recorded":
+                        dt = self.signals.step
                 samples[-1].closed_by = index
             samples.append(Sample(index, instant, status, dt, reset_by=resets))
         self.counters["samples"] = len(samples)
@@ -139,16 +141,34 @@ class Reference:
         values = {i: list(self.sent[i].values) for i in taken}
         for column, position in enumerate(where):
             signal = self.signals[position]
-            if not signal.field.startswith("unwrap"):
+            low, high = signal.valid or (-INF, INF)
+            for i in self.by_topic[topic]:
+                value = self.sent[i].values[column]
+                if value < low or value > high or any(value == code for code in signal.ignore):
+                    self.counters[f"invalid {signal.name}"] += 1
+                    if i in values:
+                        values[i][column] = NAN
+            if "unwrap" not in signal.field:
                 continue
-            last = signal.steady
+            last = steady = self.signals[self._recalls(position)].steady
             for i in taken:
                 if i in starts:
-                    last = signal.steady
+                    last = steady
                 if math.isfinite(values[i][column]):
                     turns = round((last - values[i][column]) / (2 * math.pi))
                     last = values[i][column] = values[i][column] + 2 * math.pi * turns
         return values
+
+    def _recalls(self, position: int) -> int:
+        """The state or control that a memory such as lag(data, 2) is of; the signal itself without one."""
+        signal = self.signals[position]
+        if "(" not in signal.field or signal.field.startswith("unwrap"):
+            return position
+        field = signal.field.partition("(")[2].removesuffix(")").partition(",")[0]
+        for i, other in enumerate(self.signals):
+            if (other.topic, other.field) == (signal.topic, field) and not other.delay:
+                return i
+        return position
 
     def age(self, sample: Sample, index: int) -> int:
         ours, theirs = self.stamp(sample.index), self.stamp(index)
@@ -243,7 +263,9 @@ class Reference:
             for position, value in zip(where, self.values[topic][chosen], strict=True):
                 signal = self.signals[position]
                 limit = self.signals.max_skew or self.signals.max_gap
-                if position >= self.n:
+                recalls = signal.field.startswith(("lag", "diff", "rate"))
+                of_state = recalls and signal.max_hold is None and any(s.topic == topic for s in self.signals.states)
+                if position >= self.n and not of_state:
                     limit = signal.max_hold
                 if limit is not None and age > to_ns(limit):
                     self.counters[f"stale {signal.name}"] += 1
@@ -252,14 +274,19 @@ class Reference:
         sample.z = z
 
     def _delay(self) -> None:
-        """u(t_k - delay) of the same segment in place of u(t_k)."""
+        """u(t_k - delay) of the same segment in place of u(t_k); and what lag, diff and rate take of earlier ones."""
         closed = [s for s in self.samples if s.closed_by is not None]
         before = [list(s.z) for s in closed]
         for k, sample in enumerate(closed):
             for j, control in enumerate(self.signals.controls, start=self.n):
-                source = k - control.delay
+                kind = control.field.partition("(")[0]
+                back = int(control.field.rpartition(",")[2].strip(" )")) if kind == "lag" else control.delay
+                source = k - (1 if kind in ("diff", "rate") else back)
                 joined = source >= 0 and not any(s.status.opens_segment for s in closed[source + 1 : k + 1])
-                sample.z[j] = before[source][j] if joined else NAN
+                past = before[source][j] if joined else NAN
+                if kind in ("diff", "rate"):
+                    past = before[k][j] - past
+                sample.z[j] = past / sample.dt if kind == "rate" and joined else past
             for signal, value in zip(self.signals.signals, sample.z, strict=True):
                 self.counters[f"missing {signal.name}"] += not math.isfinite(value)
 
@@ -352,6 +379,16 @@ def maps(draw: st.DrawFn) -> SignalMap:
         Signal(f"u{j}", topic, "data", max_hold=draw(limits), delay=draw(st.sampled_from([0, 0, 0, 1, 3])))
         for j, topic in enumerate(draw(st.lists(st.sampled_from(["/c", "/s", "/u", "/u", "/v"]), max_size=3)))
     ]
+    memories = ["lag(data, 1)", "lag(unwrap(data), 3)", "diff(data)", "rate(data)", "rate(unwrap(data))"]
+    for j, topic in enumerate(draw(st.lists(st.sampled_from(["/c", "/s", "/u"]), max_size=2))):
+        controls.append(Signal(f"m{j}", topic, draw(st.sampled_from(memories)), max_hold=draw(limits)))
+    valid = st.sampled_from([None, None, (-3.0, 50.0), (0.0, INF)])
+    ignored = st.sampled_from([(), (), (1.0,), (100.0, -2.5)])
+    if draw(st.booleans()):
+        states, controls = (
+            [replace(signal, valid=draw(valid), ignore=draw(ignored)) for signal in group]
+            for group in (states, controls)
+        )
     topics = dict.fromkeys(s.topic for s in [*states, *controls])
     return SignalMap(
         tuple(states),
@@ -360,6 +397,7 @@ def maps(draw: st.DrawFn) -> SignalMap:
         max_gap=draw(st.sampled_from([0.02, 0.05])),
         min_step=draw(st.sampled_from([0.0, 0.0, 0.02])),
         max_skew=draw(st.sampled_from([None, None, 0.02, 1.0])),
+        step=draw(st.sampled_from(["recorded", "recorded", 0.011])),
         time={t: draw(st.sampled_from(["header", "header", "log"])) for t in topics},
     )
 

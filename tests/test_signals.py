@@ -458,7 +458,7 @@ def control(entry: str) -> str:
         (X + "max_gap: 1\nmax_gap: 2", "key 'max_gap' is twice in one mapping, again at line 4"),
         (
             state("scales: 2"),
-            "states\\[0\\]: unknown key 'scales' \\(is scale meant\\?\\); known are delay, field, max_hold, name",
+            "states\\[0\\]: unknown key 'scales' \\(is scale meant\\?\\); known are delay, field, ignore, max_hold",
         ),
         (state("scale: 0"), "signal 'x': scale is 0.0; it must be a positive number or auto"),
         (state("scale: -1"), "signal 'x': scale is -1.0"),
@@ -490,6 +490,17 @@ def control(entry: str) -> str:
         (X + "max_skew: -1", "max_skew is -1.0; it must be a positive number of seconds"),
         (X + "min_step: -1", "min_step is -1.0; it must be 0 s or more"),
         (X + "min_step: .inf", "min_step is inf; it must be 0 s or more"),
+        (X + "step: even", "step is 'even'; write recorded, constant, or the period in seconds"),
+        (X + "step: 0", "step is 0.0; it must be 1e-9 to 9e"),
+        (X + "step: [1]", "step is \\[1\\]; write recorded, constant"),
+        (state("valid: 3"), "valid is 3; write \\[least, greatest\\]"),
+        (state("valid: [1, 1]"), "signal 'x': valid is \\[1.0, 1.0\\]; write \\[least, greatest\\]"),
+        (state("valid: [a, 1]"), "valid\\[0\\] is 'a'; write a number"),
+        (state("ignore: [1, null]"), "ignore has an empty entry"),
+        (state("ignore: {a: 1}"), "ignore is {'a': 1}; write a list of numbers"),
+        (control("field: 'lag(data, 0)'").replace("field: data, ", ""), "a lag is 1 to 1000000 samples, not 0"),
+        (control("field: 'lag(data, 1)', delay: 2").replace("field: data, ", ""), "'u': lag\\(data, 1\\) has a delay"),
+        ("states: [{name: x, topic: /a, field: diff(data)}]", "every state is a lag, diff or rate, .* list the field"),
     ],
 )
 def test_a_wrong_signals_file_is_refused_in_one_sentence(text: str | bytes, words: str, tmp_path: Path) -> None:

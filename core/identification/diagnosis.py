@@ -198,8 +198,7 @@ def describe(
     past = bool(lagged)  # A alone is then not the dynamics
     slow = [] if past else _slow(model, known, apart and not alike, bool(follow))
     messages += slow
-    if not past:
-        messages += _unstable(model)
+    messages += _unstable(model, past)
     messages += _unsure(model, names)
     columns = problem.columns
     if not columns.noise and not columns.disturbance:
@@ -230,11 +229,11 @@ def _few(words: Sequence[str]) -> str:
     return "; ".join(words[:3]) + (f"; and {len(words) - 3} more" if len(words) > 3 else "")
 
 
-def _unstable(model: UncertainLTI) -> list[str]:
-    """Whether the nominal model, of every block, stays bounded in a free run."""
+def _unstable(model: UncertainLTI, past: bool) -> list[str]:
+    """Whether the nominal model, of every block, stays bounded in a free run; past: it remembers earlier samples."""
     growing, running = [], []
     for r, block in enumerate(model.blocks):
-        unstable = [v for v in block.eigenvalues() if v.real > 0]
+        unstable = [] if past else [v for v in block.eigenvalues() if v.real > 0]
         if unstable:
             values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
             growing.append(f"eigenvalues {values} 1/s{_at(model, r)}")

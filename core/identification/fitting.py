@@ -465,6 +465,8 @@ def _common_signals(transients: Sequence[Transient]) -> SignalMap:
                 f"{other.name} has the scheduling signals {', '.join(other.scheduling_names) or 'none'}, {first.name} "
                 f"has {', '.join(first.scheduling_names) or 'none'}; read all recordings with one signals file"
             )
+        if other.step != first.step:
+            raise FitError(f"{other.name} has step {other.step or 'recorded'}, {first.name} {first.step or 'recorded'}")
         if other.signals != first.signals:
             raise FitError(f"{other.name} and {first.name} were read with different signals; read them together")
     if first.signals is not None:
@@ -475,6 +477,7 @@ def _common_signals(transients: Sequence[Transient]) -> SignalMap:
         tuple(Signal(name, "", _field(name, f"s{j + 1}")) for j, name in enumerate(first.scheduling_names)),
         max_gap=None if np.isinf(first.max_gap) else first.max_gap,
         min_step=first.min_step,
+        step=first.step or "recorded",
         source="arrays",
     )
 
@@ -531,6 +534,7 @@ def _model(
             max_gap=signals.max_gap,
             min_step=signals.min_step,
             max_skew=signals.max_skew,
+            step=None if isinstance(signals.step, str) else signals.step,
         ),
         domain=domain,
         alarm_rule=alarm_rule,

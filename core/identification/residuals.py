@@ -150,7 +150,7 @@ def _correlation(problem: Problem, now: NDArray[np.intp]) -> Array:
 
 
 def lagged_states(signals: Sequence[Signal], n: int) -> set[int]:
-    """Controls that are a state some samples earlier.
+    """Controls that are a state some samples earlier, or follow from its earlier samples.
 
     Parameters
     ----------
@@ -164,8 +164,8 @@ def lagged_states(signals: Sequence[Signal], n: int) -> set[int]:
     set of int
         Their columns among [x; u].
     """
-    states = {(s.topic, s.field) for s in signals[:n] if s.topic}
-    return {j for j, s in enumerate(signals) if j >= n and s.delay > 0 and (s.topic, s.field) in states}
+    states = {(s.topic, s.inner) for s in signals[:n]}
+    return {j for j, s in enumerate(signals) if j >= n and (s.delay > 0 or s.memory) and (s.topic, s.inner) in states}
 
 
 def missing(known: Residuals, signals: Sequence[Signal], states: Collection[int]) -> list[str]:

@@ -64,8 +64,8 @@ def coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[st
             messages.append(
                 f"'{signal.name}' is exactly {code * scale + steady:.9g} in {count} of {problem.N} transitions and "
                 f"{others.min():.4g} to {others.max():.4g} in the others: {STANDS_FOR_NONE}, or a sensor at its limit, "
-                f"and the envelope is fitted to the jumps there and back; leave those stretches out of the recording, "
-                f"or have NaN published"
+                f"and the envelope is fitted to the jumps there and back; if it stands for none, write "
+                f"`ignore: [{code * scale + steady:.12g}]` in the entry of '{signal.name}'"
             )
     return messages
 
@@ -178,8 +178,8 @@ def jittering(problem: Problem, signals: Sequence[Signal], speed: float, clock: 
     return [
         f"{JITTERS}: steps range from {dt.min() * 1e3:.3g} to {dt.max() * 1e3:.3g} ms around {usual * 1e3:.3g} ms, and "
         f"a constant step leaves {1 - 1 / ratio.max():.0%} less of '{signals[most].name}' unexplained over the "
-        f"{int(uneven.sum())} uneven ones (root mean square), so the samples are more even than their stamps: have "
-        f"them stamped at the sensor"
+        f"{int(uneven.sum())} uneven ones (root mean square), so the samples are more even than their stamps: "
+        f"write `step: constant` in the signals file, or have them stamped at the sensor"
         + (f", or try the other time of {clock} (header or log) under `topics`" if clock else "")
     ]
 

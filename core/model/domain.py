@@ -42,6 +42,8 @@ class Sampling:
         Shortest step, s; a message sooner than that is dropped.
     max_skew : float or None, optional
         Greatest age of a state from another topic than the clock, s; None for `max_gap`.
+    step : float or None, optional
+        Δt of every transition, s; None for that of the stamps.
     """
 
     clock: str = ""
@@ -53,6 +55,7 @@ class Sampling:
     max_gap: float | None = None
     min_step: float = 0.0
     max_skew: float | None = None
+    step: float | None = None
 
     @property
     def step_range(self) -> tuple[float, float]:

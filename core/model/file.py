@@ -6,7 +6,7 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -23,14 +23,16 @@ from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked
-from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.signals.table_layout import TableLayout
 
 FORMATS = ("uncertain-lti/1", "uncertain-lti/2")
 """Formats of model files, oldest first; the oldest that holds a model is written."""
 MAX_FILE_BYTES = 64 * 2**20
 _IN_EVERY_FILE = ("A", "B", "dA", "dB", "c", "dc", "v")  # the arrays of format 1; others are written if they are not 0
-_SCHEDULING = ("name", "topic", "type", "field", "unit", "steady", "scale", "max_hold")
+_STATE = ("name", "topic", "type", "field", "unit", "steady", "scale")
+_SCHEDULING = (*_STATE, "max_hold")
+_CONTROL = (*_SCHEDULING, "delay")
 _IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
 _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 
@@ -48,28 +50,20 @@ def structure(model: Any) -> dict[str, Any]:
     dict
         Plain data for JSON; null for infinite ranges.
     """
-    states = [
-        {key: getattr(s, key) for key in ("name", "topic", "type", "field", "unit", "steady", "scale")}
-        for s in model.signals.states
-    ]
-    controls = [
-        {
-            key: getattr(s, key)
-            for key in ("name", "topic", "type", "field", "unit", "steady", "scale", "max_hold", "delay")
-        }
-        for s in model.signals.controls
-    ]
+    states = [_signal(s, _STATE) for s in model.signals.states]
+    controls = [_signal(s, _CONTROL) for s in model.signals.controls]
     s = model.sampling
     arrays = [name for name in ARRAYS if name in _IN_EVERY_FILE or getattr(model, name).any()]
     scheduled = model.schedule is not None
     one_rule = model.alarm == (model.alarm_rule,)
     newer = scheduled or model.domain.measure is not None or model.signals.table is not None or bool(model.horizons)
     newer = newer or not one_rule or model.residuals is not None
+    newer |= s.step is not None or any(g.memory or g.valid is not None or g.ignore for g in model.signals)
     regimes: dict[str, Any] = {}
     if scheduled:
         regimes["schedule"] = model.schedule.to_list()
         if model.signals.scheduling:
-            regimes["scheduling"] = [{key: getattr(s, key) for key in _SCHEDULING} for s in model.signals.scheduling]
+            regimes["scheduling"] = [_signal(s, _SCHEDULING) for s in model.signals.scheduling]
         regimes["blocks"] = [
             {name: getattr(model, name)[r].tolist() for name in arrays}
             | {"transitions": facts.transitions, "tied_to": facts.tied_to}
@@ -90,6 +84,7 @@ def structure(model: Any) -> dict[str, Any]:
             "min_step": s.min_step,
             "max_skew": s.max_skew,
         }
+        | ({} if s.step is None else {"step": s.step})
         | ({} if model.signals.table is None else {"table": model.signals.table.to_dict()}),
         **(regimes if scheduled else {name: getattr(model, name).tolist() for name in arrays}),
         **({"horizons": [horizon.to_dict() for horizon in model.horizons]} if model.horizons else {}),
@@ -109,6 +104,16 @@ def structure(model: Any) -> dict[str, Any]:
         "fit": _plain({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
         "validation": _plain(model.validation),
     }
+
+
+def _signal(signal: Signal, keys: Sequence[str]) -> dict[str, Any]:
+    """Entry of a signal; null for no limit of what is valid."""
+    entry: dict[str, Any] = {key: getattr(signal, key) for key in keys}
+    if signal.valid is not None:
+        entry["valid"] = [v if math.isfinite(v) else None for v in signal.valid]
+    if signal.ignore:
+        entry["ignore"] = [v if math.isfinite(v) else str(v) for v in signal.ignore]
+    return entry
 
 
 def arguments(data: Any, source: str) -> dict[str, Any]:
@@ -148,8 +153,9 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     for name in data:
         if name not in known:
             raise ModelError(f"unknown field {reprlib.repr(name)}; known are {', '.join(sorted(known))}")
-    newer = {"table"} if data["format"] != FORMATS[0] else set()
-    said = _object(data["sampling"], "sampling", {f.name for f in fields(Sampling)} | newer)
+    older = data["format"] == FORMATS[0]
+    own = {f.name for f in fields(Sampling)}
+    said = _object(data["sampling"], "sampling", own - {"step"} if older else own | {"table"})
     sampling = Sampling(
         clock=_text(said.get("clock", ""), "sampling.clock"),
         clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
@@ -160,7 +166,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         min_step=_positive(said.get("min_step", 0.0), "sampling.min_step", zero=True) or 0.0,
         **{
             key: _positive(said.get(key), f"sampling.{key}")
-            for key in ("dt_median", "dt_min", "dt_max", "max_gap", "max_skew")
+            for key in ("dt_median", "dt_min", "dt_max", "max_gap", "max_skew", "step")
         },
     )
     for topic, kind in sampling.time.items():
@@ -174,6 +180,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         max_gap=sampling.max_gap,
         min_step=sampling.min_step,
         max_skew=sampling.max_skew,
+        step=sampling.step or "recorded",
         time={t: "log" if k == "log" else "header" for t, k in sampling.time.items()},
         table=TableLayout.from_dict(said["table"], "sampling.table") if "table" in said else None,
     )

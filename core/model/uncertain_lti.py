@@ -34,8 +34,10 @@ from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
 from uncertain_lti.sampling.transient import Transient, Transitions
-from uncertain_lti.signals.signal_map import Signal, SignalMap
+from uncertain_lti.signals.signal_map import Recalled, Signal, SignalMap
 
+LONGEST_RECURSION = 400
+"""Rows of the matrix of the recursion up to which it remembers earlier samples; longer memories are left out of it."""
 _BLOCK = 65536  # products per block of the vectorised path: they stay in the cache
 
 
@@ -599,6 +601,9 @@ class UncertainLTI:
     def simulate(self, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLike | None = None) -> Array:
         """Free run of the nominal model, x_{k+1} = x_k + Δt_k (A x_k + B u_k + c), as in eq. (3) with ΔA = ΔB = 0.
 
+        What a signal takes from earlier samples of a state (lag, diff, rate) follows the run, as soon as the run has
+        these samples.
+
         Parameters
         ----------
         x0 : array (n,)
@@ -621,14 +626,30 @@ class UncertainLTI:
         x = np.empty((len(u) + 1, self.n))
         x[0] = x0
         A, B, c = self.A, self.B, self.c
+        n, m = self.n, self.m
+        z = np.hstack((x[:-1], u, s))
+        recalled = [r for r in self.signals.recalled if r.of < n]
         with np.errstate(over="ignore", invalid="ignore"):  # an unstable model runs away, and may
             for k in range(len(u)):
+                z[k, :n] = x[k]
+                for of_state in recalled:
+                    self._recall(of_state, z, k, dt)
                 if self.schedule is not None:
-                    z = np.concatenate((x[k], u[k], s[k]))
-                    corners = self.schedule.corners(z[self._positions, None])
+                    corners = self.schedule.corners(z[k, self._positions, None])
                     A, B, c = (blended(blocks, *corners)[..., 0] for blocks in (self.A, self.B, self.c))
-                x[k + 1] = x[k] + dt[k] * (A @ x[k] + B @ u[k] + c)
+                x[k + 1] = x[k] + dt[k] * (A @ x[k] + B @ z[k, n : n + m] + c)
         return x
+
+    def _recall(self, recalled: Recalled, z: Array, k: int, dt: Array) -> None:
+        """Fill in what sample k takes from earlier ones, if the run z (N, n + m + q) has them."""
+        memory, before = recalled.memory, k - recalled.memory.samples
+        if before < 0:
+            return
+        steady, scale = self.operating_point.steady, self.operating_point.scale
+        now, past = z[[k, before], recalled.of] * scale[recalled.of] + steady[recalled.of]
+        value = past if memory.kind == "lag" else now - past
+        value = value / dt[before] if memory.kind == "rate" else value
+        z[k, recalled.position] = (value - steady[recalled.position]) / scale[recalled.position]
 
     def discrepancy(self, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
         """Discrepancies (4) and (5) between the free-running nominal model and a recorded transient.
@@ -695,6 +716,8 @@ class UncertainLTI:
     def spectral_radius(self, dt: float | None = None) -> float:
         """Largest |eigenvalue| of I + Δt A, of any block; above 1 the nominal recursion (3) runs away there.
 
+        What the model takes from earlier samples of its states belongs to the recursion.
+
         Parameters
         ----------
         dt : float, optional
@@ -713,7 +736,29 @@ class UncertainLTI:
         dt = self.sampling.dt_median if dt is None else dt
         if dt is None:
             raise ModelError("spectral radius: the model has no dt_median; give dt")
-        return float(np.abs(np.linalg.eigvals(np.eye(self.n) + dt * self.A)).max())
+        return float(np.abs(np.linalg.eigvals(self._recursion(dt))).max())
+
+    def _recursion(self, dt: float) -> Array:
+        """Matrix that takes [x_k; x_{k-1}; ...] to the next, as far back as the model remembers its states."""
+        n, scale = self.n, self.operating_point.scale
+        step = np.eye(n) + dt * self.A
+        recalled = [r for r in self.signals.recalled if r.of < n and r.position < n + self.m]
+        longest = max((r.memory.samples for r in recalled), default=0)
+        if not longest or longest > LONGEST_RECURSION // n:
+            return step
+        whole = np.zeros((*step.shape[:-2], n * (longest + 1), n * (longest + 1)))
+        whole[..., :n, :n] = step
+        whole[..., n:, :-n] = np.eye(n * longest)
+        for r in recalled:
+            column = dt * self.B[..., r.position - n] * (scale[r.of] / scale[r.position])
+            column = column / dt if r.memory.kind == "rate" else column
+            past = n * r.memory.samples + r.of
+            if r.memory.kind == "lag":
+                whole[..., :n, past] += column
+            else:
+                whole[..., :n, r.of] += column
+                whole[..., :n, past] -= column
+        return whole
 
     def replace(self, **changes: Any) -> UncertainLTI:
         """The same model with some constructor arguments replaced.
@@ -902,4 +947,5 @@ def _sampling(signals: SignalMap) -> Sampling:
         max_gap=signals.max_gap,
         min_step=signals.min_step,
         max_skew=signals.max_skew,
+        step=None if isinstance(signals.step, str) else signals.step,
     )

@@ -75,8 +75,9 @@ class Condition:
                 f"parameter enable is {text!r}; write TOPIC FIELD OPERATOR NUMBER, for example "
                 f"'/engine/mode data == 3', with one of {' '.join(_OPERATORS)}"
             ) from None
-        if path.unwrap:
-            raise ModelError(f"parameter enable: {path.text} cannot be compared, as unwrapping needs a history")
+        if path.unwrap or path.memory:
+            what = "unwrapping" if path.unwrap else path.text.partition("(")[0].strip()
+            raise ModelError(f"parameter enable: {path.text} cannot be compared, as {what} needs a history")
         return cls(match["topic"], path, match["operator"], value)
 
     def holds(self, value: float) -> bool | None:

@@ -514,6 +514,8 @@ class EnvelopeMonitor:
                 f"{transient.name}: {plural(transient.s.shape[1], 'further scheduling signal')}, and the model has "
                 f"{model.q}; read it with the signals of the model"
             )
+        if transient.step != model.sampling.step:
+            transient = transient.replace(step=model.sampling.step or "recorded")
         steps = transient.transitions()
         count, n = len(transient), model.n
         fitted = np.asarray(contained(self._shortest, steps.dt, self._longest))

@@ -163,6 +163,7 @@ def _pieces(transient: Transient, share: float) -> Transient:
         signals=transient.signals,
         max_gap=transient.max_gap,
         min_step=transient.min_step,
+        step=transient.step or "recorded",
         sources=transient.sources,
         **names,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-LATE, TOO_OLD, MISSING = "late", "stale", "missing"
+LATE, TOO_OLD, MISSING, INVALID = "late", "stale", "missing", "invalid"
 """Kinds that are counted per topic (late) or per signal."""
 
 
@@ -19,7 +19,7 @@ class Counters(Counter[str]):
 
         Parameters
         ----------
-        kind : {"late", "stale", "missing"}
+        kind : {"late", "stale", "missing", "invalid"}
             What happened.
         name : str
             Topic or signal.
@@ -33,7 +33,7 @@ class Counters(Counter[str]):
 
         Parameters
         ----------
-        kind : {"late", "stale", "missing"}
+        kind : {"late", "stale", "missing", "invalid"}
             What happened.
 
         Returns

@@ -66,3 +66,30 @@ def _forward_steps(instants: NDArray[np.int64], min_step_ns: int) -> NDArray[np.
             continue
         last = instant
     return np.array(longer, dtype=np.int64)
+
+
+def period_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> int | None:
+    """Period of a clock that samples evenly, whatever its stamps do, over all recordings.
+
+    The median of the time that 100 samples take (fewer of short recordings), divided by their number: a stamp that is
+    late, or a sample that is lost, changes few of these.
+
+    Parameters
+    ----------
+    instants : sequence of array (messages,) of int
+        Of each recording, ns.
+    min_step_ns : int, default 0
+        Shortest step that counts, ns.
+
+    Returns
+    -------
+    int or None
+        Nanoseconds, or None without a forward step.
+    """
+    steps = [_forward_steps(i, min_step_ns) for i in instants]
+    longest = max((len(s) for s in steps), default=0)
+    if not longest:
+        return None
+    over = max(1, min(100, longest // 4))
+    times = [np.concatenate([np.zeros(1, np.int64), np.cumsum(s)]) for s in steps]
+    return max(1, round(float(np.median(np.concatenate([t[over:] - t[:-over] for t in times]))) / over))

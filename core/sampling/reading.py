@@ -15,7 +15,7 @@ from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
-from uncertain_lti.sampling.counters import LATE, TOO_OLD
+from uncertain_lti.sampling.counters import INVALID, LATE, TOO_OLD
 from uncertain_lti.sampling.reading_processes import processes_for, read_streams
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.sampler import Sampler
@@ -515,5 +515,7 @@ def unused(transient: Transient) -> list[str]:
     counters = transient.counters
     parts += [f"{counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and counters[s.value]]
     return parts + [
-        f"{count} {kind} {name}" for kind in (LATE, TOO_OLD) for name, count in sorted(counters.of(kind).items())
+        f"{count} {kind} {name}"
+        for kind in (LATE, TOO_OLD, INVALID)
+        for name, count in sorted(counters.of(kind).items())
     ]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.limits import LONGEST_S
-from uncertain_lti.sampling.instants import median_step_ns, to_ns
+from uncertain_lti.sampling.instants import median_step_ns, period_ns, to_ns
 from uncertain_lti.signals.signal_map import SignalMap
 
 
@@ -20,7 +20,7 @@ def resolve(
     instants: Mapping[str, Sequence[NDArray[np.int64]]],
     time: Mapping[str, str],
 ) -> SignalMap:
-    """Fill in clock, max_gap and time sources by the stated rules.
+    """Fill in clock, max_gap, a constant step and time sources by the stated rules.
 
     Parameters
     ----------
@@ -57,9 +57,13 @@ def resolve(
             f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
         )
     max_gap = signals.max_gap if signals.max_gap is not None else min(2.5 * step * 1e-9, LONGEST_S)
+    constant = signals.step
+    if constant == "constant":
+        constant = (period_ns(instants[clock], min_step_ns) or step) * 1e-9
     return replace(
         signals,
         clock=clock,
         max_gap=max_gap,
+        step=constant,
         time={t: "header" if time[t] == "header" else "log" for t in signals.topics},
     )

@@ -19,11 +19,11 @@ from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling.angles import nearest_branch
-from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
-from uncertain_lti.sampling.instants import LONGEST_NS, to_ns
+from uncertain_lti.sampling.counters import INVALID, LATE, MISSING, TOO_OLD, Counters
+from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 BUFFERED_MESSAGES = 10_000
 """Messages kept per topic that wait for a later sample; at this many, all but the later half and the one that the
@@ -32,6 +32,8 @@ REMEMBERED_SAMPLES = 100
 """Closed samples that a message is compared with to find whether it came late."""
 KEPT_OVER_A_JUMP = 100
 """Messages kept per topic, whatever has been chosen, once its time has stepped back and the clock's has not yet."""
+
+_LAG, _DIFF, _RATE = 0, 1, 2
 
 
 class Step:
@@ -112,6 +114,7 @@ class _Topic:
     behind: cython.bint  # the clock's time has stepped back, its own not yet
     leave: Any  # a sample before the step back and what it has chosen, or None
     closed: deque[tuple[_Message, _Message | None]]  # and what they chose
+    limited: list[tuple[int, Signal]]  # those of which not every value counts
     unwrap: list[int]
     previous: list[float]
     steady: list[float]
@@ -125,7 +128,8 @@ class _Topic:
         self.header, self.clock_has_stamps = (signals.time[topic] == "header" for topic in (name, signals.clock or ""))
         here = [signals[i] for i in self.where]
         self.unwrap = [i for i, signal in enumerate(here) if FieldPath(signal.field).unwrap]
-        self.steady = [0.0 if signal.steady == "auto" else signal.steady for signal in here]
+        self.limited = [(i, signal) for i, signal in enumerate(here) if signal.valid is not None or signal.ignore]
+        self.steady = [signals.branch(i) for i in self.where]
         self.kept = deque()
         self.forgotten, self.last = {}, {}
         self.left = False, 0
@@ -290,7 +294,8 @@ class Sampler:
     ----------
     counters : Counter
         samples, gaps, resets and missing; dropped messages by status value; `late <topic>` for messages that came
-        after the sample they belonged to was closed; `missing <signal>` and `stale <signal>` per sample.
+        after the sample they belonged to was closed; `missing <signal>` and `stale <signal>` per sample;
+        `invalid <signal>` per message whose value is outside `valid` or in `ignore`.
 
     Raises
     ------
@@ -311,7 +316,8 @@ class Sampler:
     _clock_is_x: cython.bint
     _unknown: list[float]
     _no_state: list[float]
-    _delays: list[tuple[int, int]]
+    _memories: list[tuple[int, int, int]]  # place, samples back, and which function
+    _period: cython.double  # s; 0 where Δt is that of the stamps
     _open: Any  # sample k: the clock message that opened it
     _open_status: Any
     _open_dt: cython.double
@@ -321,22 +327,29 @@ class Sampler:
     def __init__(self, signals: SignalMap) -> None:
         if signals.clock is None or signals.max_gap is None:
             raise SignalError(f"{signals.source}: clock and max_gap must be resolved before sampling")
+        if signals.step == "constant":
+            raise SignalError(f"{signals.source}: the constant step must be resolved before sampling")
         unsaid = [t for t in signals.topics if t not in signals.time]
         if unsaid:
             raise SignalError(f"{signals.source}: the time source of {', '.join(unsaid)} is not resolved")
         self.signals, self.clock = signals, signals.clock
         self.max_gap_ns, self.min_step_ns = to_ns(signals.max_gap), to_ns(signals.min_step)
-        skew_ns = self.max_gap_ns if signals.max_skew is None else to_ns(signals.max_skew)
         n = self._n = len(signals.states)
-        max_age = [skew_ns] * n
-        max_age += [LONGEST_NS if c.max_hold is None else to_ns(c.max_hold) for c in signals.held]
+        max_age = [to_ns(signals.longest_age(i)) for i in range(len(signals))]
         self._topics = {topic: _Topic(signals, topic, max_age) for topic in signals.topics}
         self._clock = self._topics[signals.clock]
         self._others = [topic for topic in self._topics.values() if topic is not self._clock]
         self._one_topic = all(signal.topic == signals.clock for signal in signals.states)
         self._clock_is_x = self._clock.where == list(range(n))
         self._unknown, self._no_state = [math.nan] * len(signals), [math.nan] * n
-        self._delays = [(n + j, c.delay) for j, c in enumerate(signals.controls) if c.delay]
+        self._memories = []
+        for i, signal in enumerate(signals):
+            memory = signal.memory
+            if signal.delay or (memory is not None and memory.kind == "lag"):
+                self._memories.append((i, memory.samples if memory is not None else signal.delay, _LAG))
+            elif memory is not None:
+                self._memories.append((i, 1, _DIFF if memory.kind == "diff" else _RATE))
+        self._period = 0.0 if isinstance(signals.step, str) else signals.step
         self.counters = Counters()
         self._open = self._before = None
         self._open_status, self._open_dt = Status.FIRST, math.nan
@@ -373,6 +386,10 @@ class Sampler:
             raise ValueError(
                 f"{topic}: {plural(len(message.values), 'value')} for {plural(len(state.where), 'signal')}"
             )
+        for i, signal in state.limited:
+            if not signal.admits(message.values[i]):
+                message.values[i] = math.nan
+                self.counters.add(INVALID, signal.name)
         if state is self._clock:
             return self._push_clock(message)
         if state.steps_back(message, self.max_gap_ns):
@@ -406,6 +423,8 @@ class Sampler:
                 return [self._dropped(Status.LATE, instant, message)]
             status = Status.OK if 0 < step <= self.max_gap_ns else Status.GAP if step > 0 else Status.RESET
             dt = step * 1e-9 if step > 0 else math.nan
+            if self._period > 0.0 and status is Status.OK:
+                dt = self._period
         opens = status is not Status.OK  # a segment
         if opens:
             state.previous = list(state.steady)
@@ -477,11 +496,18 @@ class Sampler:
                     z[i] = value
                 elif final:
                     self.counters.add(TOO_OLD, self.signals[i].name)
-        for i, delay in self._delays:
-            line = self._history.setdefault(i, deque(maxlen=delay + 1))
+        for i, back, kind in self._memories:
+            line = self._history.setdefault(i, deque(maxlen=back + 1))
             line = line if final else line.copy()
             line.append(z[i])
-            z[i] = line[0] if len(line) > delay else math.nan
+            if len(line) <= back:
+                z[i] = math.nan
+            elif kind == _LAG:
+                z[i] = line[0]
+            elif kind == _DIFF:
+                z[i] = line[1] - line[0]
+            else:
+                z[i] = (line[1] - line[0]) / self._open_dt
         if final and not all_finite(z):
             for signal, value in zip(self.signals, z, strict=True):
                 if not math.isfinite(value):

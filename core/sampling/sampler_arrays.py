@@ -17,18 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.sampling.angles import TURN, nearest_branch
-from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
+from uncertain_lti.sampling.counters import INVALID, LATE, MISSING, TOO_OLD, Counters
 from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.memory import Memory
 from uncertain_lti.signals.signal_map import SignalMap
 
 Integers = NDArray[np.int64]
 Values = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-_FAR = 2**62  # ns, longer than any recording
 
 
 @dataclass(frozen=True)
@@ -175,14 +174,13 @@ class _Sampling:
         self.signals = signals
         self.n = len(signals.states)
         self.max_gap, self.min_step = to_ns(signals.max_gap), to_ns(signals.min_step)
-        skew = self.max_gap if signals.max_skew is None else to_ns(signals.max_skew)
-        self.max_age = [skew] * self.n + [_FAR if c.max_hold is None else to_ns(c.max_hold) for c in signals.held]
+        self.max_age = [to_ns(signals.longest_age(i)) for i in range(len(signals))]
         self.counters: Counters = Counters()
         self.topics: dict[str, _Messages] = {}
         for position, name in enumerate(signals.topics):
             order = np.flatnonzero(topic == position)
             usable = stamp[order] if signals.time[name] == "header" else np.zeros_like(order)
-            self.topics[name] = _Messages(order, arrival[order], usable, values[position])
+            self.topics[name] = _Messages(order, arrival[order], usable, self._admitted(name, values[position]))
 
     def run(self) -> Samples:
         """All samples; raises _BackwardError."""
@@ -208,10 +206,25 @@ class _Sampling:
         z[:, signals.on(signals.clock)] = own[:closed]
         for name, others in self.topics.items():
             self._fix(name, others, samples, z)
-        self._delay(z, opens)
+        self._recall(z, samples.stamp if by_header else samples.arrival, opens)
         for signal, column in zip(signals.signals, z.T, strict=True):
             self._count_of(MISSING, signal.name, ~np.isfinite(column))
         return self._samples(samples.stamp if by_header else samples.arrival, z, own, opens, back)
+
+    def _admitted(self, topic: str, values: Values) -> Values:
+        """Values with NaN for those that do not count, which are counted."""
+        result = values
+        for column, position in enumerate(self.signals.on(topic)):
+            signal = self.signals[position]
+            if signal.valid is None and not signal.ignore:
+                continue
+            low, high = signal.valid or (-math.inf, math.inf)
+            own = values[:, column]
+            refused = (own < low) | (own > high) | np.isin(own, list(signal.ignored))
+            self._count_of(INVALID, signal.name, refused)
+            result = result.copy() if result is values else result
+            result[refused, column] = math.nan
+        return result
 
     def _count(self, what: str, which: Mask) -> None:
         if number := int(np.count_nonzero(which)):
@@ -250,8 +263,7 @@ class _Sampling:
             signal = self.signals[position]
             if FieldPath(signal.field).unwrap:
                 result = result.copy() if result is values else result
-                steady = 0.0 if signal.steady == "auto" else signal.steady
-                result[:, column] = _unwrap(values[:, column], steady, opens)
+                result[:, column] = _unwrap(values[:, column], self.signals.branch(position), opens)
         return result
 
     def _fix(self, name: str, others: _Messages, samples: _Messages, z: Values) -> None:
@@ -292,14 +304,14 @@ class _Sampling:
         late[after] = (before < 0) | (time[before] <= time[after])
         return late
 
-    def _delay(self, z: Values, opens: Mask) -> None:
-        """Shift controls by samples within a segment."""
-        place = np.arange(len(z))
-        segment_begin = np.maximum.accumulate(np.where(opens[: len(z)], place, 0)) if len(z) else place
-        for position, control in enumerate(self.signals.controls, start=self.n):
-            if control.delay:
-                source = place - control.delay
-                z[:, position] = np.where(source >= segment_begin, z[np.maximum(source, 0), position], math.nan)
+    def _recall(self, z: Values, instants: Integers, opens: Mask) -> None:
+        """Shift, or take the differences of, what follows from earlier samples of the segment."""
+        step = self.signals.step
+        dt = np.diff(instants, prepend=0)[: len(z)] * 1e-9 if isinstance(step, str) else np.full(len(z), step)
+        for position, signal in enumerate(self.signals):
+            memory = Memory("lag", signal.delay) if signal.delay else signal.memory
+            if memory is not None:
+                z[:, position] = recall(z[:, position], memory, dt, opens[: len(z)])
 
     def _samples(self, instants: Integers, z: Values, own: Values, opens: Mask, back: Mask) -> Samples:
         clock, m = self.signals.clock, len(self.signals.held)
@@ -319,6 +331,35 @@ class _Sampling:
         held[:-1] = z[: max(count - 1, 0), self.n :]
         held[:-1][back[1:count]] = math.nan
         return Samples(instants[:count].copy(), x, held, self.counters)
+
+
+def recall(values: Values, memory: Memory, dt: Values, opens: Mask) -> Values:
+    """What each sample takes from the samples up to it, as the `Sampler` has it.
+
+    Parameters
+    ----------
+    values : array (N,)
+        Of the field itself.
+    memory : Memory
+        What is taken.
+    dt : array (N,)
+        Step that leads to each sample, s; that of the first of a segment does not count.
+    opens : array of bool (N,)
+        The first sample of each segment.
+
+    Returns
+    -------
+    array (N,)
+        NaN where the segment has too few samples before.
+    """
+    place = np.arange(len(values))
+    begin = np.maximum.accumulate(np.where(opens, place, 0)) if len(values) else place
+    source = place - memory.samples
+    past = np.where(source >= begin, values[np.maximum(source, 0)], math.nan)
+    if memory.kind == "lag":
+        return past
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return values - past if memory.kind == "diff" else (values - past) / dt
 
 
 def _latest(time: Integers, at: Integers, arrived: Integers) -> Integers:

@@ -8,7 +8,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,6 +102,9 @@ class Transient:
         A step longer than this, s, starts a new segment. Default 2.5 x the median step; math.inf for no limit.
     min_step : float, default 0.0
         A sample less than this, s, after the one before is dropped, one with an equal stamp always.
+    step : float or "recorded", optional
+        Δt of every transition, s, for samples that are even and whose stamps are not; "recorded" for the difference of
+        the instants. Default that of `signals`, else "recorded".
     counters : mapping, optional
         Counts of a `Sampler` to start from.
     sources : sequence of paths, optional
@@ -112,7 +115,8 @@ class Transient:
     Raises
     ------
     TransientError
-        Shapes do not fit, times are not finite, steps are about a nanosecond, or max_gap or min_step is out of range.
+        Shapes do not fit, times are not finite, steps are about a nanosecond, or max_gap, min_step or step is out of
+        range.
     """
 
     t_ns: NDArray[np.int64]
@@ -120,6 +124,7 @@ class Transient:
     u: Array
     s: Array
     segment: NDArray[np.int32]
+    step: float | None
     counters: Counters
 
     def __init__(
@@ -136,6 +141,7 @@ class Transient:
         scheduling_names: Sequence[str] | None = None,
         max_gap: float | None = None,
         min_step: float = 0.0,
+        step: float | Literal["recorded"] | None = None,
         counters: Mapping[str, int] | None = None,
         sources: Sequence[str | os.PathLike[str]] = (),
         notes: Sequence[str] = (),
@@ -160,6 +166,11 @@ class Transient:
             )
         if not 0 <= min_step <= LONGEST_S:
             raise TransientError(f"{name}: min_step is {min_step}; it must be 0 s or more, up to {LONGEST_S:g}")
+        if step is None:
+            step = "recorded" if signals is None or signals.step == "constant" else signals.step
+        if step != "recorded" and not (isinstance(step, (int, float)) and 1e-9 <= step <= LONGEST_S):
+            raise TransientError(f"{name}: step is {step}; it must be 1e-9 to {LONGEST_S:g} s, or recorded")
+        self.step = None if isinstance(step, str) else float(step)
         min_step_ns = to_ns(min_step)
         median = median_step_ns([t_ns], min_step_ns)
         if max_gap is None:
@@ -189,6 +200,7 @@ class Transient:
         """
         arguments: dict[str, Any] = {
             "s": self.s[part],
+            "step": self.step or "recorded",
             **{
                 name: getattr(self, name)
                 for name in (
@@ -212,8 +224,9 @@ class Transient:
 
     @property
     def dt(self) -> Array:
-        """Δt_k = (t_{k+1} - t_k) * 1e-9 s, (N,); also across segments."""
-        return np.diff(self.t_ns) * 1e-9
+        """Δt_k = (t_{k+1} - t_k) * 1e-9 s, (N,); also across segments. Within one it is `step` where that is given."""
+        recorded = np.diff(self.t_ns) * 1e-9
+        return recorded if self.step is None else np.where(np.diff(self.segment) == 0, self.step, recorded)
 
     @property
     def usable(self) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.signals.field_types import FieldType, TypeFields
 from uncertain_lti.signals.functions import FUNCTIONS, FieldFunction, as_number
+from uncertain_lti.signals.memory import KINDS, parse_memory
 from uncertain_lti.signals.paths import numeric_paths
 
 _STEP = re.compile(
@@ -20,17 +21,27 @@ _STEP = re.compile(
 
 
 class FieldPath:
-    """One scalar of a message: `a.b[3]`, `position[fan]`, `yaw(pose.orientation)`, `unwrap(...)`.
+    """One scalar of a message: `a.b[3]`, `position[fan]`, `yaw(pose.orientation)`, `unwrap(...)`, `lag(..., 1)`.
 
     Dotted attributes; `[3]` is an index, `[fan]` the position of `fan` in the `name` array of the message that
     holds the array (as in sensor_msgs/JointState), `["3"]` a name that looks like an index. Derived: roll,
     pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle
-    in rad (the sampler does the unwrapping, as it knows where a stream restarts).
+    in rad, and, outermost, lag(field, k), diff(field) and rate(field) of earlier samples (the sampler does these two,
+    as it knows where a stream restarts).
 
     Parameters
     ----------
     text : str
         The path as a signals file writes it.
+
+    Attributes
+    ----------
+    unwrap : bool
+        The sampler is to unwrap it.
+    memory : Memory or None
+        What the sampler is to take from earlier samples.
+    inner : str
+        The path without that: whose earlier samples they are.
 
     Raises
     ------
@@ -38,16 +49,17 @@ class FieldPath:
         The text is not a field path.
     """
 
-    __slots__ = ("text", "unwrap", "function", "steps", "_name_index")
+    __slots__ = ("text", "unwrap", "memory", "inner", "function", "steps", "_name_index")
 
     def __init__(self, text: str) -> None:
         self.text = text
         self.unwrap = False
         self.function: FieldFunction | None = None
         self._name_index = 0
-        inner = text.strip()
+        self.memory, self.inner = parse_memory(text)
+        inner = self.inner
         functions: list[str] = []
-        known = (*FUNCTIONS, "unwrap")
+        known = (*FUNCTIONS, "unwrap", *KINDS)
         while match := re.fullmatch(r"([A-Za-z_]\w*)\s*\((.*)\)", inner, re.DOTALL):
             if match[1] not in known:
                 raise SignalError(
@@ -59,8 +71,10 @@ class FieldPath:
         if functions[:1] == ["unwrap"]:
             self.unwrap = True
             functions = functions[1:]
-        if len(functions) > 1 or "unwrap" in functions:
-            raise SignalError(f"field '{text}': functions nest only as unwrap(roll|pitch|yaw(...))")
+        if len(functions) > 1 or not set(functions) <= set(FUNCTIONS):
+            raise SignalError(
+                f"field '{text}': functions nest only as unwrap(roll|pitch|yaw(...)), and in lag, diff, rate"
+            )
         if functions:
             self.function = FUNCTIONS[functions[0]]
         self.steps = self._parse(inner)

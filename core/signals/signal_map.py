@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import reprlib
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
@@ -14,16 +17,17 @@ from uncertain_lti.signals.additive import CHOICES, CHOICES_TEXT, Additive
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti.signals.file_values import checked_mapping, checked_number, kind_in_yaml, load_yaml
+from uncertain_lti.signals.memory import LONGEST_DELAY, Memory, parse_memory
 from uncertain_lti.signals.table_layout import TableLayout
-
-LONGEST_DELAY = 1_000_000
-"""Samples by which a control may be delayed at most."""
-
 
 Number = float | Literal["auto"]
 
 
 TimeSource = Literal["header", "log"]
+
+
+STEP_CHOICES = "recorded, constant, or the period in seconds"
+"""What `step` may be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +54,10 @@ class Signal:
         Greatest age, s, at which a held control still counts; None for no limit. For controls only.
     delay : int, default 0
         Samples by which a control is shifted: sample k takes u(t_{k - delay}). For controls only.
+    valid : (float, float) or None, optional
+        Least and greatest value of the field; beyond them it counts as missing. None for no limit.
+    ignore : tuple of float, default ()
+        Values of the field that stand for none; each also as single precision rounds it.
     """
 
     name: str
@@ -61,6 +69,67 @@ class Signal:
     type: str = ""
     max_hold: float | None = None
     delay: int = 0
+    valid: tuple[float, float] | None = None
+    ignore: tuple[float, ...] = ()
+
+    @property
+    def memory(self) -> Memory | None:
+        """What it takes from earlier samples of its field; None for the present value."""
+        return parse_memory(self.field)[0]
+
+    @property
+    def inner(self) -> str:
+        """Path of the field itself, without the memory."""
+        return parse_memory(self.field)[1]
+
+    def admits(self, value: float) -> bool:
+        """Whether a value of the field counts.
+
+        Parameters
+        ----------
+        value : float
+            Recorded units; NaN counts, as it says itself that there is none.
+
+        Returns
+        -------
+        bool
+            False outside `valid`, and for a value of `ignore`.
+        """
+        low, high = self.valid or (-math.inf, math.inf)
+        return not (value < low or value > high or value in self.ignored)
+
+    @property
+    def ignored(self) -> frozenset[float]:
+        """`ignore`, and its values as single precision rounds them."""
+        return frozenset(v for code in self.ignore for v in (code, _single(code)))
+
+
+def _single(value: float) -> float:
+    """The nearest number of single precision; the value itself beyond its range."""
+    try:
+        rounded: float = struct.unpack("f", struct.pack("f", value))[0]
+    except OverflowError:
+        return value
+    return rounded
+
+
+@dataclass(frozen=True)
+class Recalled:
+    """A signal that follows from another one's samples.
+
+    Parameters
+    ----------
+    position : int
+        Of the signal in [x; u; s].
+    of : int
+        Of the state or control whose samples they are.
+    memory : Memory
+        How it follows.
+    """
+
+    position: int
+    of: int
+    memory: Memory
 
 
 @dataclass(frozen=True)
@@ -105,7 +174,8 @@ class SignalMap:
     Parameters
     ----------
     states : tuple of Signal
-        States, in the order of x; at least one.
+        States, in the order of x; at least one. One whose field is a memory (lag, diff or rate) is known before the
+        step and so has no row: it becomes the last of the controls.
     controls : tuple of Signal, optional
         Controls, in the order of u.
     scheduling : tuple of Signal, optional
@@ -118,6 +188,8 @@ class SignalMap:
         Shortest step, s; a message sooner than that is dropped.
     max_skew : float or None, optional
         Greatest age of a state from another topic than the clock, s; None for `max_gap`.
+    step : "recorded", "constant" or float, default "recorded"
+        Δt: between stamps; or one period for every step that is no gap, estimated or given, s.
     time : mapping of str to {"header", "log"}, optional
         Per topic whether its instant is the header stamp or the log time; for a topic that is left out, header where
         most of its messages carry a stamp.
@@ -145,6 +217,7 @@ class SignalMap:
     max_gap: float | None = None
     min_step: float = 0.0
     max_skew: float | None = None
+    step: Literal["recorded", "constant"] | float = "recorded"
     time: Mapping[str, TimeSource] = field(default_factory=dict)
     additive: Additive | None = None
     schedule: tuple[ScheduleRule, ...] = ()
@@ -153,6 +226,7 @@ class SignalMap:
     source: str = "signals"
 
     def __post_init__(self) -> None:
+        self._place_memories()
         if not self.states:
             raise SignalError(f"{self.source}: 'states' is empty; list at least one state")
         seen: set[str] = set()
@@ -183,6 +257,12 @@ class SignalMap:
                 raise SignalError(
                     f"{where}: delay is {reprlib.repr(signal.delay)}; it must be 0 to {LONGEST_DELAY} samples"
                 )
+            if signal.delay and signal.memory:
+                raise SignalError(f"{where}: {signal.field} has a delay, too; leave it out, or write lag(field, k)")
+            if signal.valid is not None and not signal.valid[0] < signal.valid[1]:
+                raise SignalError(f"{where}: valid is {list(signal.valid)}; write [least, greatest]")
+            if any(math.isnan(code) for code in signal.ignore):
+                raise SignalError(f"{where}: ignore lists NaN, which never counts; leave it out")
         for signal in self.states:
             if signal.max_hold is not None or signal.delay:
                 raise SignalError(
@@ -211,6 +291,11 @@ class SignalMap:
                     f"signals come from {', '.join(self.topics)}",
                     self.topics,
                 )
+        if isinstance(self.step, str):
+            if self.step not in ("recorded", "constant"):
+                raise SignalError(f"{self.source}: step is {reprlib.repr(self.step)}; write {STEP_CHOICES}")
+        elif not 1e-9 <= self.step <= LONGEST_S:
+            raise SignalError(f"{self.source}: step is {self.step}; it must be 1e-9 to {LONGEST_S:g} s")
         for name in ("max_gap", "max_skew"):
             value = getattr(self, name)
             if value is not None and not 0 < value <= LONGEST_S:
@@ -221,6 +306,26 @@ class SignalMap:
             raise SignalError(
                 f"{self.source}: min_step is {self.min_step}; it must be 0 s or more, up to {LONGEST_S:g}"
             )
+
+    def _place_memories(self) -> None:
+        """Put memories among the states after the controls; what is valid of a listed field is so of its memories."""
+        memories = tuple(s for s in self.states if _recalls(s))
+        if memories:
+            object.__setattr__(self, "states", tuple(s for s in self.states if not _recalls(s)))
+            object.__setattr__(self, "controls", (*self.controls, *memories))
+            if not self.states:
+                raise SignalError(
+                    f"{self.source}: every state is a lag, diff or rate, which has no row of its own; list the field "
+                    f"itself as a state, too"
+                )
+        known = {(s.topic, s.field): s for s in reversed(self.signals)}
+        for group in ("controls", "scheduling"):
+            signals = list(getattr(self, group))
+            for i, signal in enumerate(signals):
+                listed = known.get((signal.topic, signal.inner)) if _recalls(signal) else None
+                if listed is not None and signal.valid is None and not signal.ignore:
+                    signals[i] = replace(signal, valid=listed.valid, ignore=listed.ignore)
+            object.__setattr__(self, group, tuple(signals))
 
     def __len__(self) -> int:
         return len(self.signals)
@@ -241,6 +346,58 @@ class SignalMap:
     def held(self) -> tuple[Signal, ...]:
         """Signals whose last value holds until the next: controls, then further scheduling signals."""
         return self.controls + self.scheduling
+
+    @property
+    def recalled(self) -> tuple[Recalled, ...]:
+        """Signals that follow from the samples of a state or control that is listed, too; a delayed one is a lag."""
+        plain = [(i, s) for i, s in enumerate(self.signals) if not s.delay and s.memory is None]
+        at = {(s.topic, s.inner): i for i, s in reversed(plain)}
+        found = []
+        for position, signal in enumerate(self.signals):
+            memory = Memory("lag", signal.delay) if signal.delay else signal.memory
+            of = at.get((signal.topic, signal.inner))
+            if memory is not None and of is not None and of != position:
+                found.append(Recalled(position, of, memory))
+        return tuple(found)
+
+    def branch(self, position: int) -> float:
+        """Value nearest to which an angle starts when it is unwrapped.
+
+        Parameters
+        ----------
+        position : int
+            Of the signal in [x; u; s].
+
+        Returns
+        -------
+        float
+            Its steady state, of a memory that of the signal that it recalls; 0 for one that is still open.
+        """
+        of = next((r.of for r in self.recalled if r.position == position), position)
+        steady = self.signals[of].steady
+        return 0.0 if steady == "auto" else steady
+
+    def longest_age(self, position: int) -> float:
+        """Age at which the value of another topic than the clock still counts.
+
+        Parameters
+        ----------
+        position : int
+            Of the signal in [x; u; s].
+
+        Returns
+        -------
+        float
+            s: of a state, and of the memory of a topic of states, max_skew or else max_gap; of the others max_hold.
+        """
+        signal = self.signals[position]
+        if signal.max_hold is not None:
+            return signal.max_hold
+        of_state = signal.topic in {s.topic for s in self.states}
+        if position < len(self.states) or (of_state and signal.memory is not None):
+            age = self.max_gap if self.max_skew is None else self.max_skew
+            return math.inf if age is None else age
+        return math.inf
 
     def replace_signals(self, signals: Sequence[Signal]) -> SignalMap:
         """The same map with other signals in the place of these.
@@ -370,6 +527,7 @@ class SignalMap:
                 "max_gap",
                 "min_step",
                 "max_skew",
+                "step",
                 "additive",
                 "schedule",
                 "structure",
@@ -388,6 +546,7 @@ class SignalMap:
                     f"{source}: topics: {topic}: time is {reprlib.repr(source_of_time)}; write header or log"
                 )
             time[topic] = source_of_time
+        top = top | _with_memories(top)
         additive = top.get("additive")
         if additive not in (None, *CHOICES):
             raise SignalError(f"{source}: additive is {reprlib.repr(additive)}; write {CHOICES_TEXT}")
@@ -402,6 +561,7 @@ class SignalMap:
             max_gap=checked_number(top.get("max_gap"), f"{source}: max_gap"),
             min_step=checked_number(top.get("min_step"), f"{source}: min_step") or 0.0,
             max_skew=checked_number(top.get("max_skew"), f"{source}: max_skew"),
+            step=_step(top.get("step"), f"{source}: step"),
             time=time,
             additive=additive,
             schedule=_schedule(top.get("schedule"), f"{source}: schedule"),
@@ -409,6 +569,74 @@ class SignalMap:
             table=TableLayout.from_dict(top["table"], f"{source}: table") if top.get("table") is not None else None,
             source=source,
         )
+
+
+def _recalls(signal: Signal) -> bool:
+    """Whether the field is a memory; one that is no field path is refused later, by name."""
+    try:
+        return signal.memory is not None
+    except SignalError:
+        return False
+
+
+def _with_memories(top: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Lists of signals in which a memory has the scale, unit and, of a lag, steady state of the listed field."""
+    lists = {key: top[key] for key in ("states", "controls", "scheduling") if isinstance(top.get(key), list)}
+    entries = [
+        e for entries in lists.values() for e in entries if isinstance(e, dict) and isinstance(e.get("field"), str)
+    ]
+    listed = {(str(e.get("topic")), e["field"].strip()): e for e in reversed(entries)}
+    found: dict[str, list[Any]] = {}
+    for key, of_list in lists.items():
+        found[key] = []
+        for entry in of_list:
+            memory = of = None
+            if any(entry is e for e in entries):
+                with contextlib.suppress(SignalError):  # refused later, by the name of the signal
+                    memory, inner = parse_memory(entry["field"])
+                    of = listed.get((str(entry.get("topic")), inner))
+            if memory is not None and of is not None:
+                unit = str(of.get("unit") or "")
+                own = {"scale": of.get("scale", 1.0), "unit": f"{unit}/s" if unit and memory.kind == "rate" else unit}
+                own |= {"steady": of["steady"]} if memory.kind == "lag" and "steady" in of else {}
+                entry = own | entry
+            found[key].append(entry)
+    return found
+
+
+def _step(value: Any, where: str) -> Literal["recorded", "constant"] | float:
+    if value is None or value == "recorded":
+        return "recorded"
+    if value == "constant":
+        return "constant"
+    try:
+        number = checked_number(value, where)
+    except SignalError:
+        raise SignalError(f"{where} is {reprlib.repr(value)}; write {STEP_CHOICES}") from None
+    assert number is not None
+    return number
+
+
+def _limits(entry: dict[str, Any], where: str) -> None:
+    """Numbers of `valid` and `ignore` in the place of what the file has; null is no limit."""
+    for key in ("valid", "ignore"):
+        if entry.get(key) is None:
+            entry.pop(key, None)
+            continue
+        value = entry[key]
+        if key == "ignore" and not isinstance(value, (list, dict)):
+            value = [value]
+        if not isinstance(value, list) or (key == "valid" and len(value) != 2):
+            wanted = "[least, greatest]" if key == "valid" else "a list of numbers"
+            raise SignalError(f"{where}: {key} is {reprlib.repr(value)}; write {wanted}")
+        numbers = [checked_number(v, f"{where}: {key}[{i}]") for i, v in enumerate(value)]
+        if key == "valid":
+            low, high = numbers
+            entry[key] = (-math.inf if low is None else low, math.inf if high is None else high)
+        elif None in numbers:
+            raise SignalError(f"{where}: ignore has an empty entry; write a number")
+        else:
+            entry[key] = tuple(numbers)
 
 
 def _schedule(data: Any, where: str) -> tuple[ScheduleRule, ...]:
@@ -462,6 +690,7 @@ def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
             if key in entry and entry[key] != "auto":
                 number = checked_number(entry[key], f"{here}: {key}")
                 entry[key] = number if number is not None else {"steady": 0.0, "scale": 1.0}[key]
+        _limits(entry, here)
         if "max_hold" in entry:
             entry["max_hold"] = checked_number(entry["max_hold"], f"{here}: max_hold")
         delay = entry.get("delay", 0)

@@ -1,0 +1,162 @@
+"""Memory: lag, diff and rate of a field, from the signals file to the free run of a model."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, fit
+from uncertain_lti.base.errors import ModelError, SignalError
+from uncertain_lti.model.domain import Sampling
+from uncertain_lti.sampling.sampler import Sampler
+from uncertain_lti.sampling.sampler_arrays import recall
+from uncertain_lti.sampling.status import Status
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.memory import Memory, parse_memory
+from uncertain_lti.signals.signal_map import Signal
+
+
+@pytest.mark.parametrize(
+    ("text", "memory", "inner"),
+    [
+        ("data", None, "data"),
+        ("lag(data)", Memory("lag"), "data"),
+        (" lag ( position[j0] , 12 ) ", Memory("lag", 12), "position[j0]"),
+        ('lag(position["a, 3"], 2)', Memory("lag", 2), 'position["a, 3"]'),
+        ("diff(unwrap(yaw(pose.orientation)))", Memory("diff"), "unwrap(yaw(pose.orientation))"),
+        ("rate(data[3])", Memory("rate"), "data[3]"),
+    ],
+)
+def test_a_path_with_a_memory_is_read_and_written(text: str, memory: Memory | None, inner: str) -> None:
+    assert parse_memory(text) == (memory, inner)
+    assert FieldPath(text).steps == FieldPath(inner).steps and FieldPath(text).unwrap == FieldPath(inner).unwrap
+    if memory is not None:
+        assert parse_memory(memory.of(inner)) == (memory, inner)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("lag(data, 0)", "a lag is 1 to 1000000 samples, not 0"),
+        ("lag(data, -1)", "not -1"),
+        ("diff(data, 2)", "diff takes a field alone; write diff\\(data\\)"),
+        ("lag(diff(data), 1)", "do not nest"),
+        ("unwrap(lag(data))", "functions nest only as"),
+        ("lagg(data)", "there is no function 'lagg' \\(is lag meant\\?\\)"),
+    ],
+)
+def test_a_wrong_memory_is_refused(text: str, words: str) -> None:
+    with pytest.raises(SignalError, match=words):
+        FieldPath(text)
+
+
+def pair(**more: object) -> dict[str, object]:
+    angle = {"name": "angle", "topic": "/a", "field": "unwrap(data[0])", "steady": 6.0, "scale": 2.0, "unit": "rad"}
+    memories = [{"name": kind, "topic": "/a", "field": f"{kind}(unwrap(data[0]))"} for kind in ("lag", "diff", "rate")]
+    return {"states": [angle | more, *memories], "controls": [{"name": "u", "topic": "/u", "field": "data"}]}
+
+
+def test_memories_among_the_states_have_no_row_and_take_over_what_is_known_of_their_field() -> None:
+    signals = SignalMap.from_dict(pair(valid=[-9, None], ignore=[0.1]))
+    assert [s.name for s in signals.states] == ["angle"]
+    assert [s.name for s in signals.controls] == ["u", "lag", "diff", "rate"]
+    lag, diff, rate = signals.controls[1:]
+    assert [(s.steady, s.scale, s.unit) for s in (lag, diff, rate)] == [
+        (6.0, 2.0, "rad"), (0.0, 2.0, "rad"), (0.0, 2.0, "rad/s"),
+    ]  # fmt: skip
+    assert {(s.valid, s.ignore) for s in (lag, diff, rate)} == {((-9.0, math.inf), (0.1,))}
+    assert [(r.position, r.of, r.memory.kind) for r in signals.recalled] == [
+        (2, 0, "lag"),
+        (3, 0, "diff"),
+        (4, 0, "rate"),
+    ]
+    assert [signals.branch(i) for i in range(5)] == [6.0, 0.0, 6.0, 6.0, 6.0]
+
+
+def test_a_delayed_copy_of_a_state_is_a_lag_too() -> None:
+    before = Signal("before", "/a", "data", delay=3)
+    (recalled,) = SignalMap((Signal("x", "/a", "data"),), (before,)).recalled
+    assert (recalled.position, recalled.of, recalled.memory) == (1, 0, Memory("lag", 3))
+
+
+def test_what_single_precision_makes_of_an_ignored_value_is_ignored() -> None:
+    signal = Signal("x", "/a", "data", valid=(-1e9, 5.0), ignore=(0.1, 1e300))
+    assert not signal.admits(float(np.float32(0.1))) and not signal.admits(0.1) and not signal.admits(6.0)
+    assert signal.admits(0.10001) and signal.admits(math.nan) and not signal.admits(-math.inf)
+
+
+def test_a_constant_step_is_the_period_and_a_gap_is_none() -> None:
+    """Stamps that jitter by half a period, a lost sample within max_gap, and one beyond it."""
+    signals = SignalMap((Signal("x", "/a", "data"),), clock="/a", max_gap=0.025, step=0.01, time={"/a": "header"})
+    stamps = [10, 15, 30, 34, 54, 90, 100]
+    sampler = Sampler(signals)
+    steps = [step for t in stamps for step in sampler.push("/a", t * 10**6, t * 10**6, [1.0])]
+    assert [s.status for s in steps] == [Status.FIRST, *[Status.OK] * 4, Status.GAP, Status.OK]
+    assert [s.dt for s in steps[1:]] == [0.01] * 4 + [pytest.approx(0.036), 0.01]
+    transient = Transient(np.array(stamps) * 10**6, np.ones((7, 1)), np.empty((7, 0)), signals=signals, max_gap=0.025)
+    assert transient.dt.tolist() == [s.dt for s in steps[1:]]
+    assert transient.replace(slice(0, 3)).dt.tolist() == [0.01, 0.01]
+
+
+def remembering(rows: dict[str, list[float]], signals: SignalMap, dt: float = 0.1) -> UncertainLTI:
+    n = len(signals.states)
+    zero = {"dA": np.zeros((n, n)), "dB": np.zeros((n, len(signals.controls)))}
+    return UncertainLTI(rows["A"], rows["B"], **zero, signals=signals, sampling=Sampling(dt_median=dt))
+
+
+@pytest.mark.parametrize("kind", ["lag", "diff", "rate"])
+def test_a_free_run_follows_its_own_memory_and_its_radius_is_that_of_the_recursion(kind: str) -> None:
+    """y_{k+1} = 1.6 y_k - 0.8 y_{k-1}, an oscillator of which one state is measured, in units of its own."""
+    dt, (own, past) = 0.1, {"lag": (0.6, -0.8), "diff": (-0.2, 0.8), "rate": (-0.2, 0.08)}[kind]
+    y = Signal("y", "", "y", steady=2.0, scale=4.0)
+    memory = Signal("m", "", f"{kind}(y)", steady=2.0 if kind == "lag" else 0.0, scale=3.0)
+    signals = SignalMap((y,), (memory,))
+    model = remembering({"A": [[own / dt]], "B": [[past / dt * 3.0 / 4.0]]}, signals)
+    truth = [5.0, 4.0]
+    for _ in range(30):
+        truth.append(2.0 + 1.6 * (truth[-1] - 2.0) - 0.8 * (truth[-2] - 2.0))
+    values = np.array(truth)
+    recalled = recall(values, Memory(kind), np.full(32, dt), np.arange(32) == 0)
+    u = (recalled[1:-1, None] - memory.steady) / 3.0
+    u[1:] = np.nan  # what is not the run's own would show
+    free = model.simulate((values[1:2] - 2.0) / 4.0, u, dt)
+    np.testing.assert_allclose(free[:, 0] * 4.0 + 2.0, values[1:], rtol=1e-9)
+    assert model.spectral_radius() == pytest.approx(math.sqrt(0.8))
+
+
+def test_a_lag_makes_one_measured_state_of_two_enough() -> None:
+    """An oscillator: its second state is what the first one was, so nothing is left unexplained."""
+    rng = np.random.default_rng(3)
+    t, drive = 0.05 * np.arange(1500), np.repeat(rng.normal(size=30), 50)
+    x = np.zeros((1500, 2))
+    for k in range(1499):
+        x[k + 1, 1] = x[k, 1] + 0.05 * (-9.0 * x[k, 0] - 0.6 * x[k, 1] + drive[k])
+        x[k + 1, 0] = x[k, 0] + 0.05 * x[k + 1, 1]
+    y = x[:, :1]
+    lagged = np.column_stack([drive, recall(y[:, 0], Memory("lag"), np.full(1500, 0.05), np.arange(1500) == 0)])
+    blind = fit(Transient(t, y, drive), additive="noise")
+    seeing = fit(Transient(t, y, lagged), additive="noise")
+    assert seeing.fit_summary["mean_width"] < 1e-9 * blind.fit_summary["mean_width"]
+
+
+def test_a_model_that_remembers_has_a_newer_format_and_an_older_one_may_not_say_so() -> None:
+    plain = SignalMap.from_dict({"states": [{"name": "angle", "topic": "/a", "field": "data"}]})
+    assert remembering({"A": [[1.0]], "B": np.zeros((1, 0))}, plain).to_dict()["format"] == "uncertain-lti/1"
+    signals = SignalMap.from_dict(pair(valid=[-9, None], ignore=[0.1]))
+    data = remembering({"A": [[1.0]], "B": np.ones((1, 4))}, signals).to_dict()
+    assert data["format"] == "uncertain-lti/2" and data["states"][0]["valid"] == [-9.0, None]
+    assert UncertainLTI.from_dict(data).signals.signals == signals.signals
+    data = remembering({"A": [[1.0]], "B": np.zeros((1, 0))}, plain).to_dict()
+    data["sampling"]["step"] = 0.01
+    with pytest.raises(ModelError, match="unknown field 'sampling.step'"):
+        UncertainLTI.from_dict(data)
+
+
+def test_a_check_takes_the_step_of_the_model() -> None:
+    t = np.array([0.0, 0.1, 0.25, 0.3])
+    model = remembering({"A": [[1.0]], "B": np.zeros((1, 0))}, SignalMap((Signal("x", "", "x"),)))
+    model = model.replace(sampling=Sampling(dt_median=0.1, step=0.1), v=np.array([0.5]))
+    verdicts = EnvelopeMonitor(model).check(Transient(t, np.ones((4, 1)), np.empty((4, 0)), max_gap=1.0))
+    assert verdicts.upper[1:, 0].tolist() == [1.6] * 3
