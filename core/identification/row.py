@@ -379,6 +379,17 @@ class Row:
         d = np.maximum(answer[self.r :], np.maximum(self.lower[self.r :], 0.0))
         self.psi_columns.put(self.d, d * self.unit_psi * self.scale)
 
+    def _store_limited(self, answer: Array) -> None:
+        """Take [ξ δ]: δ is no less than the widths it limits, to the last bit.
+
+        Where noise alone makes the widths, all samples are about as wide as the widest, and a δ that is short of it
+        by the tolerance of a solver lets every one of them join the working set.
+        """
+        self.store(answer[:-1])
+        _, d = self.scaled()
+        widest = self.width[self.pool] * (self.psi[self.pool] @ d + self.half[self.pool])
+        self.limit = max(float(answer[-1]), float(widest.max(initial=0.0)))
+
     def _store_theta(self, answer: Array) -> None:
         change = answer if self.basis is None else self.basis @ answer
         theta = change * self.unit_phi * self.scale
@@ -630,8 +641,7 @@ class Row:
             np.append(self.lower, 0.0),
             np.append(self.upper, np.inf),
         )
-        self.store(answer[:-1])
-        self.limit = max(float(answer[-1]), 0.0)
+        self._store_limited(answer)
         self._active["bounded"] = np.delete(self._active["regularised"], size)  # all but δ
         return solver
 
@@ -656,8 +666,7 @@ class Row:
             self._simplex.add(*self._rows(fresh))
             self._known = index
         answer = self._simplex.solve()
-        self.store(answer[:-1])
-        self.limit = max(float(answer[-1]), 0.0)
+        self._store_limited(answer)
         return "HiGHS simplex"
 
     def least_width(self) -> float:
