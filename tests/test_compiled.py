@@ -121,7 +121,7 @@ class Node(node_module.EnvelopeMonitorNode):
             "unreadable": session.unreadable,
             "future": session.future,
             "judged": (session.verdicts, session.violations, session.alarms, session.alarm, session.failures),
-            "window": session.monitor.alarm_statistic.recent,
+            "window": [getattr(p, "recent", tuple(p.values())) for p in session.monitor.alarms.parts],
             "latest": repr(session.sampler.latest()),
             "enable": (session.arming.on, session.arming.value),
             "last": last and (last.t_ns, last.outside_domain, last.unknown_regime, last.alarm),
@@ -397,7 +397,7 @@ def test_one_transition_is_judged_alike_to_the_last_bit(
             expected = point.recorded_x(bound)
             known = ~np.isnan(expected)
             assert np.array(one.numbers(which))[known].tobytes() == expected[known].tobytes()
-        for which in range(4):
+        for which in range(5):
             mine, theirs = np.array(one.numbers(which)), np.array(other.numbers(which))
             known = ~np.isnan(theirs)
             seen |= set(theirs[known]) if which == bounds.FLAGS else set()

@@ -17,6 +17,7 @@ from zlib import crc32
 
 MODULES = (
     "model.bounds",
+    "monitor.statistics",
     "sampling.sampler",
 )
 """Modules that have a twin where they were compiled; setup.py builds them."""

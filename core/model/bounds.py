@@ -476,7 +476,7 @@ def centre_and_half(
     return centre_of(phi[: len(v)], dt, rate), half_of(dt, spread, v)
 
 
-LOWER, UPPER, UTILISATION, FLAGS = range(4)
+LOWER, UPPER, UTILISATION, RESIDUAL, FLAGS = range(5)
 """What a `Judgement` holds of each state."""
 
 
@@ -512,12 +512,12 @@ class Judgement:
         self.outside_domain, self.unknown_regime = outside_domain, unknown_regime
 
     def numbers(self, which: int) -> Any:
-        """Lower or upper bound (recorded units), utilisation, or flag (0 contained, 1 violated) of each state.
+        """Bound (recorded units), utilisation, residual (normalised) or flag (0 contained, 1 violated) of each state.
 
         Parameters
         ----------
         which : int
-            `LOWER`, `UPPER`, `UTILISATION` or `FLAGS`.
+            `LOWER`, `UPPER`, `UTILISATION`, `RESIDUAL` or `FLAGS`.
 
         Returns
         -------
@@ -525,7 +525,7 @@ class Judgement:
             One per state.
         """
         if cython.compiled:
-            n = len(self._values) // 4
+            n = len(self._values) // 5
             return self._values[which * n : which * n + n]
         centre, half, lower, upper, x_next, inside, steady, scale = self._values
         if which == LOWER:
@@ -534,6 +534,8 @@ class Judgement:
             return recorded(upper, steady, scale)
         if which == UTILISATION:
             return utilisation_of(x_next - centre, half)
+        if which == RESIDUAL:
+            return x_next - centre
         return np.subtract(1.0, inside, dtype=np.float64)
 
 
@@ -675,7 +677,7 @@ class Judge:
             self._counted = bytearray(np.asarray(counted, dtype=np.uint8).tobytes())
             self._phi = _doubles(one)
             self._rate, self._spread = _doubles(np.zeros(self.n)), _doubles(np.zeros(self.n))
-            self._blank = array("d", bytes(32 * self.n))
+            self._blank = array("d", bytes(40 * self.n))
             self._per_unit = _doubles(cells_per_unit(least, greatest, self._cells))
             flat = np.zeros(1, bool) if occupied is None else occupied
             self._occupied = bytearray(np.ascontiguousarray(flat, dtype=np.uint8).tobytes())
@@ -797,7 +799,8 @@ class Judge:
             values[i] = recorded(lower, self._steady[i], self._scale[i])
             values[n + i] = recorded(upper, self._steady[i], self._scale[i])
             values[2 * n + i] = utilisation_of(x_next - centre, half)
-            values[3 * n + i] = not inside
+            values[3 * n + i] = x_next - centre
+            values[4 * n + i] = not inside
         return Judgement(blank, every, violation, left, unknown)
 
     @cython.cfunc

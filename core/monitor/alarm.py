@@ -1,34 +1,83 @@
-"""The alarm: m of the last n verdicts are violations."""
+"""The alarm: what each of its rules makes of one verdict after another."""
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
-from typing import Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, StatisticRule, labels
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.statistics import Statistic
+
+EVERY_STATE = "joint"
+"""What stands for the state in the name of a statistic of all of them."""
+
+
+@dataclass(frozen=True)
+class Raised:
+    """One reason for the alarm.
+
+    Parameters
+    ----------
+    label : str
+        Of the rule, as of `alarm_rule.labels`.
+    kind : str
+        Of the rule.
+    horizon : int
+        Of the rule, in steps.
+    state : str
+        The state; empty for all together, and where no state of this verdict is to blame.
+    value : float
+        The statistic over its threshold, with its sign; 1 of containment.
+    """
+
+    label: str
+    kind: str
+    horizon: int
+    state: str
+    value: float
+
+    @property
+    def words(self) -> str:
+        """`energy of fan_speed over 40 steps at 1.3 times its threshold`, for example."""
+        state = f" of {self.state}" if self.state else ""
+        over = f" over {self.horizon} steps" if self.horizon > 1 else ""
+        if self.kind == "containment":
+            return f"containment{state}{over}"
+        return f"{self.kind}{state}{over} at {abs(self.value):.3g} times its threshold"
 
 
 class AlarmStatistic(Protocol):
-    """What raises the alarm from one verdict after another; `AlarmWindow` is one."""
+    """What one rule makes of one verdict after another; `AlarmWindow` is one, `AlarmOverThreshold` another."""
+
+    rule: Rule
 
     @property
     def alarm(self) -> bool:
-        """The alarm after the last verdict."""
+        """Whether the rule raises the alarm after the last verdict."""
         ...
 
     def reset(self) -> None:
         """Forget every verdict and the alarm."""
 
-    def push(self, violated: bool) -> bool:
+    def push(self, dt: float, violated: bool, table: Any) -> bool:
         """Take one verdict.
 
         Parameters
         ----------
+        dt : float
+            Step that it ends, s.
         violated : bool
-            Whether it is a violation that counts.
+            Whether the one-step bounds are violated by a state that counts.
+        table : buffer of doubles
+            Rows of n: the utilisation for one step and for each horizon, then the one-step residual.
 
         Returns
         -------
@@ -37,25 +86,61 @@ class AlarmStatistic(Protocol):
         """
         ...
 
+    def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
+        """Take many verdicts; after each what `push` gives.
+
+        Parameters
+        ----------
+        dt : array (K,)
+            Steps, s.
+        violated : array of bool (K,)
+            As for `push`.
+        table : array (K, rows, n)
+            As for `push`.
+
+        Returns
+        -------
+        array of bool (K,)
+            The alarm after each.
+        array (K, values)
+            The numbers of `values` after each.
+        """
+        ...
+
+    def values(self) -> Any:
+        """The statistic over its threshold.
+
+        Returns
+        -------
+        array of doubles
+            One per state or one for all; none of containment.
+        """
+        ...
+
 
 class AlarmWindow:
-    """The last verdicts and the alarm that they raise, one verdict after another.
+    """Containment: the last verdicts and the alarm that they raise, one verdict after another.
 
     Parameters
     ----------
     rule : AlarmRule
-        m, n; its margin plays no part here.
+        m, n; for a horizon of several steps its margin, too.
+    places : sequence of int, optional
+        For such a horizon, where the utilisation of each state that counts is in the table.
 
     Attributes
     ----------
+    rule : AlarmRule
+        As given.
     alarm : bool
         `violations` of the last `window` verdicts are violations.
     """
 
-    __slots__ = ("_needed", "_recent", "_violations", "alarm")
+    __slots__ = ("_margin", "_needed", "_places", "_recent", "_violations", "alarm", "rule")
 
-    def __init__(self, rule: AlarmRule) -> None:
-        self._needed = rule.violations
+    def __init__(self, rule: AlarmRule, places: Sequence[int] = ()) -> None:
+        self.rule: Rule = rule
+        self._needed, self._margin, self._places = rule.violations, rule.margin, list(places)
         self._recent: deque[bool] = deque(maxlen=rule.window)
         self.reset()
 
@@ -70,19 +155,28 @@ class AlarmWindow:
         """The verdicts in the window, oldest first: whether each is a violation that counts."""
         return tuple(self._recent)
 
-    def push(self, violated: bool) -> bool:
+    def push(self, dt: float, violated: bool, table: Any) -> bool:
         """Take one verdict.
 
         Parameters
         ----------
+        dt : float
+            Step that it ends, s.
         violated : bool
             Whether it is a violation that counts.
+        table : buffer of doubles
+            As of `AlarmStatistic`; looked at for a horizon of several steps. If all of it is NaN there is no verdict.
 
         Returns
         -------
         bool
             The alarm after it.
         """
+        if self._places:
+            sizes = [abs(table[place]) for place in self._places]
+            if all(size != size for size in sizes):
+                return self.alarm
+            violated = any(not size <= self._margin for size in sizes)
         recent = self._recent
         if len(recent) == recent.maxlen:
             self._violations -= recent[0]
@@ -90,6 +184,327 @@ class AlarmWindow:
         self._violations += violated
         self.alarm = self._violations >= self._needed
         return self.alarm
+
+    def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
+        """As `AlarmStatistic`, from a cleared alarm.
+
+        Parameters
+        ----------
+        dt : array (K,)
+            Steps, s.
+        violated : array of bool (K,)
+            As for `push`.
+        table : array (K, rows, n)
+            As of `AlarmStatistic`.
+
+        Returns
+        -------
+        array of bool (K,)
+            The alarm after each.
+        array (K, 0)
+            Nothing.
+        """
+        assert isinstance(self.rule, AlarmRule)
+        given: NDArray[np.bool_] = np.ones(len(violated), dtype=bool)
+        if self._places:
+            sizes = np.abs(table.reshape(len(violated), -1)[:, self._places])
+            given = np.asarray(~np.isnan(sizes).all(axis=1))
+            violated = np.asarray(~(sizes <= self._margin).all(axis=1))
+        after = np.concatenate([[False], raised(violated[given], self.rule)])
+        return after[np.cumsum(given)], np.zeros((len(violated), 0))
+
+    def values(self) -> Any:
+        """As `AlarmStatistic`.
+
+        Returns
+        -------
+        array of doubles
+            None.
+        """
+        return array("d")
+
+
+class AlarmOverThreshold:
+    """A statistic over a window, and whether it is over its threshold.
+
+    Parameters
+    ----------
+    rule : StatisticRule
+        The statistic.
+    model : UncertainLTI
+        Gives the residuals.
+    counted : array of bool (n,)
+        States that count.
+
+    Attributes
+    ----------
+    rule : StatisticRule
+        As given.
+    """
+
+    def __init__(self, rule: StatisticRule, model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
+        self.rule: Rule = rule
+        self._row = row_of(rule, model)
+        self._begin = self._row * model.n
+        whitening = None
+        if rule.kind == JOINT:
+            assert model.residuals is not None, "checked by the model"
+            whitening = model.residuals.whitening(counted)
+        self._statistic = Statistic(
+            KINDS.index(rule.kind),
+            model.n,
+            rule.window_s,
+            rule.thresholds(model.n),
+            counted.tolist(),
+            rule.allowance,
+            None if model.residuals is None else model.residuals.mean,
+            whitening,
+        )
+
+    @property
+    def alarm(self) -> bool:
+        """Whether it is over its threshold for some state that counts."""
+        return bool(self._statistic.alarm)
+
+    def reset(self) -> None:
+        """Forget every verdict and the alarm."""
+        self._statistic.reset()
+
+    def push(self, dt: float, violated: bool, table: Any) -> bool:
+        """As `AlarmStatistic`.
+
+        Parameters
+        ----------
+        dt : float
+            Step that the verdict ends, s.
+        violated : bool
+            Not looked at.
+        table : buffer of doubles
+            As of `AlarmStatistic`.
+
+        Returns
+        -------
+        bool
+            The alarm after it.
+        """
+        return bool(self._statistic.push(dt, table, self._begin))
+
+    def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
+        """As `AlarmStatistic`.
+
+        Parameters
+        ----------
+        dt : array (K,)
+            Steps, s.
+        violated : array of bool (K,)
+            Not looked at.
+        table : array (K, rows, n)
+            As of `AlarmStatistic`.
+
+        Returns
+        -------
+        array of bool (K,)
+            The alarm after each.
+        array (K, n), or (K, 1) of chi2
+            `values` after each.
+        """
+        after, values = self._statistic.push_all(dt, table[:, self._row])
+        return after, values
+
+    def values(self) -> Any:
+        """The statistic over its threshold.
+
+        Returns
+        -------
+        array of doubles (n,), or (1,) of chi2
+            NaN before the first verdict.
+        """
+        return self._statistic.values()
+
+
+def row_of(rule: Rule, model: UncertainLTI) -> int:
+    """Row of the table that a rule looks at.
+
+    Parameters
+    ----------
+    rule : Rule
+        Of the model.
+    model : UncertainLTI
+        Its horizons follow one step, and the residuals follow them.
+
+    Returns
+    -------
+    int
+        0 for one step.
+    """
+    if rule.kind == JOINT:
+        return 1 + len(model.horizons)
+    return 0 if rule.horizon == 1 else 1 + [h.steps for h in model.horizons].index(rule.horizon)
+
+
+class Alarm:
+    """All rules of one alarm.
+
+    Parameters
+    ----------
+    rules : sequence of Rule
+        At least one.
+    model : UncertainLTI
+        What they judge by.
+    counted : array of bool (n,)
+        States that count.
+
+    Attributes
+    ----------
+    rules : tuple of Rule
+        As given.
+    labels : tuple of str
+        What each is called.
+    parts : tuple of AlarmStatistic
+        What each makes of the verdicts.
+    names : tuple of str
+        Of the statistics, `energy/fan_speed` for example; empty if every rule is containment.
+    needs_table : bool
+        Whether some rule looks at more than the one-step violation.
+    alarm : bool
+        Whether some rule raises the alarm.
+    """
+
+    def __init__(self, rules: Sequence[Rule], model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
+        self.rules, self.labels, self.alarm = tuple(rules), labels(rules), False
+        self._model, self._counted = model, counted
+        n, parts, names = model.n, list[AlarmStatistic](), list[str]()
+        for rule, label in zip(self.rules, self.labels, strict=True):
+            if isinstance(rule, AlarmRule):
+                begin = row_of(rule, model) * n
+                parts.append(AlarmWindow(rule, (begin + np.flatnonzero(counted)).tolist() if begin else ()))
+            else:
+                parts.append(AlarmOverThreshold(rule, model, counted))
+                names += [f"{label}/{s}" for s in ((EVERY_STATE,) if rule.kind == JOINT else model.state_names)]
+        self.parts, self.names = tuple(parts), tuple(names)
+        self.needs_table = any(rule.horizon > 1 or rule.kind != "containment" for rule in self.rules)
+        self._only = self.parts[0] if len(self.parts) == 1 else None
+
+    def reset(self) -> None:
+        """Forget every verdict and the alarm."""
+        for part in self.parts:
+            part.reset()
+        self.alarm = False
+
+    def push(self, dt: float, violated: bool, table: Any = None) -> bool:
+        """Take one verdict; as `AlarmStatistic.push`.
+
+        Parameters
+        ----------
+        dt : float
+            Step that it ends, s.
+        violated : bool
+            Whether the one-step bounds are violated by a state that counts.
+        table : buffer of doubles, optional
+            As of `AlarmStatistic`; if `needs_table`.
+
+        Returns
+        -------
+        bool
+            The alarm after it.
+        """
+        if self._only is not None:
+            self.alarm = self._only.push(dt, violated, table)
+            return self.alarm
+        alarm = False
+        for part in self.parts:
+            alarm = part.push(dt, violated, table) or alarm
+        self.alarm = alarm
+        return alarm
+
+    def values(self) -> Any:
+        """Each statistic over its threshold, 1 and -1 being the threshold, in the order of `names`.
+
+        Returns
+        -------
+        array of doubles
+            A copy; NaN before the first verdict.
+        """
+        found = array("d")
+        for part in self.parts:
+            found.extend(part.values())
+        return found
+
+    def raised(self) -> tuple[int, ...]:
+        """Rules that raise the alarm.
+
+        Returns
+        -------
+        tuple of int
+            Their places in `rules`.
+        """
+        return tuple(i for i, part in enumerate(self.parts) if part.alarm) if self.alarm else ()
+
+    def reasons(self, rules: Sequence[int], values: Sequence[float], sizes: Array, flags: Array) -> tuple[Raised, ...]:
+        """Why the alarm is raised at a verdict.
+
+        Parameters
+        ----------
+        rules : sequence of int
+            Of `raised` there.
+        values : sequence of float
+            Of `values` there.
+        sizes : array (H, n)
+            Utilisation there, for one step and for each horizon.
+        flags : array (n,)
+            1 for a state that violates its one-step bounds there.
+
+        Returns
+        -------
+        tuple of Raised
+            Each state that a rule blames; of a rule that blames none now, one without a state.
+        """
+        found = []
+        n, names = self._model.n, self._model.state_names
+        for i in rules:
+            rule, label = self.rules[i], self.labels[i]
+            if isinstance(rule, AlarmRule):
+                left = flags == 1.0 if rule.horizon == 1 else np.abs(sizes[row_of(rule, self._model)]) > rule.margin
+                blamed = [names[j] for j in np.flatnonzero(left & self._counted)]
+                found += [Raised(label, rule.kind, rule.horizon, name, 1.0) for name in blamed or [""]]
+                continue
+            begin = sum(1 if r.kind == JOINT else n for r in self.rules[:i] if not isinstance(r, AlarmRule))
+            if rule.kind == JOINT:
+                found.append(Raised(label, rule.kind, rule.horizon, "", float(values[begin])))
+                continue
+            for j in np.flatnonzero(self._counted).tolist():
+                if abs(values[begin + j]) > 1.0:
+                    found.append(Raised(label, rule.kind, rule.horizon, names[j], float(values[begin + j])))
+        return tuple(found)
+
+    def over(
+        self, dt: Array, violated: NDArray[np.bool_], table: Array
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
+        """Many verdicts from a cleared alarm; after each what `push` gives.
+
+        Parameters
+        ----------
+        dt : array (K,)
+            Steps, s.
+        violated : array of bool (K,)
+            As for `push`.
+        table : array (K, rows, n)
+            As for `push`.
+
+        Returns
+        -------
+        array of bool (K,)
+            The alarm after each.
+        array of bool (K, rules)
+            Which rules raise it.
+        array (K, statistics)
+            `values` after each.
+        """
+        self.reset()
+        found = [part.push_all(dt, violated, table) for part in self.parts]
+        self.reset()
+        each = np.stack([after for after, _ in found], axis=1)
+        return np.asarray(each.any(axis=1)), each, np.concatenate([values for _, values in found], axis=1)
 
 
 def raised(violated: NDArray[np.bool_], rule: AlarmRule) -> NDArray[np.bool_]:

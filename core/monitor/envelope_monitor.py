@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,10 +17,11 @@ from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LARGEST
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.bounds import (
     FLAGS,
     LOWER,
+    RESIDUAL,
     UPPER,
     UTILISATION,
     Judgement,
@@ -29,7 +31,7 @@ from uncertain_lti.model.bounds import (
     utilisation_of,
 )
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import AlarmStatistic, AlarmWindow, raised
+from uncertain_lti.monitor.alarm import Alarm, Raised
 from uncertain_lti.monitor.arming import Armed
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
@@ -59,6 +61,8 @@ class Verdict:
         None if there is no verdict.
     status : Status, optional
         In place of that of the step, where the monitor gives no verdict on it.
+    alarms : Alarm, optional
+        The rules after it, whose statistics and reasons it keeps.
     """
 
     __slots__ = (
@@ -71,15 +75,32 @@ class Verdict:
         "_after",
         "_judgement",
         "_before",
+        "_alarms",
+        "_rules",
+        "_statistics",
     )
 
-    def __init__(self, step: Step, alarm: bool, judgement: Judgement | None, status: Status | None = None) -> None:
+    def __init__(
+        self,
+        step: Step,
+        alarm: bool,
+        judgement: Judgement | None,
+        status: Status | None = None,
+        alarms: Alarm | None = None,
+    ) -> None:
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, status or step.status
         self._after, self._before = step.after, step.before
         self.outside_domain = judgement is not None and judgement.outside_domain
         self.unknown_regime = judgement is not None and judgement.unknown_regime
         self.alarm = alarm
         self._judgement = judgement
+        self._alarms = alarms
+        self._statistics: array[float] | None = None
+        self._rules: tuple[int, ...] = ()
+        if alarms is not None:
+            self._rules = alarms.raised()
+            if alarms.names and judgement is not None:
+                self._statistics = alarms.values()
 
     def __repr__(self) -> str:
         if not self.judged:
@@ -106,6 +127,28 @@ class Verdict:
     def n(self) -> int:
         """Number of states."""
         return len(self._after)
+
+    @property
+    def statistic_names(self) -> tuple[str, ...]:
+        """Names of `statistics`, `energy/fan_speed` for example; none where the alarm has containment rules alone."""
+        return () if self._alarms is None else self._alarms.names
+
+    @property
+    def statistics(self) -> Array:
+        """Each statistic over its threshold (S,): beyond 1 and -1 it raises the alarm; NaN without a verdict."""
+        if self._statistics is None:
+            return np.full(len(self.statistic_names), np.nan)
+        return np.array(self._statistics, dtype=np.float64)
+
+    @property
+    def raised(self) -> tuple[Raised, ...]:
+        """Which rules raise the alarm, with state, horizon and the statistic over its threshold.
+
+        None without an alarm, and none without a verdict, where the alarm stays as it was.
+        """
+        if self._alarms is None or not self._rules or self._judgement is None:
+            return ()
+        return self._alarms.reasons(self._rules, self.statistics.tolist(), self.horizon_utilisation, self.flags)
 
     def numbers(self, name: str) -> list[float]:
         """Numbers of one kind.
@@ -216,6 +259,12 @@ class Verdicts:
     unknown_regime : array (N+1,) of bool
         A scheduling signal lies beyond the end knots, or no recording visited the regime; then the sample counts as
         outside the domain, too.
+    statistics : array (N+1, S)
+        Each statistic of the alarm over its threshold: beyond 1 and -1 it raises the alarm; NaN without a verdict.
+    rule_alarms : array (N+1, rules) of bool
+        Which rules raise the alarm after each sample.
+    alarms : Alarm
+        The rules, with their `labels` and the `names` of the statistics.
     asked : array (N+1,) of bool, optional
         Whether a verdict was asked for; default all.
     """
@@ -231,6 +280,9 @@ class Verdicts:
     unfitted_step: NDArray[np.bool_]
     unlisted_mode: NDArray[np.bool_]
     unknown_regime: NDArray[np.bool_]
+    statistics: Array
+    rule_alarms: NDArray[np.bool_]
+    alarms: Alarm
     asked: NDArray[np.bool_] | None = None
 
     def __repr__(self) -> str:
@@ -287,6 +339,29 @@ class Verdicts:
         return self.utilisation[:, None]
 
     @property
+    def statistic_names(self) -> tuple[str, ...]:
+        """Names of `statistics`, `energy/fan_speed` for example; none where the alarm has containment rules alone."""
+        return self.alarms.names
+
+    def raised(self, k: int) -> tuple[Raised, ...]:
+        """Which rules raise the alarm after one sample.
+
+        Parameters
+        ----------
+        k : int
+            The sample.
+
+        Returns
+        -------
+        tuple of Raised
+            With state, horizon and the statistic over its threshold; none without an alarm or a verdict.
+        """
+        if not self.judged[k]:
+            return ()
+        rules = np.flatnonzero(self.rule_alarms[k]).tolist()
+        return self.alarms.reasons(rules, self.statistics[k].tolist(), self.horizon_utilisation[k], self.flags[k])
+
+    @property
     def state(self) -> Array:
         """The samples, in recorded units (N+1, n)."""
         return self.transient.x
@@ -313,35 +388,40 @@ def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int
 
 
 class EnvelopeMonitor:
-    """Judges one-step transitions by the bounds of a model, and raises the alarm when m of n are violations.
+    """Judges one-step transitions by the bounds of a model, and raises the alarm while one of its rules does.
 
     A sample is contained when lower <= x_next <= upper in the normalised quantities, nothing else (Leibov (2006),
-    eqs. (8)(9)). The alarm looks at the last `window` verdicts (messages without a verdict do not count) and
-    starts over when time jumps back. A step shorter than half of, or longer than twice, those that the model was
-    fitted to has no verdict.
+    eqs. (8)(9)). Every rule of the alarm (m of n violations, a statistic over a window) looks at the last verdicts
+    (messages without a verdict do not count) and starts over when time jumps back. A step shorter than half of, or
+    longer than twice, those that the model was fitted to has no verdict.
 
     Parameters
     ----------
     model : UncertainLTI
-        Gives the bounds and the alarm rule.
+        Gives the bounds and the rules of the alarm.
     violations : int, optional
-        In place of that of the model's rule.
+        In place of that of the rule for one-step containment.
     window : int, optional
-        In place of that of the model's rule, in verdicts.
+        In place of that of the same rule, in verdicts.
     margin : float, optional
-        In place of that of the model's rule.
+        In place of that of the same rule. If there is no such rule, giving any of the three adds one.
     masked : sequence of str, optional
-        States that are judged like the others, and whose violations never count for the alarm.
+        States that are judged like the others, and never count for the alarm.
+    rules : sequence of AlarmRule or StatisticRule, optional
+        In place of all rules of the model.
 
     Attributes
     ----------
-    alarm_statistic : AlarmStatistic
-        What raises the alarm.
+    rule : AlarmRule
+        For one-step containment; its margin is that of the flags.
+    alarms : Alarm
+        All rules, and what raises the alarm.
 
     Raises
     ------
     ModelError
-        violations, window or margin are out of range, or masked names no state of the model, or all.
+        violations, window or margin are out of range, masked names no state of the model, or all, or the model has not
+        what a rule needs.
     """
 
     def __init__(
@@ -351,19 +431,19 @@ class EnvelopeMonitor:
         window: int | None = None,
         margin: float | None = None,
         masked: Sequence[str] = (),
+        rules: Sequence[Rule] | None = None,
     ) -> None:
-        rule = model.alarm_rule
-        for other in model.alarm:
-            if other is not rule:
-                raise ModelError(
-                    f"alarm: {other.kind} at {plural(other.horizon, 'step')} cannot be watched yet; leave it out"
-                )
+        if rules is not None:
+            model = model.replace(alarm=rules)
         self.model = model
+        rule = model.alarm_rule
         self.rule = AlarmRule(
             rule.violations if violations is None else violations,
             rule.window if window is None else window,
             rule.margin if margin is None else margin,
         )
+        other = any(given is not None for given in (violations, window, margin))
+        every = with_containment(model.alarm, self.rule) if other else model.alarm
         names = model.state_names
         for name in masked:
             if name not in names:
@@ -373,24 +453,26 @@ class EnvelopeMonitor:
             raise ModelError("every state of the model is masked; leave at least one that can raise the alarm")
         self._counted = np.array([name not in masked for name in names])
         self._judge = model.judge_of(self.rule.margin, self._counted)
-        self.alarm_statistic: AlarmStatistic = AlarmWindow(self.rule)
+        self.alarms = Alarm(every, model, self._counted)
         self._shortest, self._longest = model.sampling.step_range
 
     def __repr__(self) -> str:
         rule = self.rule
         masked = f", {', '.join(self.masked)} masked" if self.masked else ""
+        others = "".join(f"; {r.words}" for r in self.alarms.rules if r is not rule)
         return (
-            f"EnvelopeMonitor({self.model!r}; alarm {rule.violations} of {rule.window}, margin {rule.margin:g}{masked})"
+            f"EnvelopeMonitor({self.model!r}; alarm {rule.violations} of {rule.window}, "
+            f"margin {rule.margin:g}{others}{masked})"
         )
 
     @property
     def alarm(self) -> bool:
         """The alarm after the last verdict."""
-        return self.alarm_statistic.alarm
+        return self.alarms.alarm
 
     def reset(self) -> None:
         """Forget the recent verdicts and the alarm."""
-        self.alarm_statistic.reset()
+        self.alarms.reset()
 
     def predict(self, x: ArrayLike, u: ArrayLike, dt: float, s: ArrayLike = ()) -> tuple[Array, Array]:
         """Bounds one step ahead, recorded units.
@@ -466,21 +548,24 @@ class EnvelopeMonitor:
         Verdict
             With the alarm after it.
         """
-        window = self.alarm_statistic
+        alarms = self.alarms
         if step.status is Status.RESET or not armed:
-            window.reset()
-        if step.status is not Status.OK:
-            return Verdict(step, window.alarm, None)
-        if not contained(self._shortest, step.dt, self._longest):
-            return Verdict(step, window.alarm, None, Status.STEP)
-        if not -LARGEST <= min(step.before) <= max(step.before) <= LARGEST:  # the bounds would be no numbers
-            return Verdict(step, window.alarm, None, Status.MISSING)
-        judgement = self._judge.judge(step.before, step.after, step.dt)
-        if judgement is None:
-            return Verdict(step, window.alarm, None, Status.MODE)
-        if armed:
-            window.push(judgement.violation)
-        return Verdict(step, window.alarm, judgement)
+            alarms.reset()
+        judgement, status = None, step.status
+        if status is Status.OK:
+            if not contained(self._shortest, step.dt, self._longest):
+                status = Status.STEP
+            elif not -LARGEST <= min(step.before) <= max(step.before) <= LARGEST:  # the bounds would be no numbers
+                status = Status.MISSING
+            elif (judgement := self._judge.judge(step.before, step.after, step.dt)) is None:
+                status = Status.MODE
+        if judgement is not None and armed:
+            alarms.push(step.dt, judgement.violation, self._table(judgement) if alarms.needs_table else None)
+        return Verdict(step, alarms.alarm, judgement, status, alarms)
+
+    def _table(self, judgement: Judgement) -> array[float]:
+        """Utilisation for one step and for each horizon, and the residual, row by row."""
+        return array("d", judgement.numbers(UTILISATION)) + array("d", judgement.numbers(RESIDUAL))
 
     def check(self, transient: Transient, armed: Armed | None = None) -> Verdicts:
         """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.
@@ -537,28 +622,39 @@ class EnvelopeMonitor:
         judged, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         with np.errstate(over="ignore", invalid="ignore"):  # a value far beyond its bounds is beyond all numbers
             z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
-            flags[arrival], low, high, utilisation[arrival] = self._judge_all(z, steps.dt, x_next)
+            flags[arrival], low, high, utilisation[arrival], residual = self._judge_all(z, steps.dt, x_next)
             lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
         judged[arrival] = True
         unknown_regime = np.zeros(count, dtype=bool)
         unknown_regime[arrival] = unknown
         outside[arrival] = unknown | model.domain.outside(z[:n].T, z[n : n + model.m].T)
         violated = ((flags == 1.0) & self._counted).any(axis=1)
-        alarm = np.zeros(count, dtype=bool)
+        alarms = Alarm(self.alarms.rules, model, self._counted)
+        statistics = np.full((count, len(alarms.names)), np.nan)
+        alarm, each = np.zeros(count, dtype=bool), np.zeros((count, len(alarms.rules)), dtype=bool)
+        dt, rows = np.zeros(count), 2 if alarms.needs_table else 0
+        dt[arrival] = steps.dt
+        table = np.empty((count, rows, n))
+        if rows:
+            table[:, 0], table[arrival, -1] = utilisation, residual
         for start, stop in _alarm_spans(transient.t_ns, armed):
-            after = raised(violated[start:stop][judged[start:stop]], self.rule)
-            held = np.concatenate([[False], after])  # without a verdict the alarm stays as it was
-            alarm[start:stop] = held[np.cumsum(judged[start:stop])]
+            part = slice(start, stop)
+            on = np.flatnonzero(judged[part]) + start
+            after, by_rule, statistics[on] = alarms.over(dt[on], violated[on], table[on])
+            held = np.cumsum(judged[part])  # without a verdict the alarm stays as it was
+            alarm[part] = np.concatenate([[False], after])[held]
+            each[part] = np.concatenate([np.zeros((1, len(alarms.rules)), dtype=bool), by_rule])[held]
         return Verdicts(
             transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
-            unknown_regime,
+            unknown_regime, statistics, each, alarms,
         )  # fmt: skip
 
-    def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array]:
-        """flags, lower, upper (normalised), utilisation of transitions [x; u; s] (n + m + q, K), (K,), (K, n)."""
+    def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """flags, lower, upper, utilisation, residual of transitions [x; u; s] (n + m + q, K), (K,), (K, n)."""
         columns = np.empty((self.model.n, len(dt))), np.empty((self.model.n, len(dt)))
         self.model.columns_centre_and_half(z, dt, *columns)
         centre, half = (a.T for a in columns)
         lower, upper = lower_of(centre, half, self.rule.margin), upper_of(centre, half, self.rule.margin)
         flags = np.where(contained(lower, x_next, upper), 0.0, 1.0)
-        return flags, np.asarray(lower), np.asarray(upper), np.asarray(utilisation_of(x_next - centre, half))
+        residual = x_next - centre
+        return flags, np.asarray(lower), np.asarray(upper), np.asarray(utilisation_of(residual, half)), residual

@@ -741,15 +741,14 @@ class Session:
         return [signal.name for signal in self.model.signals if signal.name in lacking]
 
     def rule_text(self) -> str:
-        """The alarm rule in words.
+        """The rules of the alarm in words.
 
         Returns
         -------
         str
             `at least 2 of 5 verdicts violated`, for example.
         """
-        rule = self.monitor.rule
-        return f"at least {rule.violations} of {rule.window} verdicts violated"
+        return ", or ".join(rule.words for rule in self.monitor.alarms.rules)
 
     def whole_rule_text(self) -> str:
         """The alarm rule in words, with everything that it depends on.

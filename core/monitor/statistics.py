@@ -1,0 +1,339 @@
+"""Statistics of the verdicts over a window: their arithmetic, verdict after verdict, live and offline.
+
+`model.alarm_rule.StatisticRule` has the formulas. Sums over a window are kept in two halves. The older half holds, for
+each of its verdicts, the sum from there to its end; the newer half is one sum. The window moves by taking the next sum
+of the older half, and when that is used up the newer half becomes it. So nothing is ever subtracted, no error of
+rounding remains, and a verdict costs the same on average however long the window is. Compiled or not, the same
+operations in the same order give the same bits.
+"""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+try:
+    import cython
+except ImportError:  # Cython is not needed to run
+    from uncertain_lti.base import uncompiled as cython
+
+import numpy as np
+
+from uncertain_lti.base.compiled import use_twin
+
+ENERGY, MEAN, EWMA, CUSUM, CHI2 = range(5)
+"""Kinds, in the order of `model.alarm_rule.KINDS`."""
+LIMIT = 10.0
+"""Utilisation at which ewma and cusum cut: a jump violates the bounds anyway, and must not hold them for long."""
+_MOST = 1e50  # at which the others cut: squares stay finite
+_LONGEST = 1_000_000  # verdicts of a window at most
+
+
+@cython.cclass
+class Statistic:
+    """One statistic of one verdict after another, and whether it is over its threshold.
+
+    Parameters
+    ----------
+    kind : int
+        One of the kinds above.
+    n : int
+        Number of states.
+    window_s : float
+        T, s.
+    thresholds : sequence of float (n,), or (1,) of chi2
+        What raises the alarm if it is exceeded.
+    counted : sequence of bool (n,)
+        States that raise it.
+    allowance : float
+        Of cusum.
+    mean : array (n,), optional
+        Of the residuals, for chi2.
+    whitening : array (n, n), optional
+        Of the residuals, for chi2.
+
+    Attributes
+    ----------
+    alarm : bool
+        The statistic of some state that counts is over its threshold.
+
+    Raises
+    ------
+    ValueError
+        The arrays do not fit one another.
+    """
+
+    alarm = cython.declare(cython.bint, visibility="readonly")
+    _kind: cython.int
+    _n: cython.Py_ssize_t
+    _size: cython.Py_ssize_t
+    _window: cython.double
+    _window_ns: cython.longlong
+    _allowance: cython.double
+    _thresholds: cython.double[::1]
+    _counted: cython.uchar[::1]
+    _mean: cython.double[::1]
+    _whitening: cython.double[::1]
+    _terms: cython.double[::1]  # what this verdict adds
+    _values: cython.double[::1]  # the statistic over its threshold
+    _up: cython.double[::1]  # sum of the newer half; moving average; sum upwards
+    _down: cython.double[::1]
+    _queue: cython.double[::1]  # terms of the newer half, sums of the older one
+    _steps: cython.longlong[::1]  # ns
+    _begin: cython.Py_ssize_t  # of the window in the queue
+    _middle: cython.Py_ssize_t  # of its newer half
+    _end: cython.Py_ssize_t
+    _capacity: cython.Py_ssize_t
+    _total: cython.longlong  # ns
+    _pushed: cython.bint
+
+    def __init__(
+        self,
+        kind: int,
+        n: int,
+        window_s: float,
+        thresholds: Any,
+        counted: Any,
+        allowance: float = 0.0,
+        mean: Any = None,
+        whitening: Any = None,
+    ) -> None:
+        size = 1 if kind == CHI2 else n
+        if len(thresholds) != size or len(counted) != n:
+            raise ValueError("the thresholds or the states that count do not fit the states")
+        if kind == CHI2 and (np.shape(mean) != (n,) or np.shape(whitening) != (n, n)):
+            raise ValueError("the residuals do not fit the states")
+        self._kind, self._n, self._size = kind, n, size
+        self._window, self._window_ns = window_s, round(window_s * 1e9)
+        self._allowance = allowance
+        self._thresholds = array("d", map(float, thresholds))
+        self._counted = bytearray([1]) if kind == CHI2 else bytearray(map(bool, counted))
+        self._mean = _doubles(np.zeros(n) if mean is None else mean)
+        self._whitening = _doubles(np.zeros(1) if whitening is None else np.reshape(whitening, -1))
+        self._terms, self._values = array("d", bytes(8 * size)), array("d", bytes(8 * size))
+        self._up, self._down = array("d", bytes(8 * size)), array("d", bytes(8 * size))
+        self._capacity = 64
+        self._queue, self._steps = array("d", bytes(8 * size * 64)), array("q", bytes(8 * 64))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every verdict."""
+        i: cython.Py_ssize_t
+        for i in range(self._size):
+            self._up[i] = self._down[i] = self._values[i] = 0.0
+        self._begin = self._middle = self._end = 0
+        self._total = 0
+        self._pushed = False
+        self.alarm = False
+
+    def values(self) -> Any:
+        """The statistic over its threshold: 1 and -1 are the threshold; NaN before the first verdict.
+
+        Returns
+        -------
+        array of doubles (n,), or (1,) of chi2
+            A copy; of mean, ewma and cusum with the sign of the utilisation.
+        """
+        if not self._pushed:
+            return array("d", [float("nan")] * self._size)
+        return array("d", self._values)
+
+    def push(self, dt: cython.double, table: Any, begin: cython.Py_ssize_t) -> bool:
+        """Take one verdict.
+
+        Parameters
+        ----------
+        dt : float
+            Step that it ends, s.
+        table : buffer of doubles
+            The utilisation of each state, or the residuals, among others.
+        begin : int
+            Where they begin. If all are NaN there is no verdict, and nothing changes.
+
+        Returns
+        -------
+        bool
+            The alarm after it.
+
+        Raises
+        ------
+        ValueError
+            There are too few numbers.
+        """
+        row: cython.double[::1] = table
+        if begin < 0 or begin + self._n > len(row):
+            raise ValueError("the numbers of the verdict do not fit the states")
+        self._push(dt, row, begin)
+        return self.alarm
+
+    def push_all(self, dt: Any, rows: Any) -> tuple[Any, Any]:
+        """Take many verdicts.
+
+        Parameters
+        ----------
+        dt : array (K,)
+            Steps, s.
+        rows : array (K, n)
+            As for `push`, a row for each verdict.
+
+        Returns
+        -------
+        array of bool (K,)
+            The alarm after each.
+        array (K, n), or (K, 1) of chi2
+            `values` after each.
+
+        Raises
+        ------
+        ValueError
+            The arrays do not fit one another.
+        """
+        count: cython.Py_ssize_t = len(dt)
+        i: cython.Py_ssize_t
+        k: cython.Py_ssize_t
+        if np.shape(rows) != (count, self._n):
+            raise ValueError("the numbers of the verdicts do not fit the states")
+        flat = array("d", np.ascontiguousarray(rows, dtype=np.float64).tobytes())
+        steps = array("d", np.ascontiguousarray(dt, dtype=np.float64).tobytes())
+        found, raised = array("d", bytes(8 * count * self._size)), bytearray(count)
+        if not count:
+            return np.zeros(0, dtype=bool), np.zeros((0, self._size))
+        table: cython.double[::1] = flat
+        times: cython.double[::1] = steps
+        values: cython.double[::1] = found
+        alarm: cython.uchar[::1] = raised
+        for k in range(count):
+            self._push(times[k], table, k * self._n)
+            alarm[k] = self.alarm
+            for i in range(self._size):
+                values[k * self._size + i] = self._values[i] if self._pushed else float("nan")
+        return np.frombuffer(raised, dtype=np.bool_), np.frombuffer(found).reshape(count, self._size)
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.cdivision(True)
+    def _push(self, dt: cython.double, row: cython.double[::1], begin: cython.Py_ssize_t) -> cython.void:
+        i: cython.Py_ssize_t
+        value: cython.double
+        weight: cython.double
+        down: cython.double
+        over: cython.bint = False
+        if not self._take(row, begin):
+            return
+        self._pushed = True
+        if self._kind == EWMA:
+            weight = dt / (self._window + dt)
+            for i in range(self._size):
+                self._up[i] += (self._terms[i] - self._up[i]) * weight
+                self._values[i] = self._up[i] / self._thresholds[i]
+        elif self._kind == CUSUM:
+            weight = dt / self._window
+            for i in range(self._size):
+                value = self._up[i] + (self._terms[i] - self._allowance) * weight
+                down = self._down[i] + (-self._terms[i] - self._allowance) * weight
+                self._up[i] = value = value if value > 0.0 else 0.0
+                self._down[i] = down = down if down > 0.0 else 0.0
+                self._values[i] = (value if value >= down else -down) / self._thresholds[i]
+        else:
+            self._move(dt)
+            weight = self._window if self._total <= self._window_ns else dt
+            for i in range(self._size):
+                value = self._up[i]
+                if self._begin < self._middle:
+                    value = self._queue[self._begin * self._size + i] + value
+                self._values[i] = value / weight / self._thresholds[i]
+        for i in range(self._size):
+            value = self._values[i]
+            over = over or (self._counted[i] and (value > 1.0 or value < -1.0))
+        self.alarm = over
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    def _take(self, row: cython.double[::1], begin: cython.Py_ssize_t) -> cython.bint:
+        """What the verdict adds, to `_terms`; false if there is none."""
+        n: cython.Py_ssize_t = self._n
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        value: cython.double
+        total: cython.double
+        square: cython.double = 0.0
+        limit: cython.double
+        nothing: cython.bint = True
+        if self._kind == CHI2:
+            for i in range(n):
+                total = 0.0
+                for j in range(i + 1):
+                    total += self._whitening[i * n + j] * (row[begin + j] - self._mean[j])
+                square += total * total
+            self._terms[0] = square if square <= _MOST else _MOST
+            return True
+        limit = LIMIT if self._kind == EWMA or self._kind == CUSUM else _MOST
+        for i in range(n):
+            value = row[begin + i]
+            if value == value:
+                nothing = False
+            else:
+                value = limit
+            value = limit if value > limit else -limit if value < -limit else value
+            self._terms[i] = value * value if self._kind == ENERGY else value
+        return not nothing
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    def _move(self, dt: cython.double) -> cython.void:
+        """Add `_terms` to the window, and drop what is older than it."""
+        i: cython.Py_ssize_t
+        k: cython.Py_ssize_t
+        size: cython.Py_ssize_t = self._size
+        step: cython.longlong
+        value: cython.double
+        if self._end == self._capacity:
+            self._make_room()
+        step = int(dt * 1e9 + 0.5)
+        self._steps[self._end] = step
+        self._total += step
+        for i in range(size):
+            value = self._terms[i] * dt
+            self._queue[self._end * size + i] = value
+            self._up[i] += value
+        self._end += 1
+        while self._end - self._begin > 1 and (self._total > self._window_ns or self._end - self._begin > _LONGEST):
+            if self._begin == self._middle:  # the newer half becomes the older one
+                for k in range(self._end - 2, self._begin - 1, -1):
+                    for i in range(size):
+                        self._queue[k * size + i] += self._queue[(k + 1) * size + i]
+                self._middle = self._end
+                for i in range(size):
+                    self._up[i] = 0.0
+            self._total -= self._steps[self._begin]
+            self._begin += 1
+
+    @cython.cfunc
+    def _make_room(self) -> cython.void:
+        """Move the window to the front of the queue, or double the queue if the window fills more than half of it."""
+        size: cython.Py_ssize_t = self._size
+        count: cython.Py_ssize_t = self._end - self._begin
+        k: cython.Py_ssize_t
+        queue: cython.double[::1] = self._queue
+        steps: cython.longlong[::1] = self._steps
+        if 2 * count > self._capacity:
+            self._capacity *= 2
+            self._queue = array("d", bytes(8 * size * self._capacity))
+            self._steps = array("q", bytes(8 * self._capacity))
+        for k in range(count * size):
+            self._queue[k] = queue[self._begin * size + k]
+        for k in range(count):
+            self._steps[k] = steps[self._begin + k]
+        self._middle -= self._begin
+        self._begin, self._end = 0, count
+
+
+def _doubles(values: Any) -> Any:
+    return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+if not cython.compiled:
+    use_twin(globals(), ("Statistic",))

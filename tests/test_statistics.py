@@ -1,0 +1,258 @@
+"""Statistics over a window: their formulas, live as offline, compiled as uncompiled."""
+
+from array import array
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti.base import compiled
+from uncertain_lti.model.alarm_rule import KINDS, PER_STATE, AlarmRule, StatisticRule
+from uncertain_lti.model.residuals import Residuals
+from uncertain_lti.monitor import statistics
+from uncertain_lti.monitor.statistics import LIMIT, Statistic
+from uncertain_lti.sampling.sampler import Step
+from uncertain_lti.sampling.status import Status
+
+C = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, -0.3], [0.0, -0.3, 0.5]])
+MEAN = np.array([0.1, -0.2, 0.0])
+
+
+def statistic(kind: str, window: float = 1.0, threshold: float = 1.0, n: int = 3, allowance: float = 0.0) -> Statistic:
+    joint = kind == "chi2"
+    return Statistic(
+        KINDS.index(kind), n, window, [threshold] * (1 if joint else n), [True] * n, allowance,
+        MEAN[:n], Residuals(MEAN[:n], C[:n, :n]).whitening([True] * n),
+    )  # fmt: skip
+
+
+def oracle(kind: str, T: float, dt: np.ndarray, rows: np.ndarray, allowance: float) -> np.ndarray:
+    """The formulas of the theory page, over the whole record."""
+    if kind in ("ewma", "cusum"):
+        rows = np.clip(rows, -LIMIT, LIMIT)
+        e, up, down = (np.zeros(rows.shape[1]) for _ in range(3))
+        found = []
+        for u, step in zip(rows, dt, strict=True):
+            e = e + (u - e) * step / (T + step)
+            up = np.maximum(0, up + (u - allowance) * step / T)
+            down = np.maximum(0, down + (-u - allowance) * step / T)
+            found.append(e if kind == "ewma" else np.where(up >= down, up, -down))
+        return np.array(found)
+    if kind == "chi2":
+        r = rows - MEAN[: rows.shape[1]]
+        terms = np.einsum("ki,ij,kj->k", r, np.linalg.inv(C[: rows.shape[1], : rows.shape[1]]), r)[:, None]
+    else:
+        terms = rows**2 if kind == "energy" else rows
+    found = []
+    ns = np.rint(dt * 1e9).astype(int)
+    for k in range(len(dt)):
+        first = k
+        while first > 0 and ns[first - 1 : k + 1].sum() <= round(T * 1e9):
+            first -= 1
+        part = slice(first, k + 1)
+        found.append((terms[part] * dt[part, None]).sum(axis=0) / max(T, dt[k] if first == k else 0.0))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("jitter", [0.0, 0.4])
+def test_every_statistic_is_its_formula(kind: str, jitter: float) -> None:
+    rng = np.random.default_rng(1)
+    dt = np.rint(1e9 * 0.01 * (1 + jitter * rng.uniform(-1, 1, 700))) * 1e-9
+    rows = rng.normal(size=(700, 3)) + np.linspace(0, 2, 700)[:, None]
+    alarm, values = statistic(kind, 0.5, 0.8, allowance=0.3).push_all(dt, rows)
+    expected = oracle(kind, 0.5, dt, rows, 0.3) / 0.8
+    np.testing.assert_allclose(values, expected, rtol=1e-9, atol=1e-12)
+    assert np.array_equal(alarm, (np.abs(values) > 1).any(axis=1)) and 0 < alarm.sum() < 700
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_at_a_time_and_all_at_once_are_the_same_bits(kind: str) -> None:
+    rng = np.random.default_rng(2)
+    dt, rows = rng.uniform(0.001, 0.02, 500), rng.normal(size=(500, 3))
+    rows[rng.random(500) < 0.1] = np.nan
+    rows[40, 1], rows[60, 2], rows[80, 0] = np.inf, -np.inf, 1e300
+    together = statistic(kind, 0.1)
+    alarm, values = together.push_all(dt, rows)
+    one = statistic(kind, 0.1)
+    for k in range(500):
+        assert one.push(dt[k], array("d", [7.0, *rows[k]]), 1) == alarm[k]
+        assert np.array(one.values()).tobytes() == values[k].tobytes()
+    assert np.isfinite(values[1:]).all()
+
+
+@given(st.sampled_from(KINDS), st.integers(1, 4), st.integers(0, 10_000), st.sampled_from([1e-4, 0.03, 0.5, 1e6]))
+def test_compiled_gives_the_bits_of_uncompiled(kind: str, n: int, seed: int, window: float) -> None:
+    if statistics.Statistic.__module__ != "uncertain_lti.monitor._statistics":
+        pytest.skip("the statistics are not compiled here")
+    rng = np.random.default_rng(seed)
+    n = min(n, 3)
+    dt = rng.choice([0.001, 0.01, 0.0125, 0.3], 300) * rng.choice([1.0, 1 + 1e-7])
+    rows = rng.normal(size=(300, n)) * 10.0 ** rng.integers(-3, 4)
+    rows[rng.random(300) < 0.05] = np.nan
+    found = []
+    for source in (statistics, compiled.uncompiled("monitor.statistics")):
+        made = source.Statistic(
+            KINDS.index(kind), n, window, [0.7] * (1 if kind == "chi2" else n), [True] * n,
+            0.1, MEAN[:n], Residuals(MEAN[:n], C[:n, :n]).whitening([True] * n),
+        )  # fmt: skip
+        alarm, values = made.push_all(dt, rows)
+        found.append((alarm.tobytes(), values.tobytes()))
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("kind", ["energy", "mean", "chi2"])
+def test_a_huge_value_leaves_nothing_behind(kind: str) -> None:
+    """A running sum that subtracts what leaves the window would keep the rounding of 1e40 for ever."""
+    rows = np.full((400, 3), 0.25)
+    rows[100] = 1e20
+    _, values = statistic(kind, 0.5).push_all(np.full(400, 0.01), rows)
+    assert values[149].max() > 1e10
+    assert values[150:] == pytest.approx(np.broadcast_to(values[99], (250, values.shape[1])), rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_missing_changes_nothing(kind: str) -> None:
+    rng = np.random.default_rng(3)
+    rows, dt = rng.normal(size=(200, 3)), np.full(200, 0.01)
+    without = np.insert(rows, [50, 50, 120], np.nan, axis=0)
+    _, plain = statistic(kind, 0.2).push_all(dt, rows)
+    alarm, broken = statistic(kind, 0.2).push_all(np.full(203, 0.01), without)
+    if kind == "chi2":  # residuals are never missing
+        return
+    assert np.delete(broken, [50, 51, 122], axis=0).tobytes() == plain.tobytes()
+    assert broken[51].tobytes() == broken[49].tobytes() and alarm[51] == alarm[49]
+
+
+def test_until_there_is_a_window_what_is_missing_counts_as_0() -> None:
+    _, values = statistic("energy", 1.0).push_all(np.full(4, 0.25), np.full((4, 3), 2.0))
+    assert values[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_a_window_shorter_than_a_step_holds_one_verdict() -> None:
+    _, values = statistic("mean", 0.001).push_all(np.full(3, 0.01), np.array([[1.0] * 3, [2.0] * 3, [-3.0] * 3]))
+    assert values[:, 0].tolist() == [1.0, 2.0, -3.0]
+
+
+def test_reset_forgets_everything() -> None:
+    rng = np.random.default_rng(5)
+    for kind in KINDS:
+        one = statistic(kind, 0.1, allowance=0.1 if kind == "cusum" else 0.0)
+        first = one.push_all(np.full(90, 0.01), rng.normal(size=(90, 3)) * 9)
+        one.reset()
+        assert not one.alarm and np.isnan(one.values()).all() and first[0].any()
+        rows = rng.normal(size=(90, 3))
+        fresh = statistic(kind, 0.1, allowance=0.1 if kind == "cusum" else 0.0)
+        again, new = (s.push_all(np.full(90, 0.01), rows)[1] for s in (one, fresh))
+        assert again.tobytes() == new.tobytes()
+
+
+# --- in the monitor ---
+
+
+def model(rules: Any, n: int = 3) -> UncertainLTI:
+    return UncertainLTI(
+        -0.5 * np.eye(n), np.zeros((n, 1)), np.zeros((n, n)), np.zeros((n, 1)), v=np.full(n, 0.3),
+        residuals=Residuals(MEAN[:n], 0.01 * C[:n, :n]), alarm=rules,
+    )  # fmt: skip
+
+
+RULES = (
+    AlarmRule(3, 8),
+    StatisticRule("energy", 0.5, (0.5, 0.6, 0.7)),
+    StatisticRule("mean", 0.3, 0.4),
+    StatisticRule("ewma", 0.3, 0.4),
+    StatisticRule("cusum", 0.3, 0.5, allowance=0.2),
+    StatisticRule("chi2", 0.2, 9.0),
+)
+
+
+def a_run(seed: int, count: int = 400, n: int = 3, drift: float = 0.2) -> Transient:
+    rng = np.random.default_rng(seed)
+    x = 0.12 * rng.normal(size=(count, n))
+    x[250:] += np.linspace(0, 0.3, count - 250)[:, None] * (-1.0) ** np.arange(count - 250)[:, None]
+    x[330:] += drift * np.arange(count - 330)[:, None]
+    x[[70, 71, 200]] = np.nan
+    t = np.cumsum(rng.integers(9_000_000, 11_000_000, count))
+    t[320:] -= t[320] - t[100]  # time jumps back
+    return Transient(t * 1, x, np.zeros((count, 1)))
+
+
+def steps_of(run: Transient) -> list[Step]:
+    found = []
+    for k, status in enumerate(run.statuses()):
+        before, dt = [np.nan] * 4, np.nan
+        if k and status is Status.OK:
+            before, dt = [*run.x[k - 1], *run.u[k - 1]], run.dt[k - 1]
+        found.append(Step(status, int(run.t_ns[k]), 0, dt, before, run.x[k].tolist()))
+    return found
+
+
+@pytest.mark.parametrize("masked", [(), ("x2",)])
+def test_offline_is_live(masked: tuple[str, ...]) -> None:
+    monitor = EnvelopeMonitor(model(RULES), masked=masked)
+    run = a_run(1)
+    verdicts = monitor.check(run)
+    assert verdicts.alarm.any() and not verdicts.alarm.all()
+    assert verdicts.rule_alarms.any(axis=0).all(), "every rule raises the alarm somewhere"
+    assert verdicts.statistics.shape == (400, 13) and verdicts.statistic_names[0] == "energy/x1"
+    assert verdicts.statistic_names[-1] == "chi2/joint"
+    live = EnvelopeMonitor(model(RULES), masked=masked)
+    for k, step in enumerate(steps_of(run)):
+        verdict = live.judge(step)
+        assert verdict.alarm == verdicts.alarm[k]
+        assert verdict.statistics.tobytes() == verdicts.statistics[k].tobytes()
+        assert verdict.raised == verdicts.raised(k)
+        assert bool(verdict.raised) == (verdict.alarm and verdict.judged)
+    assert not monitor.alarm, "check leaves the live alarm alone"
+
+
+def test_a_masked_state_does_not_count() -> None:
+    run = a_run(2, drift=0.0)
+    x = run.x.copy()
+    x[100:, 1] += 0.4 * np.minimum(np.arange(300), 100)
+    run = Transient(run.t_ns, x, run.u)
+    for rule in RULES:
+        blamed = EnvelopeMonitor(model([rule])).check(run)
+        masked = EnvelopeMonitor(model([rule]), masked=("x2",)).check(run)
+        assert blamed.alarm.sum() > masked.alarm.sum()
+    two = EnvelopeMonitor(model(RULES), masked=("x2",)).check(run)
+    names = {r.state for k in np.flatnonzero(two.alarm) for r in two.raised(k)}
+    assert "x2" not in names and "x1" in names
+
+
+def test_the_alarm_says_which_rule_state_and_value() -> None:
+    monitor = EnvelopeMonitor(model([AlarmRule(50, 50), StatisticRule("mean", 0.05, 0.5)]))
+    x = np.zeros((12, 3))
+    x[:, 2] = [0.0, *(-0.24 * np.arange(1, 12))]
+    verdicts = monitor.check(Transient(np.arange(12) * 0.01, x, np.zeros((12, 1))))
+    first = int(np.argmax(verdicts.alarm))
+    (why,) = verdicts.raised(first)
+    assert (why.label, why.kind, why.horizon, why.state) == ("mean", "mean", 1, "x3") and why.value < -1
+    assert "mean of x3 at 1" in why.words and "its threshold" in why.words
+    assert verdicts.raised(0) == ()
+
+
+def test_unarmed_verdicts_leave_no_trace() -> None:
+    live = EnvelopeMonitor(model(RULES))
+    for step in steps_of(a_run(3)):
+        verdict = live.judge(step, armed=False)
+        assert not verdict.alarm and np.isnan(verdict.statistics).all()
+
+
+def test_rules_of_a_monitor_take_the_place_of_the_models() -> None:
+    given = model(RULES)
+    assert EnvelopeMonitor(given, rules=RULES[:2]).alarms.rules == RULES[:2]
+    assert EnvelopeMonitor(given, violations=1).alarms.rules == (AlarmRule(1, 8), *RULES[1:])
+    only = EnvelopeMonitor(given, rules=RULES[1:2])
+    assert only.rule == AlarmRule() and only.alarms.rules == RULES[1:2], "flags need a margin and arm nothing"
+    assert EnvelopeMonitor(given, 2, 3, rules=RULES[1:2]).alarms.rules == (AlarmRule(2, 3), RULES[1])
+
+
+def test_kinds_are_numbered_in_the_order_of_the_rules() -> None:
+    for number, name in enumerate(KINDS):
+        assert getattr(statistics, name.upper()) == number
+    assert (*PER_STATE, "chi2") == KINDS
