@@ -30,6 +30,7 @@ from tanks import DT, Tanks  # noqa: E402
 from uncertain_lti import Transient, UncertainLTI  # noqa: E402
 from uncertain_lti.model.alarm_rule import AlarmRule  # noqa: E402
 from uncertain_lti.validation.calibration import calibrate  # noqa: E402
+from uncertain_lti.validation.detectable import detectable  # noqa: E402
 from uncertain_lti.validation.left_out import validate  # noqa: E402
 from uncertain_lti.validation.result import Validation  # noqa: E402
 
@@ -107,6 +108,74 @@ def blocks(plants: Iterable[int]) -> Held:
             held.setdefault(f"alarms per hour, {rule.violations} of {rule.window}", []).append(
                 low <= alarms.sum() / hours <= high
             )
+    return held
+
+
+FAULTS = ("bias", "drift", "spike", "offset", "loss", "time_constant")
+"""Kinds of which the study of detectable faults simulates the truth."""
+FRESH = 400
+"""Fresh recordings with a fault, for each."""
+
+
+def faulty(plant: Tanks, kind: str, i: int, size: float, seed: int, noise: float) -> tuple[np.ndarray, ...]:
+    """x, u of fresh recordings with the true fault (half of either sign, where it has one), healthy x, and onsets."""
+    rng = np.random.default_rng([seed, 9])
+    onset = rng.integers(1, 78, FRESH)
+    sign = np.where(np.arange(FRESH) % 2, 1.0, -1.0)
+    after = np.arange(101) >= onset[:, None]
+    healthy, u = plant.arrays(FRESH, seed, noise=noise)
+    if kind == "offset":
+        x, _ = plant.arrays(FRESH, seed, noise=noise, act=lambda u: u + after * (sign * size)[:, None])
+    elif kind == "loss":  # of what is commanded, whose steady value is 0
+        x, _ = plant.arrays(FRESH, seed, noise=noise, act=lambda u: u * (1 - after * size))
+    elif kind == "time_constant":
+        x = healthy.copy()
+        for one, factor in ((1.0, 1.0 / (1.0 + size)), (-1.0, 1.0 + size)):
+            there, _ = plant.arrays(FRESH, seed, noise=noise, slower=(i, factor, onset))
+            x[sign == one] = there[sign == one]
+    else:
+        since = np.maximum(np.arange(101) - onset[:, None], 0) * DT
+        shape = {"bias": after, "drift": since, "spike": np.arange(101) == onset[:, None]}[kind]
+        x = healthy.copy()
+        x[:, :, i] += (sign * size)[:, None] * shape
+    return x, u, healthy, onset
+
+
+def true_share(model: UncertainLTI, found: tuple[np.ndarray, ...], rule: AlarmRule, within: float) -> float:
+    """Share of the faults that raise the alarm in time, of those without one."""
+    x, u, healthy, onset = found
+    k = np.arange(100) + 1  # the sample at which each transition arrives
+    inside = (k >= onset[:, None]) & (k * DT <= onset[:, None] * DT + within + 1e-9)
+    raised = []
+    for states in (x, healthy):
+        low, high = model.bounds(states[:, :-1], u[:, :-1], DT, margin=rule.margin)
+        left = ~((low <= states[:, 1:]) & (states[:, 1:] <= high)).all(axis=-1)
+        left &= k >= onset[:, None] - rule.window  # the alarm starts there
+        recent = np.cumsum(np.pad(left, ((0, 0), (rule.window, 0))), axis=1)
+        raised.append(((recent[:, rule.window :] - recent[:, : -rule.window] >= rule.violations) & inside).any(axis=1))
+    return float(raised[0][~raised[1]].mean())
+
+
+def detectable_faults(plants: Iterable[int]) -> Held:
+    """12 to 24 recordings; faults of the smallest detectable size, simulated in 400 fresh recordings of the plant."""
+    held: Held = {}
+    for seed in plants:
+        rng = np.random.default_rng([seed, 11])
+        plant, noise = Tanks(seed, spread=0.2), 1e-3 * (seed % 2)
+        runs = plant.transients(int(rng.integers(12, 25)), seed, noise=noise)
+        rule = (AlarmRule(), AlarmRule(2, 3))[seed // 4 % 2]
+        validation = validate(
+            runs, criterion=("qp", "lp")[seed // 2 % 2], additive="noise" if noise else "none", alarm_rule=rule
+        )
+        found = detectable(validation.model, validation.parts, kinds=FAULTS, confidence=CONFIDENCE, seed=seed)
+        for number, fault in enumerate(found.faults):
+            if not np.isfinite(fault.size):
+                continue
+            i = 0 if fault.signal.startswith("u") else int(fault.signal[1]) - 1
+            truth = faulty(plant, fault.kind, i, fault.size, 90_000 + 100 * seed + number, noise)
+            low, high = fault.share_interval
+            share = true_share(validation.model, truth, rule, found.within)
+            held.setdefault(f"share of {fault.kind} seen", []).append(low <= share <= high)
     return held
 
 
@@ -220,8 +289,9 @@ STUDIES: dict[str, Callable[[Iterable[int]], Held]] = {
     "groups": groups,
     "rare": rare,
     "drift": drift,
+    "detectable": detectable_faults,
 }
-SLOW = {"rare": 20, "drift": 16}
+SLOW = {"rare": 20, "drift": 16, "detectable": 3}
 """Studies that take about a second of processor time a plant, and how many plants the suite has of them."""
 
 

@@ -44,6 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--false-alarms", type=float, metavar="PER_HOUR", help="find the alarm rule that stays below this rate per hour"
     )
     parser.add_argument(
+        "--within",
+        type=float,
+        metavar="S",
+        help="time within which a fault shall be seen (default: 1 s or 20 steps, at most a quarter of a recording)",
+    )
+    parser.add_argument(
         "--output",
         metavar="MODEL",
         help="write the model with this validation, and the alarm rule found, to this file; where --false-alarms "
@@ -78,8 +84,10 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti.reports.validation_text import validation_text
     from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.calibration import calibrate
+    from uncertain_lti.validation.detectable import check_within, detectable
     from uncertain_lti.validation.fitted_model import validate_model
 
+    check_within(options.within)
     model = UncertainLTI.load(options.model)
     sources = model.fit_summary.get("sources", [])
     bags = options.bags or list(dict.fromkeys(s["file"] for s in sources))
@@ -113,6 +121,10 @@ def run(options: argparse.Namespace) -> int:
             model = model.replace(alarm_rule=calibration.alarm_rule)
         elif options.output is not None:
             refusal = f"{options.output}: not written: {calibration.words}"
+    with options.progress.stage("injecting faults") as step:
+        data["detectable"] = detectable(
+            model, validation.parts, options.within, confidence=options.confidence, progress=step
+        ).to_dict()
     model = model.replace(validation=data)
     output = None if refusal else options.output
     if output is not None:

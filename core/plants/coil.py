@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,11 @@ def inductance(current: ArrayLike) -> Array:
 
 
 def coil_runs(
-    seeds: Sequence[int], samples: int = 501, volts: float = 40.0, magnitude: bool = False
+    seeds: Sequence[int],
+    samples: int = 501,
+    volts: float = 40.0,
+    magnitude: bool = False,
+    act: Callable[[Array], Array] | None = None,
 ) -> list[Transient]:
     """Runs from rest: V_C (V) and I_L (A) under V_IN (V), held between samples; integrated by Runge-Kutta, no noise.
 
@@ -59,6 +63,8 @@ def coil_runs(
         Standard deviation of the voltage, V.
     magnitude : bool, default False
         `I_L_magnitude`, |I_L|, is there as a further scheduling signal.
+    act : callable, optional
+        The voltages that the source really gives, for the commanded ones (samples, seeds), which V_IN tells of.
 
     Returns
     -------
@@ -73,6 +79,7 @@ def coil_runs(
     for k in range(1, len(u)):
         u[k] = pole * u[k - 1] + math.sqrt(1.0 - pole * pole) * white[k]
     u = volts * u[warm:]
+    given = u if act is None else act(u)
 
     def rate(x: Array, v: Array) -> Array:
         return np.stack([x[1] / C, (v - x[0] - R * x[1]) / inductance(x[1])])
@@ -81,10 +88,10 @@ def coil_runs(
     for k in range(samples - 1):
         at = x[k]
         for _ in range(SUBSTEPS):
-            a = rate(at, u[k])
-            b = rate(at + 0.5 * h * a, u[k])
-            c = rate(at + 0.5 * h * b, u[k])
-            at = at + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(at + h * c, u[k]))
+            a = rate(at, given[k])
+            b = rate(at + 0.5 * h * a, given[k])
+            c = rate(at + 0.5 * h * b, given[k])
+            at = at + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(at + h * c, given[k]))
         x[k + 1] = at
     runs = []
     for i, seed in enumerate(seeds):

@@ -17,6 +17,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.reports.check_data import check_data
+from uncertain_lti.reports.detectable_text import detectable_data
 from uncertain_lti.reports.plain_data import finite_data, list_of, numbers_of
 from uncertain_lti.reports.regimes import block_facts, blocks_in_words
 from uncertain_lti.reports.reliance import answer, reasons
@@ -167,6 +168,7 @@ def _validation(model: UncertainLTI) -> dict[str, Any] | None:
             "condition_short": str(data.get("condition_short", "")),
             "hint": str(data.get("hint", "")),
             "notes": [str(note) for note in data["notes"]],
+            "detectable": detectable_data(data),
         }
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
         return None

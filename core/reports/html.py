@@ -25,6 +25,7 @@ from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.recording import Progress
 from uncertain_lti.reports import alt_texts, schedule_figures
 from uncertain_lti.reports import figures as plots
+from uncertain_lti.reports.detectable_text import SHOWN, condition_text, detectable_tables, detectable_words
 from uncertain_lti.reports.drawing import between_rows
 from uncertain_lti.reports.findings import APART
 from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, WEIGHTS, YES
@@ -54,6 +55,7 @@ h1 { font-size: 1.35rem; margin: 0 0 .2rem; } h2 { font-size: 1.1rem; margin: 2r
 p { margin: .4rem 0; } .soft { color: var(--soft); } code { font-family: ui-monospace, monospace; font-size: .85em; }
 .cards { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 1rem; margin-top: .8rem; }
 .card { border: 1px solid var(--line); border-top: 5px solid var(--soft); border-radius: 4px; padding: .7rem 1rem; }
+.card.wide { grid-column: 1 / -1; }
 .card h2 { border: 0; margin: 0; padding: 0; font-size: .95rem; color: var(--soft); font-weight: 600; }
 .answer { font-size: 1.7rem; font-weight: 700; line-height: 1.25; margin: 0 0 .3rem; }
 .good { border-top-color: var(--good); } .care { border-top-color: var(--care); } .bad { border-top-color: var(--bad); }
@@ -176,8 +178,24 @@ def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
         + '<a href="#trust">How far to trust it</a><a href="#origin">Where it comes from</a></nav></header>\n'
         f'<div class="cards"><section class="card {tone[rely["answer"]]}"><h2>May I rely on it?</h2>'
         f'<p class="answer">{_ANSWER[rely["answer"]]}</p><ul>{listed}</ul></section>\n'
-        f'<section class="card {look}"><h2>What happened?</h2><p class="answer">{what}</p><ul>{items}</ul></section>'
-        "</div>"
+        f'<section class="card {look}"><h2>What happened?</h2><p class="answer">{what}</p><ul>{items}</ul></section>\n'
+        f"{_sees(facts)}</div>"
+    )
+
+
+def _sees(facts: Mapping[str, Any]) -> str:
+    """Which faults the model sees, on the first screen."""
+    faults = facts["validation"] and facts["validation"]["detectable"]
+    if not faults or faults["refused"]:
+        why = faults["refused"] if faults else "run uncertain-lti validate MODEL --output MODEL"
+        answer, items = "Unknown", f"<li>{_text(why)}</li>"
+    else:
+        answer, words = f"Within {number(faults['within'])} s, from these sizes on", detectable_words(faults)
+        items = "".join(f"<li>{_text(text)}</li>" for text in words[:SHOWN])
+        items += '<li class="soft">and more <a href="#trust">below</a></li>'
+    return (
+        f'<section class="card wide"><h2>Which faults would it see?</h2><p class="answer">{_text(answer)}</p>'
+        f"<ul>{items}</ul></section>"
     )
 
 
@@ -458,6 +476,12 @@ def _trust(facts: Mapping[str, Any]) -> str:
             for a in v["false_alarms"]
         ]
         parts.append(_table(("alarm rule", "false alarms", "per hour", f"interval{under}"), rows))
+        if (faults := v["detectable"]) and not faults["refused"]:
+            parts.append(f"<h3>Which faults it sees</h3><p>{_text(condition_text(faults))}.</p>")
+            parts += [
+                _table(header, [[_text(cell) for cell in row] for row in rows], most=200)
+                for header, rows in detectable_tables(faults)
+            ]
         parts += [f"<p>{_text(line)}.</p>" for line in [v["condition"], v["words"], *v["notes"]] if line]
     if facts["model"]["messages"]:
         listed = "".join(f"<li>{_text(_without_address(m))}</li>" for m in facts["model"]["messages"])

@@ -9,6 +9,7 @@ import numpy as np
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.reports.detectable_text import condition_text, detectable_data, detectable_words
 from uncertain_lti.reports.regimes import MOST_REGIMES, block_facts, blocks_in_words
 from uncertain_lti.reports.tables import number, table
 
@@ -64,6 +65,8 @@ def model_text(model: UncertainLTI) -> str:
         f"alarm: {alarm.violations} of the last {plural(alarm.window, 'verdict')} violated; margin "
         f"{number(alarm.margin)}"
     )
+    if (faults := detectable_data(model.validation)) is not None:
+        lines += [condition_text(faults), *(f"  {text}" for text in detectable_words(faults))]
     return "\n".join(lines + [f"note: {message}" for message in facts.get("messages", [])])
 
 

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from uncertain_lti.base.english import plural
+from uncertain_lti.reports.detectable_text import detectable_data, detectable_text
 from uncertain_lti.reports.tables import number, table
 
 MOST_PARTS = 20
@@ -81,6 +82,8 @@ def validation_text(data: dict[str, Any]) -> str:
     if "condition" in data:
         lines.append(data["condition"])
     lines.append(data["scenario"]["words"])
+    if (faults := detectable_data(data)) is not None:
+        lines += detectable_text(faults)
     if "calibration" in data:
         lines.append(data["calibration"]["words"])
         if warning := data["calibration"].get("warning"):  # files written before it was stored have none

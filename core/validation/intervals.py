@@ -97,6 +97,53 @@ def share_interval(hits: int, trials: int, confidence: float) -> tuple[float, fl
     return lower, upper
 
 
+def quantile_share_interval(
+    units: ArrayLike, hits: ArrayLike, confidence: float, share: float | None = None
+) -> tuple[float, tuple[float, float]]:
+    """Interval for a share of cases that come in clusters: recordings or groups.
+
+    The exact binomial (Clopper-Pearson) limits with as many independent cases as the clusters are worth: the cases over
+    the design effect, the variance of the clusters' totals over that of independent cases (at least 1). As it is
+    estimated from G clusters, the tails are those of Student's t with G - 1 degrees of freedom.
+
+    Parameters
+    ----------
+    units : array (N,) of int
+        Cluster of each case.
+    hits : array (N,) of bool
+        Whether it has the property.
+    confidence : float
+        Of the interval, two-sided.
+    share : float, optional
+        In place of the share of the cases, as the middle of the interval.
+
+    Returns
+    -------
+    float
+        Share of the cases.
+    tuple of (float, float)
+        Its limits; (0, 1) for fewer than two clusters.
+    """
+    from scipy.special import ndtr, stdtrit
+    from scipy.stats import beta
+
+    unit, hit = np.asarray(units), np.asarray(hits, dtype=np.float64)
+    total, found = len(hit), float(hit.mean()) if len(hit) else math.nan
+    middle = found if share is None else share
+    G = len(np.unique(unit))
+    if G < 2 or not 0.0 <= middle <= 1.0:
+        return found, (0.0, 1.0)
+    residuals = np.array([float((hit[unit == g] - found).sum()) for g in np.unique(unit)])
+    variance = total * found * (1.0 - found)
+    effect = max(1.0, float(np.sum(residuals**2)) * G / (G - 1) / variance) if variance > 0 else 1.0
+    worth = total / effect
+    tail = float(ndtr(stdtrit(G - 1, (1.0 - confidence) / 2.0)))
+    yes, no = middle * worth, (1.0 - middle) * worth
+    low = float(beta.ppf(tail, yes, no + 1.0)) if yes > 0 else 0.0
+    high = float(beta.isf(tail, yes + 1.0, no)) if no > 0 else 1.0
+    return found, (low, high)
+
+
 def scenario_interval(support: int, transients: int, confidence: float) -> tuple[float, float]:
     """Interval for the probability that a fresh whole transient leaves the envelope of this very model.
 

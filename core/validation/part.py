@@ -50,6 +50,10 @@ class Part:
         What was left out together with it; "" if it was left out alone.
     block : array (K,) of int, optional
         Block of the full model that has the largest weight at each judged transition; 0 without a schedule.
+    model : UncertainLTI, optional
+        Fitted without it.
+    transient : Transient, optional
+        What was left out.
     """
 
     name: str
@@ -66,6 +70,8 @@ class Part:
     relative_width: Array
     group: str = ""
     block: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    model: UncertainLTI | None = None
+    transient: Transient | None = None
 
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
@@ -181,6 +187,8 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         np.full(n, np.nan) if empty else width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
         group,
         full.main_block(full.normalised_columns(steps)),
+        model,
+        transient,
     )
 
 

@@ -1,0 +1,224 @@
+"""What is said of the smallest faults that a model detects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.reports.tables import number, table
+
+COLUMNS = (
+    ("sensor", ("bias", "drift", "scale", "noise")),
+    ("sensor", ("spike", "freeze", "dropout", "sensor_delay")),
+    ("actuator", ("offset", "loss", "stuck", "actuator_delay")),
+    ("dynamics", ("time_constant", "gain")),
+)
+"""Kinds of faults that share a table."""
+TITLES = {
+    "bias": "off by",
+    "drift": "drifts, per s",
+    "scale": "scaled by",
+    "noise": "noise",
+    "spike": "one sample off by",
+    "freeze": "frozen, s",
+    "dropout": "reads 0, s",
+    "sensor_delay": "late, s",
+    "offset": "off by",
+    "loss": "loses",
+    "stuck": "stuck, s",
+    "actuator_delay": "late, s",
+    "time_constant": "time constant",
+    "gain": "gain",
+}
+"""Heads of the columns."""
+SHOWN = 6
+"""Signals that the short form names."""
+
+
+def detectable_data(validation: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The section on detectable faults of a model's validation, if it is one.
+
+    Parameters
+    ----------
+    validation : mapping
+        Of the model file.
+
+    Returns
+    -------
+    dict or None
+        As `Detectable.to_dict` makes it; None where there is none, or another program wrote something else.
+    """
+    try:
+        data = validation["detectable"]
+        faults = [
+            {
+                "kind": str(f["kind"]),
+                "of": str(f["of"]),
+                "signal": str(f["signal"]),
+                "unit": str(f["unit"]),
+                "size": _real(f["size"]),
+                "size_interval": [_real(v) for v in f["size_interval"]],
+                "largest": float(f["largest"]),
+                "share": _real(f["share"]),
+                "share_interval": [float(v) for v in f["share_interval"]],
+                "delay": _real(f["delay"]),
+                "cases": int(f["cases"]),
+                "refused": str(f.get("refused", "")),
+            }
+            for f in data["faults"]
+        ]
+        return {
+            "within": float(data["within"]),
+            "share": float(data["share"]),
+            "confidence": float(data["confidence"]),
+            "cases": int(data["cases"]),
+            "left_out": int(data["left_out"]),
+            "faults": [f for f in faults if f["kind"] in TITLES],
+            "refused": str(data.get("refused", "")),
+        }
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+
+
+def _real(value: Any) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, str) or not math.isfinite(value):
+        raise ValueError
+    return float(value)
+
+
+def size_text(fault: Mapping[str, Any], interval: bool = True) -> str:
+    """The smallest detectable size of one fault.
+
+    Parameters
+    ----------
+    fault : mapping
+        Of `detectable_data`.
+    interval : bool, default True
+        Whether its interval follows.
+
+    Returns
+    -------
+    str
+        `7.5 (6.2 to 8.6)`, or how much of the largest is seen.
+    """
+    if fault["refused"]:
+        return "unknown"
+    if fault["size"] is None:
+        return f"not seen ({fault['share']:.0%} at {_size(fault, fault['largest'])})"
+    text = _size(fault, fault["size"])
+    if not interval:
+        return text
+    low, high = fault["size_interval"]
+    return f"{text} ({_size(fault, low)} to {_size(fault, high)})"
+
+
+def _size(fault: Mapping[str, Any], value: float | None) -> str:
+    if value is None:
+        return "more than tried"
+    if fault["kind"] in ("scale", "loss", "time_constant", "gain"):
+        return f"{100 * value:.3g}%"
+    return f"{value:.3g}"
+
+
+def detectable_tables(data: Mapping[str, Any]) -> list[tuple[tuple[str, ...], list[list[str]]]]:
+    """Tables of the smallest detectable faults.
+
+    Parameters
+    ----------
+    data : mapping
+        Of `detectable_data`.
+
+    Returns
+    -------
+    list of (header, rows)
+        A row for each signal; none for kinds that were not looked for.
+    """
+    found = []
+    for of, kinds in COLUMNS:
+        faults = [f for f in data["faults"] if f["kind"] in kinds]
+        there = [k for k in kinds if any(f["kind"] == k for f in faults)]
+        if not there:
+            continue
+        rows = []
+        for signal in dict.fromkeys(f["signal"] for f in faults):
+            mine = {f["kind"]: f for f in faults if f["signal"] == signal}
+            unit = next((f["unit"] for f in faults if f["signal"] == signal and f["kind"] in ("bias", "offset")), "")
+            rows.append(
+                [signal + f" [{unit}]" * bool(unit), *(size_text(mine[k]) if k in mine else "-" for k in there)]
+            )
+        found.append(((of, *(TITLES[k] for k in there)), rows))
+    return found
+
+
+def condition_text(data: Mapping[str, Any]) -> str:
+    """What the sizes hold for.
+
+    Parameters
+    ----------
+    data : mapping
+        Of `detectable_data`.
+
+    Returns
+    -------
+    str
+        A clause.
+    """
+    out = data["left_out"]
+    without = f"; {plural(out, 'case')} with an alarm without a fault left out" if out else ""
+    return (
+        f"smallest fault seen in {data['share']:.0%} of the cases within {number(data['within'])} s "
+        f"({data['confidence']:.0%} interval; put into what was left out at {plural(data['cases'], 'instant')}"
+        f"{without})"
+    )
+
+
+def detectable_text(data: Mapping[str, Any]) -> list[str]:
+    """What `validate` prints of them.
+
+    Parameters
+    ----------
+    data : mapping
+        Of `detectable_data`.
+
+    Returns
+    -------
+    list of str
+        Lines and tables.
+    """
+    if data["refused"]:
+        return [f"which faults are seen is not known: {data['refused']}"]
+    lines = [condition_text(data)]
+    lines += [table(header, rows) for header, rows in detectable_tables(data)]
+    lines += list(dict.fromkeys(f"unknown: {f['refused']}" for f in data["faults"] if f["refused"]))
+    return lines
+
+
+def detectable_words(data: Mapping[str, Any]) -> list[str]:
+    """A short clause for each state and control, those of a first screen.
+
+    Parameters
+    ----------
+    data : mapping
+        Of `detectable_data`.
+
+    Returns
+    -------
+    list of str
+        `fan_speed: off by 7.5 rpm, drifts by 60 rpm/s`, for example.
+    """
+    words = []
+    for signal in dict.fromkeys(f["signal"] for f in data["faults"] if f["of"] != "dynamics"):
+        parts = []
+        for kind, what in (("bias", "off by"), ("drift", "drifts by"), ("offset", "off by"), ("loss", "loses")):
+            fault = next((f for f in data["faults"] if (f["kind"], f["signal"]) == (kind, signal)), None)
+            if fault is not None and not fault["refused"] and fault["size"] is not None:
+                parts.append(f"{what} {size_text(fault, interval=False)} {fault['unit']}".rstrip())
+            elif fault is not None and not fault["refused"]:
+                parts.append(f"not even if it {what} {_size(fault, fault['largest'])} {fault['unit']}".rstrip())
+        if parts:
+            words.append(f"{signal}: {', '.join(parts)}")
+    return words

@@ -1,0 +1,353 @@
+"""Injected faults: recordings of a healthy machine as they were if a sensor, an actuator or its dynamics had failed.
+
+A sensor fault changes readings alone. Of an actuator, or of the dynamics, the machine's response is needed: the states
+are changed by what the nominal (scheduled) model makes of the difference,
+
+    x'_{k+1} = x_{k+1} + f'(x'_k, u'_k) - f(x_k, u_k),   f(x, u) = x + Δt (A x + B u + c),
+
+with u' what the actuator really did and f' the changed dynamics; the recorded u stays as commanded. It is exact for a
+linear plant that the model describes. Otherwise it is an approximation: what the nominal model leaves unexplained
+stays as recorded, and no controller reacts to the fault.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.signal_map import Recalled
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of fault.
+
+    Parameters
+    ----------
+    of : str
+        What fails: `sensor` (of a state), `actuator` (a control) or `dynamics` (of a state).
+    unit : str
+        Of its size: `recorded` (that of the signal), `rate` (that per s), `share`, or `s`.
+    words : str
+        What happens.
+    both : bool, default False
+        Whether it may be of either sign.
+    """
+
+    of: str
+    unit: str
+    words: str
+    both: bool = False
+
+
+KINDS: Mapping[str, Kind] = {
+    "bias": Kind("sensor", "recorded", "the reading is off by the size", True),
+    "drift": Kind("sensor", "rate", "the reading moves off by the size in every second", True),
+    "scale": Kind("sensor", "share", "the reading is too large or too small by this share of itself", True),
+    "noise": Kind("sensor", "recorded", "normal noise of this standard deviation is added to the reading"),
+    "freeze": Kind("sensor", "s", "the reading holds its last value for so long"),
+    "dropout": Kind("sensor", "s", "the reading is 0 for so long"),
+    "spike": Kind("sensor", "recorded", "one reading is off by the size", True),
+    "sensor_delay": Kind("sensor", "s", "the reading is that of so long ago"),
+    "stuck": Kind("actuator", "s", "the actuator holds its place for so long"),
+    "loss": Kind("actuator", "share", "the actuator does this share less than commanded"),
+    "offset": Kind("actuator", "recorded", "the actuator is off by the size", True),
+    "actuator_delay": Kind("actuator", "s", "the actuator does what was commanded so long ago"),
+    "time_constant": Kind("dynamics", "share", "the state follows slower, or faster, by this share", True),
+    "gain": Kind("dynamics", "share", "all controls move the state more, or less, by this share", True),
+}
+"""Kinds of fault by name."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    signal : str
+        Name of the state, or of an actuator's control.
+    size : float
+        In the unit of its kind; negative for the other direction, where there is one.
+    at : float
+        Onset, s after the first sample; it begins with the first sample at or after.
+    seed : int, default 0
+        Of noise.
+
+    Raises
+    ------
+    FitError
+        There is no such kind, or the size does not fit it.
+    """
+
+    kind: str
+    signal: str
+    size: float
+    at: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise FitError(f"there is no fault '{self.kind}'; there are {', '.join(KINDS)}")
+        if not np.isfinite(self.size) or (self.size < 0 and not KINDS[self.kind].both):
+            raise FitError(f"a fault '{self.kind}' of size {self.size}; give a finite size of 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Stretches of recordings of equal length, side by side, all with the onset of a fault at the same sample.
+
+    Parameters
+    ----------
+    t : array (W, L)
+        Instants, s.
+    x : array (W, L, n)
+        States, recorded units; NaN where there is none.
+    u : array (W, L, m)
+        Controls, recorded units.
+    s : array (W, L, q)
+        Further scheduling signals, recorded units.
+    onset : int
+        The first sample of the fault.
+    """
+
+    t: Array
+    x: Array
+    u: Array
+    s: Array
+    onset: int
+
+    def take(self, which: NDArray[np.bool_]) -> Windows:
+        """Some of them.
+
+        Parameters
+        ----------
+        which : array (W,) of bool
+            Those that are wanted.
+
+        Returns
+        -------
+        Windows
+            In the same order.
+        """
+        return replace(self, t=self.t[which], x=self.x[which], u=self.u[which], s=self.s[which])
+
+
+def position(kind: str, signal: str, states: Sequence[str], controls: Sequence[str]) -> int:
+    """Column of the signal that a fault is of.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    signal : str
+        Its name.
+    states : sequence of str
+        Names of the states.
+    controls : sequence of str
+        Names of the controls.
+
+    Returns
+    -------
+    int
+        Column in x, or in u for an actuator.
+
+    Raises
+    ------
+    FitError
+        There is no such signal.
+    """
+    names = controls if KINDS[kind].of == "actuator" else states
+    what = "control" if KINDS[kind].of == "actuator" else "state"
+    if signal not in names:
+        raise FitError(f"a fault '{kind}' is of a {what}, and '{signal}' is none of {', '.join(names)}")
+    return list(names).index(signal)
+
+
+def inject(transient: Transient, fault: Fault, model: UncertainLTI | None = None) -> Transient:
+    """A recording as it would have been with a fault.
+
+    Parameters
+    ----------
+    transient : Transient
+        Of a healthy machine.
+    fault : Fault
+        The fault.
+    model : UncertainLTI, optional
+        Its nominal model gives the response to faults of actuators and of the dynamics; sensors need none.
+
+    Returns
+    -------
+    Transient
+        With changed states, and the recorded controls.
+
+    Raises
+    ------
+    FitError
+        There is no such signal; or the fault needs a model and there is none.
+    """
+    i = position(fault.kind, fault.signal, transient.state_names, transient.control_names)
+    onset = int(np.searchsorted(transient.t, fault.at - 1e-12))
+    windows = Windows(transient.t[None], transient.x[None], transient.u[None], transient.s[None], onset)
+    noise = np.random.default_rng(fault.seed).standard_normal((1, len(transient)))
+    signals = transient.signals if model is None else model.signals
+    recalled = () if signals is None else signals.recalled
+    x, u = faulty(windows, fault.kind, i, np.array([fault.size]), noise, recalled, model, transient.segment[None])
+    return transient.replace(x=x[0], u=u[0])
+
+
+def faulty(
+    windows: Windows,
+    kind: str,
+    i: int,
+    size: Array,
+    noise: Array,
+    recalled: Sequence[Recalled] = (),
+    model: UncertainLTI | None = None,
+    segment: NDArray[np.int32] | None = None,
+) -> tuple[Array, Array]:
+    """States and controls of many recordings at once, each with a fault of its own size.
+
+    Parameters
+    ----------
+    windows : Windows
+        Without a fault.
+    kind : str
+        One of `KINDS`.
+    i : int
+        Column of the signal, of `position`.
+    size : array (W,)
+        Size of the fault in each.
+    noise : array (W, L)
+        Standard normal numbers.
+    recalled : sequence of Recalled, optional
+        Controls that are memories of states or controls: those of a state follow its readings.
+    model : UncertainLTI, optional
+        As in `inject`.
+    segment : array (W, L) of int, optional
+        Segments of the samples, over which no response goes on; default one.
+
+    Returns
+    -------
+    array (W, L, n)
+        States, recorded units.
+    array (W, L, m)
+        Controls, recorded units: those of `windows`, but for the memories of states.
+
+    Raises
+    ------
+    FitError
+        The fault needs a model and there is none.
+    """
+    if KINDS[kind].of == "sensor":
+        x = windows.x.copy()
+        x[:, windows.onset :, i] = _reading(windows, kind, windows.x[:, :, i], size, noise)
+    elif model is None:
+        raise FitError(f"a fault '{kind}' changes how the machine moves; give the model that says how")
+    else:
+        x = _response(windows, kind, i, size, recalled, model, segment)
+    n = x.shape[2]
+    of_states = [r for r in recalled if r.of < n <= r.position < n + windows.u.shape[2]]
+    if not of_states:
+        return x, windows.u
+    u, moved, dt = windows.u.copy(), np.nan_to_num(x - windows.x), np.diff(windows.t, axis=1)
+    for r in of_states:
+        for k in range(windows.onset, x.shape[1]):
+            u[:, k, r.position - n] += _recall(r, moved[:, :, r.of], k, dt)
+    return x, u
+
+
+def _recall(recalled: Recalled, moved: Array, k: int, dt: Array) -> Array:
+    """What a memory (W,) makes at sample k of differences (W, L) of what it recalls."""
+    memory = recalled.memory
+    past = moved[:, k - memory.samples] if k >= memory.samples else np.zeros(len(moved))
+    if memory.kind == "lag":
+        return past
+    difference: Array = moved[:, k] - past
+    return difference / dt[:, k - 1] if memory.kind == "rate" and k else difference
+
+
+def _reading(windows: Windows, kind: str, true: Array, size: Array, noise: Array) -> Array:
+    """Readings (W, L - onset) of a sensor from the onset on; of an actuator likewise what it does."""
+    t, k = windows.t, windows.onset
+    after, since, size = true[:, k:], t[:, k:] - t[:, k : k + 1], size[:, None]
+    if kind in ("bias", "offset"):
+        return np.asarray(after + size)
+    if kind == "drift":
+        return np.asarray(after + size * since)
+    if kind == "scale":
+        return np.asarray(after * (1.0 + size))
+    if kind == "loss":
+        return np.asarray(after * (1.0 - size))
+    if kind == "noise":
+        return np.asarray(after + size * noise[:, k:])
+    if kind == "dropout":
+        return np.where((since < size) & np.isfinite(after), 0.0, after)
+    if kind == "spike":
+        changed = after.copy()
+        changed[:, :1] += size
+        return changed
+    if kind in ("freeze", "stuck"):
+        held = true[:, max(k - 1, 0)][:, None]
+        return np.where((since < size) & np.isfinite(after), held, after)
+    assert kind in ("sensor_delay", "actuator_delay")
+    late = np.empty_like(after)
+    for w, (row, wanted) in enumerate(zip(t, t[:, k:] - size, strict=True)):
+        late[w] = true[w, np.maximum(np.searchsorted(row, wanted + 1e-9, side="right") - 1, 0)]
+    return late
+
+
+def _response(
+    windows: Windows,
+    kind: str,
+    i: int,
+    size: Array,
+    recalled: Sequence[Recalled],
+    model: UncertainLTI,
+    segment: NDArray[np.int32] | None,
+) -> Array:
+    point = model.operating_point
+    x, u, s = point.normalise_x(windows.x), point.normalise_u(windows.u), point.normalise_s(windows.s)
+    done = windows.u.copy()
+    n, m, dt = model.n, model.m, np.diff(windows.t, axis=1)
+    of_states = [r for r in recalled if r.of < n <= r.position < n + m]
+    if KINDS[kind].of == "actuator":
+        done[:, windows.onset :, i] = _reading(windows, kind, windows.u[:, :, i], size, np.empty((0, 0)))
+        for r in recalled:
+            if r.of == n + i and n <= r.position < n + m:
+                moved = done[:, :, i] - windows.u[:, :, i]
+                for k in range(windows.onset, done.shape[1]):
+                    done[:, k, r.position - n] += _recall(r, moved, k, dt)
+    done = point.normalise_u(done)
+    broken = np.zeros(dt.shape, dtype=bool) if segment is None else np.diff(segment, axis=1) != 0
+    faster = np.where(size >= 0, 1.0 / (1.0 + np.abs(size)), 1.0 + np.abs(size))  # of the time constant: slower first
+    moved_by = np.zeros_like(x)  # the difference that the fault makes
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(windows.onset, x.shape[1] - 1):
+            before, step = x[:, k] + moved_by[:, k], dt[:, k]
+            for r in of_states:
+                at = r.position - n
+                done[:, k, at] += _recall(r, moved_by[:, :, r.of] * point.X[r.of], k, dt) / point.U[at]
+            healthy, _ = model.centre_and_half(x[:, k], u[:, k], step, s[:, k])
+            faulty, _ = model.centre_and_half(before, done[:, k], step, s[:, k])
+            if kind == "time_constant":
+                faulty = faulty.copy()
+                faulty[:, i] = before[:, i] + faster * (faulty[:, i] - before[:, i])
+            elif kind == "gain":
+                idle, _ = model.centre_and_half(before, np.zeros_like(u[:, k]), step, s[:, k])
+                faulty = faulty.copy()
+                faulty[:, i] += size * (faulty[:, i] - idle[:, i])
+            difference = faulty - healthy
+            # nothing is known of the machine across a gap: the difference stays as it was
+            unknown = broken[:, k] | ~np.isfinite(difference).all(axis=1)
+            moved_by[:, k + 1] = np.where(unknown[:, None], moved_by[:, k], difference)
+        return np.asarray(windows.x + moved_by * point.X)
