@@ -144,7 +144,7 @@ def ros(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """Nodes whose inputs are `Input`, that keep all messages, and do nothing by the time that the test takes."""
     monkeypatch.setattr(node_module, "MatchedSubscription", Input)
     given = {"heartbeat": 3600.0, "diagnostics_period": 3600.0, "snapshot.seconds": 3600.0, "snapshot.memory": 1024.0}
-    given |= {"snapshot.folder": tmp_path / "snapshots"}
+    given |= {"snapshot.folder": tmp_path / "snapshots", "catch_up": 0.0}
     arguments = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
     with own_domain() as domain:
         rclpy.init(args=["--ros-args", *arguments], domain_id=domain)

@@ -332,8 +332,8 @@ def test_statuses_group_by_node_and_hardware(world: World, tmp_path: Path) -> No
         for status in array.status:
             keys = [v.key for v in status.values]
             assert len(set(keys)) == len(keys) and status.message
-    values = Diagnostics.values(diagnostics.latest(f"rig{NODE}: monitor"))
-    assert values["verdicts"] == "29"
+    monitor = f"rig{NODE}: monitor"
+    until(lambda: Diagnostics.values(diagnostics.latest(monitor))["verdicts"] == "29", "a report on all verdicts")
 
 
 # --- what is lost on the way --------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from std_srvs.srv import Trigger
 from uncertain_lti.base.compiled import why_not
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.arming import Condition
+from uncertain_lti.monitor.catch_up import Waiting
 from uncertain_lti.monitor.event_log import EventLog
 from uncertain_lti.monitor.failures import Failures
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session
@@ -159,6 +160,8 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _swap(self, session: Session) -> None:
         """Replace the model, between two messages."""
         if self.session is not None and self.active:
+            now = time.monotonic()
+            self._take_all(self.session, self.session.release(now, all_of_them=True), now)
             session.go_on_from(self.session)
         self.session = session
         self.outputs.prepare(self.session.model.state_names)
@@ -387,19 +390,27 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _on_message(self, topic: str, data: bytes) -> None:
         if not self.active or self.session is None:
             return
+        now = time.monotonic()
         try:
-            self._take(self.session, topic, data)
+            messages = self.session.accept(topic, self._arrival(), data, now)
         except Exception as error:
             self._note_failed_message(topic, error)
+        else:
+            self._take_all(self.session, messages, now)
+
+    def _take_all(self, session: Session, messages: Sequence[Waiting], now: float) -> None:
+        for topic, arrival, data in messages:
+            try:
+                self._take(session, topic, arrival, data, now)
+            except Exception as error:
+                self._note_failed_message(topic, error)
 
     def _note_failed_message(self, topic: str, error: Exception) -> None:
         self.note_failure(f"on a message of {topic}", error)
         assert self.session is not None
         self.session.failed()
 
-    def _take(self, session: Session, topic: str, data: bytes) -> None:
-        arrival = self._arrival()
-        now = time.monotonic()
+    def _take(self, session: Session, topic: str, arrival: int, data: bytes, now: float) -> None:
         alarms, alarm = session.alarms, session.alarm
         verdicts, opened = session.take(topic, arrival, data, now)
         turned = session.alarm != alarm
@@ -437,6 +448,9 @@ class EnvelopeMonitorNode(LifecycleNode):
         for subscription in self.inputs.values():
             subscription.poll()
         self.outputs.poll()
+        if self.session is not None and self.active:
+            now = time.monotonic()
+            self._take_all(self.session, self.session.release(now), now)
         if any(s.look_soon for s in self.inputs.values()):
             self._look_around()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from uncertain_lti.monitor.catch_up import WINDOW
 from uncertain_lti_ros.arguments import Declared
 from uncertain_lti_ros.subscriptions import DEPTH, DURABILITY, RELIABILITY
 
@@ -57,6 +58,12 @@ PARAMETERS = (
         "diagnostics_period", 1.0,
         "Time between two messages on /diagnostics, s of wall time.",
         fixed=True, low=0.05, high=3600.0,
+    ),
+    Declared(
+        "catch_up", WINDOW,
+        "At the start and after a stall, samples wait this long at most, s of wall time, for topics that the "
+        "middleware delivers later than others; 0: not at all. It takes effect with the next model.",
+        low=0.0, high=10.0,
     ),
     Declared("hardware_id", "", "hardware_id in /diagnostics; empty: the name of this node.", fixed=True),
     Declared("qos.depth", DEPTH, "Messages kept per subscription until they are taken.", fixed=True, low=1, high=10**6),

@@ -70,4 +70,4 @@ def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | Non
 
         return MessageReader(type_name, paths, _type_fields, decode)
 
-    return Session(model, rule, types, _type_fields, make_reader, time.monotonic(), arming)
+    return Session(model, rule, types, _type_fields, make_reader, time.monotonic(), arming, settings.real("catch_up"))

@@ -155,6 +155,8 @@ class EventLog:
         if self._matter("arming").becomes(session.arming.on, now):
             condition = session.arming.condition or "there is no condition any more"
             self._log(OK, session.arming.why_off() or f"alarms count from now on: {condition}")
+        if session.caught_up and self._matter("catching up").becomes((session.reordered, session.caught_up), now):
+            self._log(OK, session.caught_up)
         for topic in session.types:
             if topic != session.sampler.clock:
                 self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0))

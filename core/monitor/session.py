@@ -11,6 +11,7 @@ from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Arming, Condition
+from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Waiting
 from uncertain_lti.monitor.deployed import condition_words
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.monitor.outputs import JUDGED
@@ -242,6 +243,8 @@ class Session:
         A steady time in s, as everywhere below.
     arming : Arming, optional
         Of the session before: where the condition asks for the same field, what is known of that stays.
+    catch_up : float, optional
+        How long messages wait in `accept` at most, s; 0 for not at all.
 
     Attributes
     ----------
@@ -251,6 +254,10 @@ class Session:
         Topic of the enable condition; empty without one.
     period : Period
         What has happened since the last report.
+    reordered : int
+        Messages that were taken after one that came later.
+    caught_up : str
+        What the last catching up came to, in words; empty as long as no message was put in order.
 
     Raises
     ------
@@ -269,6 +276,7 @@ class Session:
         make_reader: MakeReader,
         now: float,
         arming: Arming | None = None,
+        catch_up: float = WINDOW,
     ) -> None:
         self.model, self._model_types = model, types
         self._type_fields, self._make_reader = type_fields, make_reader
@@ -278,6 +286,10 @@ class Session:
             for topic in signals.topics
         }
         self._held = {topic: _held(model, signals.on(topic)) for topic in signals.topics}
+        stamped = [topic for topic in signals.topics if signals.time[topic] == "header"]
+        self._stamped = [topic for topic in stamped if topic != signals.clock]
+        waits = signals.clock in stamped and bool(self._stamped) and catch_up > 0.0  # arrivals are in order as they are
+        self._window, self._stall = catch_up, max(STALL, 5 * (model.sampling.dt_median or 0.0)) if waits else math.inf
         self.arming = arming if arming is not None else Arming(None, 0)
         self.latched, self.enable_topic, self.enable_type = False, "", ""
         self._follow(rule)
@@ -301,6 +313,9 @@ class Session:
         self.last: Verdict | None = None
         self._heard: dict[str, float] = {}
         self._began, self._judged = now, -math.inf
+        self._came = now
+        self._catches_up = self._catch_up(self._stamped, start=True) if math.isfinite(self._stall) else None
+        self.reordered, self.caught_up = 0, ""
         self.period = Period(now)
 
     def _start(self) -> None:
@@ -361,6 +376,9 @@ class Session:
                 continue
             for stamp, arrival, values in other.sampler.kept(topic):
                 self.sampler.push(topic, arrival, stamp or None, [values[fields[field]] for field in wanted])
+        if all(topic in self._heard for topic in self._model_types):
+            self._catches_up = None  # the stream is the same
+        self._came = other._came
         if other.enable_type and not self.enable_type and other.arming.said_on(self.arming.condition) is not None:
             self.found_enable_type(other.enable_type)
         self.latched = self.rule.latch and other.alarm
@@ -450,6 +468,78 @@ class Session:
         self._start()
         self.latched, self.sampler.counters = latched, counters
         self.failures += 1
+
+    def _catch_up(self, awaited: Sequence[str], start: bool) -> CatchUp:
+        step, max_gap = self.model.sampling.dt_median or 0.0, self.sampler.signals.max_gap
+        return CatchUp(self.sampler.clock, self._stamped, awaited, step, to_ns(max_gap), self._window, start)
+
+    def accept(self, topic: str, arrival_ns: int, data: bytes, now: float) -> Sequence[Waiting]:
+        """Receive one serialised message, and tell which messages are to be taken now.
+
+        That is this message, except at the start and after a stall, when messages wait until topics have caught
+        up with each other (`CatchUp`). Then `release` has to be called every now and then.
+
+        Parameters
+        ----------
+        topic : str
+            Its topic.
+        arrival_ns : int
+            Its arrival, ns.
+        data : bytes
+            The message.
+        now : float
+            Steady time, s.
+
+        Returns
+        -------
+        sequence of (str, int, bytes)
+            Arguments of `take`, of each message in order.
+        """
+        before, self._came = self._came, now
+        if self._catches_up is None:
+            if now - before <= self._stall:
+                return ((topic, arrival_ns, data),)
+            lately = [t for t in self._stamped if self._heard.get(t, -math.inf) >= before - self._stall]
+            self._catches_up = self._catch_up(lately, start=False)
+        stamp_ns = None
+        if topic in self._readers and self.sampler.signals.time[topic] == "header":
+            try:
+                stamp_ns = self._readers[topic].read(data)[0]
+            except UnreadableError:
+                return ((topic, arrival_ns, data),)  # it decides nothing
+            self._heard[topic] = now
+        self._catches_up.put(topic, arrival_ns, data, stamp_ns, now)
+        return self.release(now)
+
+    def release(self, now: float, all_of_them: bool = False) -> Sequence[Waiting]:
+        """Messages that need not wait any longer.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+        all_of_them : bool, default False
+            Whether those too that should wait: no more messages are accepted.
+
+        Returns
+        -------
+        sequence of (str, int, bytes)
+            Arguments of `take`, of each message in order.
+        """
+        waits = self._catches_up
+        if waits is None:
+            return ()
+        before = waits.reordered
+        released = waits.finish(now) if all_of_them else waits.ready(now)
+        self.reordered += waits.reordered - before
+        if waits.over:
+            self._catches_up = None
+            if waits.reordered:
+                self.caught_up = (
+                    f"topics arrived one after another, up to {waits.behind_ns * 1e-9:.3g} s apart; "
+                    f"{waits.reordered} messages were put in order, for which verdicts waited {waits.took:.2f} s"
+                )
+        return released
 
     def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[Sequence[Verdict], bool]:
         """Take one serialised message.
@@ -814,6 +904,7 @@ class Session:
             "window": repr(rule.window),
             "margin": repr(rule.margin),
             "late messages": str(self.late),
+            "put in order": str(self.reordered),
             "dropped": str(sum(counters[status.value] for status in Status if status.dropped)),
         }
         for name in ("samples", "gaps", "resets", "missing"):

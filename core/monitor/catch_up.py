@@ -1,0 +1,253 @@
+"""CatchUp: messages that wait, at the start and after a stall, until every topic has come as far as the others."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+from uncertain_lti.sampling.instants import to_ns
+
+WINDOW = 4.0
+"""s of steady time that messages wait at most: Fast DDS asks every 3 s for what a reliable reader has missed."""
+STALL = 0.2
+"""s without any message after which topics may arrive one after another."""
+MOST = 20_000
+"""Messages that wait at most."""
+
+_QUIET = STALL  # s that messages wait at least: a longer pause counts as another stall
+_BURST = 5  # stamps that advance this many times as fast as the steady time come in a burst
+
+Waiting = tuple[str, int, bytes]
+"""Topic, arrival in ns, and data of one message."""
+
+
+class _Progress:
+    """How far the stamps of one topic have come."""
+
+    def __init__(self) -> None:
+        self._last: deque[tuple[float, int]] = deque(maxlen=10)  # steady time and stamp of the last messages
+        self.newest = 0  # stamp, ns
+
+    def advance(self, stamp: int, now: float) -> int:
+        """Take a stamp; the step from the one before."""
+        step = stamp - self.newest if self.newest else 0
+        self.newest = stamp
+        self._last.append((now, stamp))
+        return step
+
+    @property
+    def at(self) -> float:
+        """Steady time of the last message, s."""
+        return self._last[-1][0]
+
+    def in_burst(self, messages: int) -> bool:
+        """Whether the last messages came much sooner one after the other than their steps are long."""
+        if len(self._last) < 2:
+            return False
+        then, stamp = self._last[max(0, len(self._last) - messages)]
+        return (self.at - then) * _BURST < (self.newest - stamp) * 1e-9
+
+    @property
+    def longest_step(self) -> int:
+        """Of the last stamps, ns; 0 where only one has come."""
+        stamps = [stamp for _, stamp in self._last]
+        return max((b - a for a, b in zip(stamps, stamps[1:], strict=False)), default=0)
+
+
+class CatchUp:
+    """Messages in order of arrival in, messages in an order in which no sample closes before its controls are here.
+
+    When a monitor starts, or goes on after a stall, the middleware delivers what it held back in bursts, one topic
+    after another. Messages wait here until each topic has been heard, has come as far as the clock topic, and stamps
+    advance no faster than the time; at most `longest` seconds. If topics came in bursts, messages are then released
+    by their stamps, each clock message after everything that belongs to it; otherwise as they came. The order within a
+    topic never changes. At a start there can be no verdict before every topic has been heard: until then each message
+    waits the full time, in case the missing topic arrives in a burst.
+
+    Parameters
+    ----------
+    clock : str
+        Clock topic; its time is that of its header stamps.
+    stamped : sequence of str
+        Further topics whose time is that of their header stamps.
+    awaited : sequence of str
+        Those of them that are expected to arrive.
+    step : float
+        Expected step of the clock topic, s.
+    max_gap_ns : int
+        A step back of more than this is a reset, ns.
+    longest : float
+        How long a message waits at most, s.
+    start : bool
+        Whether the monitor starts; otherwise it goes on after a stall.
+
+    Attributes
+    ----------
+    over : bool
+        Every message has been released, and none need wait any longer.
+    reordered : int
+        Messages that were released after one that came later.
+    behind_ns : int
+        How far a topic was behind the clock topic at most, ns, while it arrived in a burst.
+    took : float
+        How long the first message waited, s.
+    """
+
+    def __init__(
+        self,
+        clock: str,
+        stamped: Sequence[str],
+        awaited: Sequence[str],
+        step: float,
+        max_gap_ns: int,
+        longest: float,
+        start: bool,
+    ) -> None:
+        self._clock, self._never, self._step_ns = clock, {clock, *awaited}, to_ns(step)
+        self._longest, self._max_gap_ns, self._start = longest, max_gap_ns, start
+        self._progress = {topic: _Progress() for topic in (clock, *stamped)}
+        self._waiting: deque[tuple[int, float, int, Waiting]] = deque()  # number, steady time, stamp, message
+        self._recent: deque[tuple[float, int]] = deque()  # steady time and stamp of clock messages
+        self._number, self._began, self._heard, self._until = 0, 0.0, 0.0, math.inf
+        self._arrival_ns = -(2**63)  # of the last message released
+        self._bursts = self._stepped_back = False
+        self.over, self.reordered, self.behind_ns, self.took = False, 0, 0, 0.0
+
+    def put(self, topic: str, arrival_ns: int, data: bytes, stamp_ns: int | None, now: float) -> None:
+        """Have a message wait.
+
+        Parameters
+        ----------
+        topic : str
+            Its topic.
+        arrival_ns : int
+            Its arrival, ns.
+        data : bytes
+            The message.
+        stamp_ns : int or None
+            Its header stamp, ns; None where it has none or its topic goes by arrival.
+        now : float
+            Steady time, s.
+        """
+        if not self._number:
+            self._began, self._until = now, now + self._longest
+        self._waiting.append((self._number, now, stamp_ns or 0, (topic, arrival_ns, data)))
+        self._number += 1
+        progress = self._progress.get(topic)
+        if progress is None or not stamp_ns:
+            return
+        if topic in self._never:
+            self._never.remove(topic)
+            self._heard = now
+            if self._start:
+                self._until = now + self._longest
+        first = not progress.newest
+        self._stepped_back |= progress.advance(stamp_ns, now) < -self._max_gap_ns
+        if topic == self._clock:
+            self._recent.append((now, stamp_ns))
+            while self._recent[0][0] < now - _QUIET:
+                self._recent.popleft()
+        else:
+            clock = self._progress[self._clock].newest
+            behind = clock - stamp_ns
+            if (progress.in_burst(2) and behind > 0) or (first and clock and behind > self._step_ns):
+                self._bursts = True
+                self.behind_ns = max(self.behind_ns, behind)
+
+    def ready(self, now: float) -> list[Waiting]:
+        """Messages that need not wait any longer, in the order in which they are to be taken.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+
+        Returns
+        -------
+        list of (str, int, bytes)
+            Topic, arrival in ns, and data. An arrival is moved to just after that of the message before, where
+            a message that came later was released first.
+        """
+        full = len(self._waiting) > MOST
+        if self._never and self._start and not full:
+            return self._release(now - self._longest)
+        if full or now >= self._until or (not self._never and self._in_step(now)):
+            return self.finish(now)
+        return []
+
+    def finish(self, now: float) -> list[Waiting]:
+        """Release everything.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+
+        Returns
+        -------
+        list of (str, int, bytes)
+            As `ready`.
+        """
+        self.over, self.took = True, now - self._began if self._number else 0.0
+        return self._release(math.inf)
+
+    def _in_step(self, now: float) -> bool:
+        """Whether each topic has come as far as the clock topic, and none goes on in a burst."""
+        if now - self._heard < _QUIET:
+            return False
+        while self._recent and self._recent[0][0] < now - _QUIET:
+            self._recent.popleft()
+        if self._recent and (self._recent[-1][1] - self._recent[0][1]) * 1e-9 > _BURST * _QUIET:
+            return False
+        clock = self._progress[self._clock].newest
+        for progress in self._progress.values():
+            if not progress.newest:
+                continue
+            behind = clock - progress.newest
+            silent = now - progress.at > _QUIET and not progress.in_burst(10)  # else more is on the way
+            if behind > (progress.longest_step or self._step_ns) and not silent:
+                return False
+        return True
+
+    def _release(self, until: float) -> list[Waiting]:
+        """Those that came before a steady time, and what belongs before them."""
+        if not (self._bursts and not self._stepped_back):
+            released = []
+            while self._waiting and self._waiting[0][1] < until:
+                released.append(self._waiting.popleft()[3])
+            return released
+        by_topic: dict[str, deque[tuple[int, float, int, Waiting]]] = {}
+        for entry in self._waiting:
+            by_topic.setdefault(entry[3][0], deque()).append(entry)
+        clock = by_topic.pop(self._clock, deque())
+        order: list[tuple[int, float, int, Waiting]] = []
+        while clock and clock[0][1] < until:
+            sample = clock.popleft()
+            belonging = []
+            for entries in by_topic.values():
+                while entries and _belongs(entries[0], sample):
+                    belonging.append(entries.popleft())
+            order += sorted(belonging)  # as they came
+            order.append(sample)
+        rest = sorted([*clock, *(entry for entries in by_topic.values() for entry in entries)])
+        let_go = sum(entry[1] < until for entry in rest)  # they came in this order
+        order += rest[:let_go]
+        self._waiting = deque(rest[let_go:])
+        return self._in_order(order)
+
+    def _in_order(self, order: list[tuple[int, float, int, Waiting]]) -> list[Waiting]:
+        released, last = [], -1
+        for number, _, _, (topic, arrival_ns, data) in order:
+            self.reordered += number < last
+            last = max(last, number)
+            self._arrival_ns = max(arrival_ns, self._arrival_ns + 1)
+            released.append((topic, self._arrival_ns, data))
+        return released
+
+
+def _belongs(entry: tuple[int, float, int, Waiting], sample: tuple[int, float, int, Waiting]) -> bool:
+    """Whether a sample may choose a message: by stamps if both have one, else by arrival."""
+    if entry[2] and sample[2]:
+        return entry[2] <= sample[2]
+    return entry[3][1] <= sample[3][1]

@@ -1,0 +1,232 @@
+"""Messages that the middleware delivers late, at the start or after a stall, cost no verdict; without rclpy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from engine_bag import SIGNALS, engine_bag
+
+from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit, read_transients
+from uncertain_lti.monitor.catch_up import MOST, STALL, WINDOW, CatchUp
+from uncertain_lti.monitor.session import Rule, Session, topic_types
+from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC
+from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.message_reader import MessageReader
+from uncertain_lti.sampling.reading import read_as_fitted
+
+STEP = 0.025  # s, of the engine's recordings
+STOPPED = 4.0  # s
+Message = tuple[float, str, int, bytes]  # when it comes (s, steady), topic, log time, data
+
+
+@pytest.fixture(scope="module")
+def engine(tmp_path_factory: pytest.TempPathFactory) -> tuple[UncertainLTI, Bag]:
+    """A model of the engine and a recording of 600 samples at 40 Hz, states and controls with equal stamps."""
+    folder = tmp_path_factory.mktemp("engine")
+    (folder / "signals.yaml").write_text(SIGNALS)
+    path = engine_bag(folder / "run.mcap", 600)
+    return fit(read_transients([path], folder / "signals.yaml")), Bag(path)
+
+
+def session_of(model: UncertainLTI, bag: Bag, **options: Any) -> Session:
+    definitions = {raw.topic: raw.channel.definition for raw in bag.raw_messages(model.signals.topics)}
+    decoders = {definition.type_name: definition.decode for definition in definitions.values()}
+
+    def make_reader(type_name: str, paths: Any) -> MessageReader:
+        return MessageReader(type_name, paths, bag.fields, decoders[type_name])
+
+    return Session(model, Rule(), topic_types(model, "the model", bag.fields), bag.fields, make_reader, 0.0, **options)
+
+
+def sent(bag: Bag) -> list[Message]:
+    messages = list(bag.raw_messages([STATE_TOPIC, CONTROL_TOPIC]))
+    began = messages[0].log_time_ns
+    return [((m.log_time_ns - began) * 1e-9, m.topic, m.log_time_ns, m.data) for m in messages]
+
+
+def run(session: Session, messages: list[Message], until: float = 100.0) -> list[Any]:
+    """Verdicts of a session that gets these messages, and is asked every 0.1 s what it releases, as by the node."""
+    verdicts, now = list[Any](), 0.0
+    for at, topic, arrival_ns, data in [*messages, (until, "", 0, b"")]:
+        while now + 0.1 < at:
+            now += 0.1
+            for message in session.release(now):
+                verdicts += session.take(*message, now)[0]
+        if topic:
+            for message in session.accept(topic, arrival_ns, data, at):
+                verdicts += session.take(*message, at)[0]
+    return verdicts
+
+
+def held_up(messages: list[Message], topic: str, begin: float, until: float) -> list[Message]:
+    """Messages of a topic sent from `begin` to `until` come at its end, in a burst; a microsecond between two."""
+    moved = []
+    for at, name, log_time, data in messages:
+        come = until - 1e-3 + 1e-6 * len(moved) if name == topic and begin <= at < until else at
+        moved.append((come, name, log_time + round((come - at) * 1e9), data))
+    return sorted(moved, key=lambda m: m[0])
+
+
+def stopped(messages: list[Message], begin: float, chunk: int, first: str) -> list[Message]:
+    """Nothing is received for 4 s; then what came meanwhile does, a chunk of one topic after a chunk of the other."""
+    end = begin + STOPPED
+    late = [m for m in messages if begin <= m[0] < end]
+    by_topic = {
+        t: [m for m in late if m[1] == t] for t in sorted({STATE_TOPIC, CONTROL_TOPIC}, key=lambda t: t != first)
+    }
+    order = []
+    for at in range(0, len(late), chunk):
+        for own in by_topic.values():
+            order += own[at : at + chunk]
+    burst = [(end + 2e-5 * i, t, log + round((end - at) * 1e9), d) for i, (at, t, log, d) in enumerate(order)]
+    others = [m for m in messages if not begin <= m[0] < end]
+    return sorted([*burst, *others], key=lambda m: m[0])
+
+
+DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
+    "on time": lambda m: m,
+    "controls come 0.6 s after the states": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 0.6),
+    "controls come 3 s after the states": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 3.0),
+    "both come in bursts": lambda m: held_up(held_up(m, STATE_TOPIC, 0.0, 2.0), CONTROL_TOPIC, 0.0, 2.1),
+    "states come 0.6 s after the controls": lambda m: held_up(m, STATE_TOPIC, 0.0, 0.6),
+    "stopped, then topic by topic": lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC),
+    "stopped, then in chunks": lambda m: stopped(m, 5.01, 16, STATE_TOPIC),
+    "stopped, then in chunks, controls first": lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC),
+    "stopped, and controls 3 s later": lambda m: held_up(stopped(m, 5.01, 16, STATE_TOPIC), CONTROL_TOPIC, 5.01, 12.0),
+}
+
+
+@pytest.mark.parametrize("delay", DELAYS.values(), ids=DELAYS.keys())
+def test_every_verdict_is_that_of_the_offline_check(engine: tuple[UncertainLTI, Bag], delay: Any) -> None:
+    model, bag = engine
+    session = session_of(model, bag)
+    live = run(session, delay(sent(bag)))
+    check = EnvelopeMonitor(model).check(read_as_fitted(bag, model.signals))
+    assert session.late == 0 and session.sampler.counters["missing"] == 0
+    assert len(live) == len(check.lower) == 600
+    for name in ("lower", "upper", "utilisation"):
+        assert np.array([v.numbers(name) for v in live]).tobytes() == getattr(check, name).tobytes()
+
+
+def test_without_it_the_verdicts_are_lost(engine: tuple[UncertainLTI, Bag]) -> None:
+    model, bag = engine
+    delay = DELAYS["controls come 0.6 s after the states"]
+    session = session_of(model, bag, catch_up=0.0)
+    assert len(run(session, delay(sent(bag)))) == 600
+    assert session.late == 23 and session.sampler.counters["missing"] == 23
+
+
+def test_what_was_put_in_order_is_counted_and_told(engine: tuple[UncertainLTI, Bag]) -> None:
+    model, bag = engine
+    on_time, session = session_of(model, bag), session_of(model, bag)
+    run(on_time, sent(bag))
+    assert on_time.reordered == 0 and on_time.caught_up == ""
+    run(session, DELAYS["controls come 0.6 s after the states"](sent(bag)))
+    assert session.counts(0.0)["put in order"] == str(session.reordered) != "0"
+    assert "up to 0.575 s apart" in session.caught_up and f"{session.reordered} messages" in session.caught_up
+
+
+def test_without_a_stall_nothing_waits(engine: tuple[UncertainLTI, Bag]) -> None:
+    model, bag = engine
+    session = session_of(model, bag)
+    messages = sent(bag)
+    run(session, messages[:100], until=messages[100][0])
+    for at, topic, log_time, data in messages[100:]:
+        assert session.accept(topic, log_time, data, at) == ((topic, log_time, data),)
+
+
+def test_a_control_that_is_late_at_its_usual_pace_stays_late(engine: tuple[UncertainLTI, Bag]) -> None:
+    """As in a recording: only what comes in bursts is put in order."""
+    model, bag = engine
+    shifted = [(at + 1.5 * STEP * (t == CONTROL_TOPIC), t, log, d) for at, t, log, d in sent(bag)]
+    session = session_of(model, bag)
+    run(session, sorted(shifted, key=lambda m: m[0]))
+    assert session.late > 500 and session.reordered == 0
+
+
+def test_a_topic_that_does_not_come_back_holds_up_nothing_for_long(engine: tuple[UncertainLTI, Bag]) -> None:
+    model, bag = engine
+    messages = [m for m in stopped(sent(bag), 5.01, 16, STATE_TOPIC) if m[1] == STATE_TOPIC or m[0] < 5.0]
+    session = session_of(model, bag)
+    taken = [(0.0, 0.0)]
+    for at, topic, log_time, data in messages:
+        for message in session.accept(topic, log_time, data, at):
+            taken.append((at, session.take(*message, at)[0] and 1.0 or 0.0))
+    waits = max(b[0] - a[0] for a, b in zip(taken, taken[1:], strict=False))
+    assert STOPPED < waits <= STOPPED + WINDOW + 2 * STEP
+    assert len(taken) == len(messages) + 1
+
+
+def test_controls_that_are_sent_no_more_hold_up_nothing(engine: tuple[UncertainLTI, Bag]) -> None:
+    model, bag = engine
+    messages = [m for m in sent(bag) if m[1] == STATE_TOPIC or m[0] < 0.1]
+    session = session_of(model, bag)
+    waits = [at for at, *message in messages if not session.accept(*message, at)]
+    assert len(messages) == 604 and max(waits) < 0.1 + STALL + 2 * STEP
+
+
+def test_what_cannot_be_read_is_counted_at_once(engine: tuple[UncertainLTI, Bag]) -> None:
+    session = session_of(*engine)
+    (message,) = session.accept(STATE_TOPIC, 1, b"no message", 0.0)
+    session.take(*message, 0.0)
+    assert session.unreadable[STATE_TOPIC] == 1
+
+
+# --- CatchUp alone ------------------------------------------------------------------------------------------
+
+
+def waiting(start: bool = True, awaited: tuple[str, ...] = ("u",)) -> CatchUp:
+    return CatchUp("x", ["u"], awaited, 0.01, 10**8, WINDOW, start)
+
+
+def test_as_long_as_a_topic_was_never_heard_each_message_waits_the_full_time() -> None:
+    catch_up = waiting()
+    for k in range(10):
+        catch_up.put("x", k, b"", 10**9 + 10**7 * k, 0.01 * k)
+    assert catch_up.ready(WINDOW - 0.001) == []
+    assert [arrival for _, arrival, _ in catch_up.ready(WINDOW + 0.035)] == [0, 1, 2, 3]
+    assert not catch_up.over
+
+
+def test_memory_is_bounded() -> None:
+    catch_up = waiting()
+    for k in range(MOST + 1):
+        assert not catch_up.over
+        catch_up.put("x", k, b"", 10**9 + k, 0.0)
+    assert len(catch_up.ready(0.0)) == MOST + 1
+    assert catch_up.over
+
+
+def test_a_topic_that_is_sent_once_is_not_waited_for_again() -> None:
+    catch_up = waiting()
+    catch_up.put("u", 0, b"once", 10**8, 0.0)
+    for k in range(100):
+        catch_up.put("x", k, b"", 10**9 + 10**7 * k, 0.01 * k)
+        if released := catch_up.ready(0.01 * k):
+            break
+    assert catch_up.over and released[0] == ("u", 0, b"once")
+    assert STALL <= 0.01 * k <= STALL + 0.011
+
+
+def test_where_time_steps_back_messages_stay_as_they_came() -> None:
+    catch_up = waiting()
+    stamps = [("x", 5.0), ("x", 5.01), ("x", 1.0), ("x", 1.01), ("u", 5.0), ("u", 5.01), ("u", 1.0), ("u", 1.01)]
+    for k, (topic, stamp) in enumerate(stamps):
+        catch_up.put(topic, k, b"", round(stamp * 1e9), 1e-6 * k)
+    assert [arrival for _, arrival, _ in catch_up.finish(1.0)] == list(range(8))
+
+
+def test_arrivals_never_go_back() -> None:
+    """What is written to a snapshot in this order is read in this order."""
+    catch_up = waiting()
+    for k in range(20):
+        catch_up.put("x", 1000 + k, b"", 10**9 + 10**7 * k, 1e-6 * k)
+    for k in range(20):
+        catch_up.put("u", 2000 + k, b"", 10**9 + 10**7 * k, 1e-3 + 1e-6 * k)
+    released = catch_up.finish(1.0)
+    assert [topic for topic, _, _ in released] == ["u", "x"] * 20
+    arrivals = [arrival for _, arrival, _ in released]
+    assert arrivals == sorted(set(arrivals))
