@@ -499,8 +499,8 @@ def test_a_lagged_state_as_control_is_understood(recordings, signals_folder):
     plain = fit(read_transients(bag, signals))
     (message,) = [m for m in plain.fit_summary["messages"] if WORDS["missing"] in m]
     entry = yaml.safe_load(re.search(r"control \((\{.*\})\)", message)[1])
-    added = replace(signals.states[0], name=entry["name"], delay=entry["delay"])
-    assert (entry["topic"], entry["field"]) == (added.topic, added.field)
+    added = replace(signals.states[0], name=entry["name"], field=entry["field"])
+    assert (entry["topic"], entry["field"]) == (added.topic, f"lag({signals.states[0].field}, 1)")
     better = fit(read_transients(bag, replace(signals, controls=(*signals.controls, added))))
     assert better.fit_summary["mean_width"][0] < 0.6 * plain.fit_summary["mean_width"][0]
     found = better.fit_summary["messages"]

@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, fit
-from uncertain_lti.base.errors import ModelError, SignalError
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, fit, validate
+from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
+from uncertain_lti.proposal.memories import Remembered, memory_candidates, remember, suggest_memories
+from uncertain_lti.sampling.recall import recall, recalled, with_memories
 from uncertain_lti.sampling.sampler import Sampler
-from uncertain_lti.sampling.sampler_arrays import recall
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.memory import Memory, parse_memory
@@ -160,3 +161,57 @@ def test_a_check_takes_the_step_of_the_model() -> None:
     model = model.replace(sampling=Sampling(dt_median=0.1, step=0.1), v=np.array([0.5]))
     verdicts = EnvelopeMonitor(model).check(Transient(t, np.ones((4, 1)), np.empty((4, 0)), max_gap=1.0))
     assert verdicts.upper[1:, 0].tolist() == [1.6] * 3
+
+
+def oscillating(seed: int, blind: bool = True) -> Transient:
+    """A swing whose rate is not measured, pushed by a force, with a little noise."""
+    rng = np.random.default_rng(seed)
+    t, push = 0.05 * np.arange(900), np.repeat(rng.normal(size=18), 50)
+    x = np.zeros((900, 2))
+    for k in range(899):
+        x[k + 1, 1] = x[k, 1] + 0.05 * (-9.0 * x[k, 0] - 0.6 * x[k, 1] + push[k])
+        x[k + 1, 0] = x[k, 0] + 0.05 * x[k + 1, 1]
+    x += 1e-4 * rng.normal(size=x.shape)
+    signals = SignalMap((Signal("swing", "/s", "data"),), (Signal("push", "/u", "data"),), source="swing.yaml")
+    return Transient(t, x[:, :1] if blind else x, push, signals=signals if blind else None, max_gap=0.1)
+
+
+def test_a_memory_is_suggested_with_what_it_gains_on_left_out_data() -> None:
+    runs = [oscillating(seed) for seed in range(3)]
+    suggestion = suggest_memories(runs, additive="noise")
+    assert suggestion.facts["suggested"] == ["swing_rate"]
+    assert "{name: swing_rate, topic: /s, field: 'rate(data)'} among the controls" in suggestion.message
+    (first, *_) = suggestion.facts["memories"]
+    with_it = remember(runs, [Remembered("swing", Memory("rate"))])
+    assert with_it[0].control_names == ("push", "swing_rate") and first["width"] < 0.2
+    narrow, wide = (validate(some, additive="noise") for some in (with_it, runs))
+    widths = [np.mean([part.mean_width[0] for part in left.parts]) for left in (narrow, wide)]
+    assert widths[0] / widths[1] == pytest.approx(first["width"], rel=0.05)
+    message = next(m for m in fit(runs, additive="noise", suggest=True).fit_summary["messages"] if "memory" in m)
+    assert message == suggestion.message
+
+
+def test_no_memory_is_suggested_where_every_state_is_measured() -> None:
+    runs = [oscillating(seed, blind=False) for seed in range(2)]
+    assert not any(one.of.startswith("x") for some in memory_candidates(runs) for one in some)
+
+
+def test_what_a_transient_recalls_follows_what_was_done_to_its_states() -> None:
+    """As for a fault that is put into a recorded run."""
+    run = remember([oscillating(1)], [Remembered("swing", Memory("diff")), Remembered("push", Memory("lag", 2))])[0]
+    x = run.x.copy()
+    x[400:] += 1.0
+    changed = recalled(run.replace(x=x))
+    moved = np.flatnonzero((np.abs(np.nan_to_num(changed.u - run.u)) > 1e-9).any(axis=1))
+    assert moved.tolist() == [400] and changed.u[400, 1] - run.u[400, 1] == pytest.approx(1.0)
+    np.testing.assert_array_equal(changed.u[2:, 2], run.u[:-2, 0])
+    assert recalled(oscillating(1).replace(signals=None, state_names=["y"], control_names=["u"])).u.shape == (900, 1)
+
+
+@pytest.mark.parametrize(
+    ("memories", "words"),
+    [({"m": ("swin", Memory("lag"))}, "is swing meant"), ({"push": ("swing", Memory("lag"))}, "already")],
+)
+def test_a_memory_of_nothing_or_under_a_taken_name_is_refused(memories: dict[str, object], words: str) -> None:
+    with pytest.raises(TransientError, match=words):
+        with_memories(oscillating(1), memories)  # type: ignore[arg-type]

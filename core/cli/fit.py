@@ -60,7 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-suggest",
         action="store_true",
-        help="do not try, on a part of the recordings (some 4000 transitions), whether a schedule would pay",
+        help="do not try, on a part of the recordings (some 4000 transitions), whether a schedule, or lags and "
+        "rates, would pay",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(

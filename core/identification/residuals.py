@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.english import plural
 from uncertain_lti.identification.excitation import DETERMINED, certainty_of, successive, unexplained
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.signals.memory import Memory
 from uncertain_lti.signals.signal_map import Signal
 
 Array = NDArray[np.float64]
@@ -193,7 +194,7 @@ def missing(known: Residuals, signals: Sequence[Signal], states: Collection[int]
         how = "alternates" if first and one < 0 else "follows"
         what = "a state that moves it, or a swing faster than the samples show," if one < 0 else "a state that moves it"
         entry = (
-            f"{{name: {signal.name}_before, topic: {signal.topic}, field: '{signal.field}', delay: 1}}"
+            f"{{name: {signal.name}_before, topic: {signal.topic}, field: '{Memory('lag').of(signal.field)}'}}"
             if signal.topic
             else "the same column, one row later"
         )
@@ -201,7 +202,7 @@ def missing(known: Residuals, signals: Sequence[Signal], states: Collection[int]
             f"what one step leaves unexplained of '{signal.name}' {how} from sample to sample (autocorrelation "
             f"{one if first else two:.2f} at {'one sample' if first else 'two samples'}): {what} is not among the "
             f"signals. Its value one sample earlier explains {1 - 1 / known.gain[i]:.0%} of it (root "
-            f"mean square); add that as a control ({entry}), or its measured rate as a state"
+            f"mean square); add that as a control ({entry}), or its rate, measured or as `rate(...)` of the field"
         )
     return messages
 

@@ -17,6 +17,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.proposal.memories import suggest_memories
 from uncertain_lti.proposal.scheduling import choose_knots, knots_of
 from uncertain_lti.proposal.suggestion import suggest_schedule
 from uncertain_lti.sampling.transient import Transient
@@ -93,8 +94,9 @@ def fit(
     groups : sequence or str, optional
         What is left out together, for "auto" and `suggest`: one name per recording, or a key, as in `validate`.
     suggest : bool, default False
-        Try, where no schedule is asked for, whether one would pay, on a part of the recordings (`suggest_schedule`).
-        The answer is among the messages, its tables in `model.fit_summary["suggestion"]`.
+        Try, where no schedule is asked for, whether one would pay, or a lag, rate or difference of a signal, on a part
+        of the recordings (`suggest_schedule`, `suggest_memories`). The answer is among the messages, its tables in
+        `model.fit_summary["suggestion"]`.
 
     Returns
     -------
@@ -160,9 +162,10 @@ def fit(
         if transient_weights is not None or not _per_state(weights):
             added["suggestion"] = {"not_done": "the weights belong to the samples, of which a part is looked at"}
         else:
+            memories = suggest_memories(transients, groups, progress, **options)
             suggestion = suggest_schedule(transients, groups, progress, **options)
-            added["suggestion"] = suggestion.facts
-            messages += [suggestion.message] if suggestion.message else []
+            added["suggestion"] = {**suggestion.facts, "memory": memories.facts}
+            messages += [found.message for found in (memories, suggestion) if found.message]
     if added or messages:
         there = model.fit_summary.get("messages", [])
         model = model.replace(fit_summary={**model.fit_summary, **added, "messages": [*there, *messages]})

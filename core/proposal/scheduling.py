@@ -250,7 +250,7 @@ class Trials:
         model = fit(transients, schedule=self.others, describe_data=False, **options)
         self._baseline: Validation | None = None
         try:
-            self.fold = _fold(transients, groups, model, folds)
+            self.fold = fold_of(transients, groups, model, folds)
         except FitError as error:
             self.fold = Fold(None, None, None, "recording")
             self.base = Candidate(1, model, str(error))
@@ -372,8 +372,27 @@ def knots_of(model: UncertainLTI, signal: str) -> list[float]:
     return [value for axis, values in at if axis.signal == signal for value in values.tolist()]
 
 
-def _fold(transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI, folds: int) -> Fold:
-    """What is left out at a time."""
+def fold_of(
+    transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI, folds: int
+) -> Fold:
+    """What is left out at a time.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    groups : sequence or str, optional
+        As in `validate`.
+    base : UncertainLTI
+        Fitted to all of them; its time constants give the guard interval between blocks of a single recording.
+    folds : int
+        Times that something is left out, at most.
+
+    Returns
+    -------
+    Fold
+        The same for every candidate.
+    """
     names, _ = resolve_groups(transients, groups)
     if not names and len(transients) == 1:
         usable = int(transients[0].usable.sum())

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from uncertain_lti.sampling.angles import TURN, nearest_branch
 from uncertain_lti.sampling.counters import INVALID, LATE, MISSING, TOO_OLD, Counters
 from uncertain_lti.sampling.instants import to_ns
+from uncertain_lti.sampling.recall import recall
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
@@ -331,35 +332,6 @@ class _Sampling:
         held[:-1] = z[: max(count - 1, 0), self.n :]
         held[:-1][back[1:count]] = math.nan
         return Samples(instants[:count].copy(), x, held, self.counters)
-
-
-def recall(values: Values, memory: Memory, dt: Values, opens: Mask) -> Values:
-    """What each sample takes from the samples up to it, as the `Sampler` has it.
-
-    Parameters
-    ----------
-    values : array (N,)
-        Of the field itself.
-    memory : Memory
-        What is taken.
-    dt : array (N,)
-        Step that leads to each sample, s; that of the first of a segment does not count.
-    opens : array of bool (N,)
-        The first sample of each segment.
-
-    Returns
-    -------
-    array (N,)
-        NaN where the segment has too few samples before.
-    """
-    place = np.arange(len(values))
-    begin = np.maximum.accumulate(np.where(opens, place, 0)) if len(values) else place
-    source = place - memory.samples
-    past = np.where(source >= begin, values[np.maximum(source, 0)], math.nan)
-    if memory.kind == "lag":
-        return past
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return values - past if memory.kind == "diff" else (values - past) / dt
 
 
 def _latest(time: Integers, at: Integers, arrived: Integers) -> Integers:

@@ -191,13 +191,14 @@ class Transient:
         part : slice, optional
             Samples; a part has neither counters nor notes of its own. Default all.
         **changes : object
-            Constructor arguments by name.
+            Constructor arguments by name; x and u with as many rows as the part.
 
         Returns
         -------
         Transient
             A new transient.
         """
+        x, u = (changes.pop(name, getattr(self, name)[part]) for name in ("x", "u"))
         arguments: dict[str, Any] = {
             "s": self.s[part],
             "step": self.step or "recorded",
@@ -215,10 +216,7 @@ class Transient:
         if changes.get("signals") is not None:  # it has the names
             for which in ("state_names", "control_names", "scheduling_names"):
                 arguments[which] = changes.get(which)
-        t, x, u = (
-            arguments.pop(key, getattr(self, name)[part]) for key, name in (("t", "t_ns"), ("x", "x"), ("u", "u"))
-        )
-        return Transient(t, x, u, **arguments)
+        return Transient(self.t_ns[part], x, u, **arguments)
 
     @property
     def t(self) -> Array:

@@ -551,7 +551,12 @@ def _cases(model: UncertainLTI, parts: Sequence[Part], within: float, cases: int
         np.repeat([unit for _, unit, _, _ in chosen], counts),
         np.repeat([numbers[id(part.model)] for part, *_ in chosen], counts),
         tuple(EnvelopeMonitor(m.replace(alarm=model.alarm)) for m in models.values() if m is not None),
-        {"name": "cases", "max_gap": (int(np.diff(times, axis=1).max()) + 1) * 1e-9, **names},
+        {
+            "name": "cases",
+            "max_gap": (int(np.diff(times, axis=1).max()) + 1) * 1e-9,
+            "step": first.step or "recorded",
+            **names,
+        },
         step,
     )
 
