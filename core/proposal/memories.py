@@ -170,9 +170,6 @@ def suggest_memories(
     """
     if options.get("structure") is not None or options.get("operating_point") is not None:
         return Suggestion({"not_done": "structure or operating point are for the signals as they are"}, "")
-    signals = transients[0].signals
-    if signals is not None and signals.structure:
-        return Suggestion({"not_done": "the structure is for the signals as they are"}, "")
     sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), options.get("additive") or "noise")
     if not sets:
         return Suggestion({"memories": []}, "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,8 +89,18 @@ def with_memories(transient: Transient, memories: Mapping[str, tuple[str, Memory
     u = np.column_stack([transient.u, *columns])
     if transient.signals is not None:
         signals = replace(transient.signals, controls=(*transient.signals.controls, *added))
+        signals = replace(signals, structure=_with_rules(signals.structure, memories))
         return transient.replace(u=u, signals=signals)
     return transient.replace(u=u, control_names=(*transient.control_names, *memories))
+
+
+def _with_rules(structure: Any, memories: Mapping[str, tuple[str, Memory]]) -> Any:
+    """Rules of a signals file, with those that a signal has no effect said of its memories, too."""
+    if not isinstance(structure, list):
+        return structure
+    nothing = [r for r in structure if isinstance(r, dict) and (r.get("nominal"), r.get("half_width")) == (0, 0)]
+    more = [{**r, "from": name} for name, (of, _) in memories.items() for r in nothing if r.get("from") == of]
+    return [*structure, *more] if more else structure
 
 
 def recalled(transient: Transient) -> Transient:

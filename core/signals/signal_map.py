@@ -19,6 +19,7 @@ from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti.signals.file_values import checked_mapping, checked_number, kind_in_yaml, load_yaml
 from uncertain_lti.signals.memory import LONGEST_DELAY, Memory, parse_memory
 from uncertain_lti.signals.table_layout import TableLayout
+from uncertain_lti.signals.templates import expand
 
 Number = float | Literal["auto"]
 
@@ -546,6 +547,7 @@ class SignalMap:
                     f"{source}: topics: {topic}: time is {reprlib.repr(source_of_time)}; write header or log"
                 )
             time[topic] = source_of_time
+        top = expand(top, source)
         top = top | _with_memories(top)
         additive = top.get("additive")
         if additive not in (None, *CHOICES):
