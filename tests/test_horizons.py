@@ -8,12 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
+from uncertain_lti.base import compiled
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Horizon
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, SHAPES
+from uncertain_lti.sampling.sampler import Sampler, Step
+from uncertain_lti.sampling.status import Status
+from uncertain_lti.signals.signal_map import Signal
 
 pytestmark = pytest.mark.numpy
 
@@ -98,3 +105,140 @@ def test_format_1_has_no_horizons() -> None:
     }
     with pytest.raises(ModelError, match="unknown field 'horizons'"):
         UncertainLTI.from_dict(data)
+
+
+# --- the same bits live and offline, compiled or not --------------------------------------------------------------
+
+PURE = compiled.uncompiled("model.bounds")
+TICK = 10_000_000  # ns
+GEAR = Axis("gear", modes=(1.0, 2.0))
+SCHEDULES = [None, SPEED, Schedule((GEAR,)), Schedule((SPEED.axes[0], GEAR))]
+
+
+@st.composite
+def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
+    """A run with gaps, resets, dropped messages, NaN, long steps, other modes: as a transient, and by the Sampler."""
+    n, m = draw(st.integers(1, 3)), draw(st.integers(0, 2))
+    schedule = draw(st.sampled_from(SCHEDULES))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    steps = rng.choice([1, 2, 0, 4, 9, -1, -30], size=draw(st.integers(0, 120)), p=[0.9, *[0.1 / 6] * 6])
+    t = 1000 * TICK + TICK * np.cumsum(np.array([0, *steps], dtype=np.int64))
+    gear = schedule is not None and GEAR in schedule.axes
+    z = rng.normal(size=(len(t), n + m + gear))
+    if gear:
+        z[:, -1] = rng.choice([1.0, 2.0, 3.0], size=len(t) // 20 + 1, p=[0.45, 0.45, 0.1]).repeat(20)[: len(t)]
+    z[rng.uniform(size=z.shape) < draw(st.sampled_from([0.0, 0.01]))] = np.nan
+    signals = SignalMap(
+        tuple(Signal(f"x{i + 1}", "/c", f"x{i}", float(rng.normal()), float(rng.uniform(0.5, 2))) for i in range(n)),
+        tuple(Signal(f"u{j + 1}", "/c", f"u{j}", float(rng.normal()), float(rng.uniform(0.5, 2))) for j in range(m)),
+        (Signal("gear", "/c", "gear"),) * gear,
+        clock="/c",
+        max_gap=0.05,
+        time={"/c": "header"},
+    )
+    blocks = None if schedule is None else schedule.blocks
+    one = horizon(rng, 2, blocks, n, m)
+    lengths = draw(st.lists(st.sampled_from([2, 3, 5, 12, 70]), min_size=1, max_size=3, unique=True))
+    model = UncertainLTI(
+        **{name: getattr(one, name) for name in ARRAYS},
+        schedule=schedule,
+        signals=signals,
+        sampling=Sampling("/c", time={"/c": "header"}, max_gap=0.05, dt_min=0.01, dt_max=0.015),
+        horizons=[horizon(rng, h, blocks, n, m) for h in lengths],
+    )
+    sampler = Sampler(signals)
+    pushed = [s for k in range(len(t)) for s in sampler.push("/c", int(t[k]), int(t[k]), z[k].tolist())]
+    transient = Transient(t, z[:, :n], z[:, n : n + m], s=z[:, n + m :], signals=signals, max_gap=0.05)
+    return model, transient, pushed
+
+
+def pure() -> pytest.MonkeyPatch:
+    patch = pytest.MonkeyPatch()
+    for name in ("Judge", "Runs"):
+        patch.setattr(f"uncertain_lti.model.uncertain_lti.{name}", getattr(PURE, name))
+    return patch
+
+
+@settings(max_examples=60, deadline=None)
+@given(streams())
+def test_a_stream_has_the_utilisations_of_its_transient(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
+    """Through gaps, resets, dropped messages, missing values, steps out of range and changes of mode."""
+    model, transient, steps = case
+    whole = EnvelopeMonitor(model).check(transient).horizon_utilisation
+    again = live(model, steps)
+    assert again.tobytes() == whole.tobytes()
+    patch = pure()
+    try:
+        assert live(model, steps).tobytes() == whole.tobytes()
+        assert EnvelopeMonitor(model).check(transient).horizon_utilisation.tobytes() == whole.tobytes()
+    finally:
+        patch.undo()
+
+
+def live(model: UncertainLTI, steps: list[Step]) -> Any:
+    monitor = EnvelopeMonitor(model)
+    verdicts = [(step, monitor.judge(step)) for step in steps]
+    for step, verdict in verdicts:
+        assert not step.status.dropped or np.isnan(verdict.horizon_utilisation).all()
+        assert verdict.horizon_utilisation[0].tobytes() == verdict.utilisation.tobytes()
+    kept = [verdict.horizon_utilisation for step, verdict in verdicts if not step.status.dropped]
+    return np.array(kept).reshape(len(kept), len(model.horizons) + 1, model.n)
+
+
+@settings(max_examples=40, deadline=None)
+@given(streams())
+def test_windows_are_those_of_the_rules_worked_out_naively(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
+    """Which windows count, and the run and its envelope, one number after another."""
+    model, transient, _ = case
+    verdicts = EnvelopeMonitor(model).check(transient)
+    table, point, n, m = verdicts.horizon_utilisation, model.operating_point, model.n, model.m
+    kinds = verdicts.statuses()
+    z = (np.hstack([transient.x, transient.u, transient.s]) - point.steady) / point.scale
+    axes = () if model.schedule is None else model.schedule.axes
+    modes = [z[:, i] for axis, i in zip(axes, model.scheduling_positions, strict=True) if axis.modes]
+    dt = np.diff(transient.t_ns) * 1e-9
+
+    def blended(arrays: Any, name: str, k: int) -> Any:
+        values = getattr(arrays, name)
+        if model.schedule is None:
+            return values
+        places, weights = (a[:, 0] for a in model.schedule.corners(z[k][list(model.scheduling_positions)][:, None]))
+        total = values[places[0]] * weights[0]
+        for place, weight in zip(places[1:], weights[1:], strict=True):
+            total = total + values[place] * weight
+        return total
+
+    def summed(rows: Any, numbers: Any, absolute: bool = False) -> list[float]:
+        found = []
+        for row in rows.tolist():
+            total = row[0] * (abs(numbers[0]) if absolute else numbers[0])
+            for a, b in zip(row[1:], numbers[1:], strict=True):
+                total += a * (abs(b) if absolute else b)
+            found.append(total)
+        return found
+
+    for end in range(len(transient)):
+        for j, one in enumerate(model.horizons, 1):
+            begin = end - one.steps
+            inner = range(begin + 1, end + 1)
+            whole = begin >= 0 and all(kinds[k] is Status.OK for k in inner)
+            whole = whole and all(len(set(mode[begin:end])) == 1 for mode in modes)
+            assert np.isnan(table[end, j]).all() != whole
+            if not whole or one.steps > 5:
+                continue
+            x, total, mean = z[begin, :n].tolist(), 0.0, [0.0] * m
+            for k in range(begin, end):
+                step = float(dt[k])
+                rows = np.hstack([blended(model, "A", k), blended(model, "B", k), blended(model, "c", k)[:, None]])
+                rate = summed(rows, [*x, *z[k, n : n + m].tolist(), 1.0])
+                x = [r * step + a for r, a in zip(rate, x, strict=True)]
+                total += step
+                mean = [a + float(u) * step for a, u in zip(mean, z[k, n : n + m], strict=True)]
+            phi = [*z[begin, :n].tolist(), *(a / total for a in mean), 1.0]
+            part = {name: blended(one, name, begin) for name in ARRAYS}
+            rate = summed(np.hstack([part["A"], part["B"], part["c"][:, None]]), phi)
+            spread = summed(np.hstack([part["dA"], part["dB"], part["dc"][:, None]]), phi, absolute=True)
+            centre = [r * total + a for r, a in zip(rate, x, strict=True)]
+            half = [r * total + float(a) for r, a in zip(spread, part["v"], strict=True)]
+            expected = [float((z[end, i] - centre[i]) / half[i]) for i in range(n)]
+            assert table[end, j].tolist() == expected

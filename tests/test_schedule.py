@@ -58,6 +58,11 @@ def test_two_signals_multiply_their_weights_with_the_first_slowest() -> None:
     assert both.corners(s)[0].shape == (4, 50)
 
 
+def test_two_signals_without_a_sample_have_no_corners() -> None:
+    places, weights = Schedule((SPEED, GEAR)).corners(np.zeros((2, 0)))
+    assert places.shape == weights.shape == (2, 0)
+
+
 def test_a_missing_value_has_no_weights() -> None:
     assert np.isnan(Schedule((SPEED,)).weights(np.array([[np.nan]]))).all()
 

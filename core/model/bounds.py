@@ -438,7 +438,7 @@ def blended(blocks: Any, places: Any, weights: Any) -> Any:
 
 
 def centre_and_half(
-    theta: Any, delta: Any, v: Any, phi: Any, dt: Any, places: Any = None, weights: Any = None
+    theta: Any, delta: Any, v: Any, phi: Any, dt: Any, places: Any = None, weights: Any = None, base: Any = None
 ) -> tuple[Any, Any]:
     """Centre and half-width of the bounds of K samples at once.
 
@@ -456,6 +456,8 @@ def centre_and_half(
         Blocks that hold at each sample, of a scheduled model.
     weights : array (C, K), optional
         Their weights.
+    base : array (n, K), optional
+        What the rates are added to, over a horizon the run of the nominal model; default the states.
 
     Returns
     -------
@@ -473,11 +475,13 @@ def centre_and_half(
         v = blended(v, places, weights)
     rate = ordered_sum(theta, columns)
     spread = ordered_sum(delta, np.abs(columns))
-    return centre_of(phi[: len(v)], dt, rate), half_of(dt, spread, v)
+    return centre_of(phi[: len(v)] if base is None else base, dt, rate), half_of(dt, spread, v)
 
 
 LOWER, UPPER, UTILISATION, RESIDUAL, FLAGS = range(5)
 """What a `Judgement` holds of each state."""
+_TOGETHER = 64  # runs that one compiled loop advances: they stay in the cache
+_FEW = 8192  # runs that one numpy operation advances
 
 
 @cython.cclass
@@ -612,6 +616,8 @@ class Judge:
     _all_theta: cython.double[::1]  # block after block; the three above hold what is blended from them
     _all_delta: cython.double[::1]
     _all_v: cython.double[::1]
+    _rates: cython.double[::1]
+    _together: cython.Py_ssize_t
 
     def __init__(
         self,
@@ -682,9 +688,12 @@ class Judge:
             flat = np.zeros(1, bool) if occupied is None else occupied
             self._occupied = bytearray(np.ascontiguousarray(flat, dtype=np.uint8).tobytes())
             self._place = array("i", bytes(4 * self.size))
+            self._together = _TOGETHER
+            self._rates = _doubles(np.zeros(self.n * _TOGETHER))
         else:
             both = np.stack([np.swapaxes(theta, -1, -2), np.swapaxes(delta, -1, -2)], axis=-2)
             self._both = np.ascontiguousarray(both)  # (p, 2, n), or (R, p, 2, n)
+            self._nominal = np.ascontiguousarray(np.swapaxes(theta, -1, -2))  # (p, n), or (R, p, n)
             self._schedule, self._known = schedule, known
             self._positions = list(positions)
             self._phi = np.stack([one, one])[:, :, None].transpose(1, 0, 2).copy()  # (p, 2, 1): phi and psi
@@ -931,10 +940,399 @@ class Judge:
                     rate[i] += theta[j * n + i] * value
                     spread[i] += delta[j * n + i] * size
 
+    def advance(
+        self, x: Any, time: Any, control: Any, z: Any, dt: Any, begin: Any, a: cython.Py_ssize_t, b: cython.Py_ssize_t
+    ) -> None:
+        """Take runs of the nominal model from a steps to b, the run k being the one that begins at transition k.
+
+        Of a transition at which a run may not go on, what is computed for that run has no meaning.
+
+        Parameters
+        ----------
+        x : array (n, N)
+            State of each run after a steps, normalised; takes the result.
+        time : array (N,)
+            Σ Δt of the steps so far, s; takes the result.
+        control : array (m, N)
+            Σ Δt u of the steps so far; takes the result.
+        z : array (n + m + q, N)
+            Normalised [x; u; s] of the transitions, in order of time.
+        dt : array (N,)
+            s.
+        begin : array of int64 (N,)
+            Of each transition the first of those that follow one another without a break up to it.
+        a, b : int
+            Steps done, and to be done.
+
+        Raises
+        ------
+        ValueError
+            The arrays do not fit one another.
+        """
+        n, count = self.n, len(dt)
+        fits = x.shape == (n, count) and z.shape == (self.total, count) and control.shape == (self.size - n, count)
+        if not (fits and len(time) == len(begin) == count and 0 <= a <= b):
+            raise ValueError("the runs do not fit the transitions")
+        if cython.compiled:
+            whole = x.flags.c_contiguous and control.flags.c_contiguous and time.flags.c_contiguous
+            if not (whole and begin.dtype == np.int64):
+                raise ValueError("the runs are not laid out row by row")
+            rows = np.ascontiguousarray(z.T, dtype=np.float64).reshape(-1)
+            controls = control.reshape(-1) if control.size else np.zeros(1)
+            if count:
+                self._advance_all(x.reshape(-1), time, controls, rows, np.array(dt, dtype=np.float64), begin, a, b)
+        else:
+            with np.errstate(over="ignore", invalid="ignore"):
+                self._advance_arrays(x, time, control, z, dt, a, b)
+
+    def _advance_arrays(self, x: Any, time: Any, control: Any, z: Any, dt: Any, a: int, b: int) -> None:
+        """`_advance_all` by numpy, step after step."""
+        if cython.compiled:
+            return  # not called there
+        count = len(dt)
+        for j in range(a, b):
+            for first in range(0, count - j, _FEW):
+                runs = slice(first, min(first + _FEW, count - j))
+                at = slice(runs.start + j, runs.stop + j)
+                self._advance_columns(x[:, runs], time[runs], control[:, runs], z[:, at], dt[at])
+
+    def _advance_columns(self, x: Any, time: Any, control: Any, z: Any, dt: Any) -> None:
+        """One step of runs in columns (n, K), each by the transition beside it, z (n + m + q, K or 1)."""
+        if cython.compiled:
+            return  # not called there
+        u = z[self.n : self.size]
+        ones = np.ones((self.p - self.size, x.shape[1]))
+        phi = np.concatenate([x, np.broadcast_to(u, (len(u), x.shape[1])), ones])
+        theta = self._nominal[..., None]
+        if self._schedule is not None:
+            theta = blended(self._nominal, *self._schedule.corners(z[self._positions]))
+        rate = ordered_sum(theta, phi[:, None, :])
+        x[:] = centre_of(x, dt, rate)
+        time += dt
+        control += u * dt
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    def _advance_all(
+        self,
+        x: cython.double[::1],
+        time: cython.double[::1],
+        control: cython.double[::1],
+        rows: cython.double[::1],
+        dt: cython.double[::1],
+        begin: cython.longlong[::1],
+        a: cython.Py_ssize_t,
+        b: cython.Py_ssize_t,
+    ) -> cython.void:
+        """`advance`, transition after transition, each blended once for all the runs that it takes further."""
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        low: cython.Py_ssize_t
+        count: cython.Py_ssize_t = dt.shape[0]
+        for i in range(count):
+            low = begin[i] if begin[i] > i - b + 1 else i - b + 1
+            low = low if low > 0 else 0
+            if low > i - a:
+                continue
+            for j in range(self.size):
+                self._phi[j] = rows[i * self.total + j]
+            for j in range(self.size, self.total):
+                self._z[j] = rows[i * self.total + j]
+            if self._axes:
+                self._blend()
+            self._advance(x, time, control, count, low, i - a + 1, dt[i])
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _advance(
+        self,
+        x: cython.double[::1],
+        time: cython.double[::1],
+        control: cython.double[::1],
+        stride: cython.Py_ssize_t,
+        low: cython.Py_ssize_t,
+        high: cython.Py_ssize_t,
+        dt: cython.double,
+    ) -> cython.void:
+        """One step of the runs low to high - 1 by the transition in `_phi`, with its elements in `_theta`."""
+        n: cython.Py_ssize_t = self.n
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        k: cython.Py_ssize_t
+        width: cython.Py_ssize_t
+        most: cython.Py_ssize_t = self._together
+        value: cython.double
+        rate: cython.p_double
+        state: cython.p_double
+        theta: cython.p_double = cython.address(self._theta[0])
+        while low < high:
+            width = high - low if high - low < most else most
+            for i in range(n):
+                rate = cython.address(self._rates[i * most])
+                state = cython.address(x[low])
+                value = theta[i]
+                for k in range(width):
+                    rate[k] = value * state[k]
+                for j in range(1, n):
+                    state = cython.address(x[j * stride + low])
+                    value = theta[j * n + i]
+                    for k in range(width):
+                        rate[k] += value * state[k]
+                for j in range(n, self.p):
+                    value = theta[j * n + i] * self._phi[j]
+                    for k in range(width):
+                        rate[k] += value
+            for i in range(n):
+                rate = cython.address(self._rates[i * most])
+                state = cython.address(x[i * stride + low])
+                for k in range(width):
+                    state[k] = centre_of(state[k], dt, rate[k])
+            state = cython.address(time[low])
+            for k in range(width):
+                state[k] += dt
+            for j in range(n, self.size):
+                value = self._phi[j] * dt
+                state = cython.address(control[(j - n) * stride + low])
+                for k in range(width):
+                    state[k] += value
+            low += width
+
+
+@cython.cclass
+class Runs:
+    """Runs of the nominal model, one from each measured state, and what the horizons say of the states they lead to.
+
+    Parameters
+    ----------
+    judge : Judge
+        Of the model.
+    horizons : sequence of Horizon
+        Envelopes after a number of steps, the shortest first; at least one.
+
+    Attributes
+    ----------
+    count : int
+        Number of horizons.
+    """
+
+    count = cython.declare(cython.Py_ssize_t, visibility="readonly")
+    _judge = cython.declare(Judge)
+    _longest: cython.Py_ssize_t
+    _under_way: cython.Py_ssize_t  # runs, in the first places
+    _newest: cython.Py_ssize_t
+    _steps: cython.longlong[::1]
+    _x: cython.double[::1]  # state of each run, row by row
+    _time: cython.double[::1]
+    _control: cython.double[::1]
+    _start: cython.double[::1]  # state at which each run began
+    _places: cython.longlong[::1]  # blocks that held there, four of each run
+    _weights: cython.double[::1]
+    _modes: cython.double[::1]
+    _theta: cython.double[::1]  # horizon after horizon, block after block, column after column
+    _delta: cython.double[::1]
+    _v: cython.double[::1]
+    _one_theta: cython.double[::1]
+    _one_delta: cython.double[::1]
+    _one_v: cython.double[::1]
+    _rate: cython.double[::1]
+    _spread: cython.double[::1]
+    _mean: cython.double[::1]
+    _blank = cython.declare(object)
+
+    def __init__(self, judge: Judge, horizons: Sequence[Any]) -> None:
+        n, m = judge.n, judge.size - judge.n
+        self._judge, self.count = judge, len(horizons)
+        tables = [horizon.tables for horizon in horizons]
+        lead = () if judge.blocks == 1 and tables[0][0].ndim == 2 else (judge.blocks,)
+        steps = [horizon.steps for horizon in horizons]
+        fits = [theta.shape == (*lead, n, judge.p) and v.shape == (*lead, n) for theta, _, v in tables]
+        if not (all(fits) and steps == sorted(steps)):
+            raise ValueError("the horizons do not fit the model")
+        self._longest = longest = steps[-1]
+        if cython.compiled:
+            self._steps = array("q", steps)
+            self._x, self._time = _doubles(np.zeros(n * longest)), _doubles(np.zeros(longest))
+            self._control, self._start = _doubles(np.zeros(m * longest or 1)), _doubles(np.zeros(n * longest))
+            self._places, self._weights = array("q", bytes(32 * longest)), _doubles(np.zeros(4 * longest))
+            self._modes = _doubles(np.zeros(2))
+            columns = [[np.swapaxes(a, -1, -2) for a in table[:2]] for table in tables]
+            self._theta = _doubles(np.stack([theta for theta, _ in columns]))
+            self._delta = _doubles(np.stack([delta for _, delta in columns]))
+            self._v = _doubles(np.stack([v for *_, v in tables]))
+            self._one_theta, self._one_delta = _doubles(np.zeros(n * judge.p)), _doubles(np.zeros(n * judge.p))
+            self._one_v, self._mean = _doubles(np.zeros(n)), _doubles(np.zeros(m or 1))
+            self._rate, self._spread = _doubles(np.zeros(n)), _doubles(np.zeros(n))
+            self._blank = array("d", np.full(self.count * n, np.nan).tobytes())
+        else:
+            self._steps, self._tables = steps, tables
+            self._x, self._time = np.zeros((n, longest)), np.zeros(longest)
+            self._control, self._start = np.zeros((m, longest)), np.zeros((n, longest))
+            self._vectors = np.zeros((len(judge._positions), longest))
+        self.reset()
+
+    def reset(self) -> None:
+        """End every run: what comes next does not follow what was before."""
+        self._under_way = 0
+        self._newest = -1
+
+    def push(self, before: Sequence[float], after: Sequence[float], dt: cython.double) -> Any:
+        """Begin a run, take all a step further, and compare those that have gone far enough with the state there.
+
+        Parameters
+        ----------
+        before : sequence of float (n + m + q,)
+            As of `Judge.judge`, which must have judged this transition just before.
+        after : sequence of float (n,)
+            As there.
+        dt : float
+            Δt_k, s.
+
+        Returns
+        -------
+        buffer of doubles (horizons n,)
+            Utilisation of each state by each horizon, horizon after horizon; NaN where no run has gone so far.
+        """
+        if cython.compiled:
+            return self._one(after, dt)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._of_arrays(before, after, dt)
+
+    def _of_arrays(self, before: Sequence[float], after: Sequence[float], dt: float) -> Any:
+        """`_one` by numpy."""
+        if cython.compiled:
+            return None  # not called there
+        judge, n = self._judge, self._judge.n
+        z = normalised(np.array([*before, *after], dtype=np.float64), judge._steady, judge._scale)
+        z, x_next, s = z[:-n, None], z[-n:], z[judge._positions]
+        schedule = judge._schedule
+        if schedule is not None and self._under_way:
+            modes = [bool(axis.modes) for axis in schedule.axes]
+            if (s != self._vectors[:, self._newest])[modes].any():
+                self.reset()
+        self._newest = newest = (self._newest + 1) % self._longest
+        self._under_way = min(self._under_way + 1, self._longest)
+        self._x[:, newest] = self._start[:, newest] = z[:n, 0]
+        self._time[newest], self._control[:, newest], self._vectors[:, newest] = 0.0, 0.0, s
+        judge._advance_columns(self._x, self._time, self._control, z, dt)
+        found = np.full((self.count, n), np.nan)
+        for values, steps, (theta, delta, v) in zip(found, self._steps, self._tables, strict=True):
+            if steps > self._under_way:
+                break
+            k = (newest - steps + 1) % self._longest
+            run = slice(k, k + 1)
+            time = self._time[run]
+            ones = np.ones((judge.p - judge.size, 1))
+            phi = np.concatenate([self._start[:, run], self._control[:, run] / time, ones])
+            places, weights = (None, None) if schedule is None else schedule.corners(self._vectors[:, run])
+            centre, half = centre_and_half(theta, delta, v, phi, time, places, weights, self._x[:, run])
+            values[:] = utilisation_of(x_next - centre[:, 0], half[:, 0])
+        return array("d", found.tobytes())
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    def _one(self, after: Any, dt: cython.double) -> Any:
+        judge: Judge = self._judge
+        n: cython.Py_ssize_t = judge.n
+        m: cython.Py_ssize_t = judge.size - n
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        k: cython.Py_ssize_t
+        h: cython.Py_ssize_t
+        longest: cython.Py_ssize_t = self._longest
+        corners: cython.Py_ssize_t = 1
+        s: cython.double
+        time: cython.double
+        value: cython.double
+        size: cython.double
+        x_next: cython.double
+        theta: cython.p_double
+        delta: cython.p_double
+        v: cython.p_double
+        for i in range(judge._axes):
+            if not judge._of_modes[i]:
+                corners *= 2
+                continue
+            k = judge._positions[i]
+            s = judge._phi[k] if k < judge.size else judge._z[k]
+            if self._under_way and s != self._modes[i]:
+                self._under_way = 0
+                self._newest = -1
+            self._modes[i] = s
+        self._newest = k = self._newest + 1 if self._newest + 1 < longest else 0
+        if self._under_way < longest:
+            self._under_way += 1
+        for i in range(n):
+            self._x[i * longest + k] = self._start[i * longest + k] = judge._phi[i]
+        self._time[k] = 0.0
+        for j in range(m):
+            self._control[j * longest + k] = 0.0
+        for i in range(corners):
+            self._places[4 * k + i] = judge._places[i]
+            self._weights[4 * k + i] = judge._weights[i]
+        judge._advance(self._x, self._time, self._control, longest, 0, self._under_way, dt)
+        blank = array("d", self._blank)
+        values: cython.double[::1] = blank
+        for h in range(self.count):
+            if self._steps[h] > self._under_way:
+                break
+            k = self._newest - self._steps[h] + 1
+            if k < 0:
+                k += longest
+            time = self._time[k]
+            for j in range(m):
+                self._mean[j] = self._control[j * longest + k] / time
+            i = h * judge.blocks
+            if judge._axes:
+                self._blend(i, k, corners)
+                theta, delta = cython.address(self._one_theta[0]), cython.address(self._one_delta[0])
+                v = cython.address(self._one_v[0])
+            else:
+                theta = cython.address(self._theta[i * n * judge.p])
+                delta = cython.address(self._delta[i * n * judge.p])
+                v = cython.address(self._v[i * n])
+            for j in range(judge.p):
+                value = self._start[j * longest + k] if j < n else self._mean[j - n] if j < n + m else 1.0
+                size = abs(value)
+                if j == 0:
+                    for i in range(n):
+                        self._rate[i] = theta[i] * value
+                        self._spread[i] = delta[i] * size
+                else:
+                    for i in range(n):
+                        self._rate[i] += theta[j * n + i] * value
+                        self._spread[i] += delta[j * n + i] * size
+            for i in range(n):
+                x_next = after[i]
+                x_next = normalised(x_next, judge._steady[i], judge._scale[i])
+                value = centre_of(self._x[i * longest + k], time, self._rate[i])
+                size = half_of(time, self._spread[i], v[i])
+                values[h * n + i] = utilisation_of(x_next - value, size)
+        return blank
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _blend(self, first: cython.Py_ssize_t, k: cython.Py_ssize_t, corners: cython.Py_ssize_t) -> cython.void:
+        """Elements of a horizon, whose blocks begin at the first, where run k began."""
+        judge: Judge = self._judge
+        size: cython.Py_ssize_t = judge.n * judge.p
+        i: cython.Py_ssize_t
+        r: cython.Py_ssize_t
+        for i in range(corners):
+            r = first + self._places[4 * k + i]
+            judge._add(self._one_theta, self._theta, size, i, r * size, self._weights[4 * k + i])
+            judge._add(self._one_delta, self._delta, size, i, r * size, self._weights[4 * k + i])
+            judge._add(self._one_v, self._v, judge.n, i, r * judge.n, self._weights[4 * k + i])
+
 
 def _doubles(values: Any) -> Any:
     return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
 
 
 if not cython.compiled:
-    use_twin(globals(), ("Judge", "Judgement"))
+    use_twin(globals(), ("Judge", "Judgement", "Runs"))

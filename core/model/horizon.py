@@ -13,22 +13,123 @@ step by the recorded scheduling vector, and the elements of the horizon by that 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked, tables
+from uncertain_lti.model.bounds import Judge, centre_and_half
+from uncertain_lti.model.schedule import Schedule
+from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked, regressors, tables
 
 Widths = Literal["growing", "constant"]
 """Half-widths that grow with |x| and |u|, or are the same everywhere."""
 MOST_STEPS = 10_000
 """Steps of a horizon at most: so many runs are under way at a time."""
+_PRODUCTS = 65536  # per block: they stay in the cache
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Transitions in a row without a break, as many as a horizon has steps, and the nominal model run over them.
+
+    Parameters
+    ----------
+    steps : int
+        Transitions of each.
+    start : array of int (K,)
+        Position of the first of them among all transitions.
+    z : array (n + m, K)
+        State at the begin and mean control, [x_k; ū], normalised.
+    run : array (n, K)
+        x̂, normalised.
+    time : array (K,)
+        T, s.
+    """
+
+    steps: int
+    start: NDArray[np.intp]
+    z: Array
+    run: Array
+    time: Array
+
+    @property
+    def last(self) -> NDArray[np.intp]:
+        """Position of the last transition of each (K,): its arrival is what the envelope is compared with."""
+        return self.start + (self.steps - 1)
+
+
+def unbroken_over(k: NDArray[np.intp], vectors: Array, schedule: Schedule | None) -> NDArray[np.int64]:
+    """Of each transition the first of those that follow one another without a break, in the same modes, up to it.
+
+    Parameters
+    ----------
+    k : array of int (N,)
+        Sample that each begins with; recordings one after the other leave one out in between.
+    vectors : array (axes, N)
+        Scheduling vectors, normalised.
+    schedule : Schedule or None
+        None for one block.
+
+    Returns
+    -------
+    array of int64 (N,)
+        Positions.
+    """
+    position = np.arange(len(k), dtype=np.int64)
+    broken = np.diff(k, prepend=k[:1] - 2) != 1
+    for axis, s in zip(() if schedule is None else schedule.axes, vectors, strict=True):
+        if axis.modes:
+            broken[1:] |= s[1:] != s[:-1]
+    return np.maximum.accumulate(np.where(broken, position, 0)) if len(k) else position
+
+
+def windows_of(
+    judge: Judge, z: Array, size: tuple[int, int], dt: Array, begin: NDArray[np.int64], steps: Sequence[int]
+) -> Iterator[Windows]:
+    """Windows of several lengths over the same transitions.
+
+    Parameters
+    ----------
+    judge : Judge
+        Of the model.
+    z : array (n + m + q, N)
+        Normalised [x; u; s] of the transitions, in order of time.
+    size : pair of int
+        n and m.
+    dt : array (N,)
+        s.
+    begin : array of int64 (N,)
+        Of `unbroken_over`.
+    steps : sequence of int
+        Lengths, increasing.
+
+    Yields
+    ------
+    Windows
+        Of each length; good until the next one is asked for.
+    """
+    n, m = size
+    run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
+    done = 0
+    for length in steps:
+        judge.advance(run, time, control, z, dt, begin, done, length)
+        done = length
+        last = np.arange(length - 1, len(dt))
+        start = last - (length - 1)
+        whole = begin[last] <= start
+        if whole.all():
+            part: Any = slice(0, len(start))
+        else:
+            part = start = start[whole]
+        mean = control[:, part] / time[part]
+        yield Windows(length, start, np.concatenate([z[:n, part], mean]), run[:, part], time[part])
 
 
 class Horizon:
@@ -115,6 +216,36 @@ class Horizon:
     def tables(self) -> tuple[Array, Array, Array]:
         """Nominal elements and half-widths side by side, and what T does not multiply (`terms.tables`)."""
         return tables({name: getattr(self, name) for name in ARRAYS})
+
+    def centre_and_half(self, windows: Windows, corners: tuple[Any, ...] = ()) -> tuple[Array, Array]:
+        """Centre and half-width of the envelope at the end of windows.
+
+        Parameters
+        ----------
+        windows : Windows
+            Of as many steps; K of them.
+        corners : tuple, optional
+            Blocks that hold where each began, and their weights (`Schedule.corners`); without a schedule none.
+
+        Returns
+        -------
+        array (n, K)
+            Centre, normalised.
+        array (n, K)
+            Half-width, normalised.
+        """
+        centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
+        n, p = self.tables[0].shape[-2:]
+        size = max(1, _PRODUCTS // (n * p))
+        for first in range(0, len(windows.time), size):
+            part = slice(first, first + size)
+            phi = regressors(windows.z[:n, part], windows.z[n:, part])
+            places, weights = (a[:, part] for a in corners) if corners else (None, None)
+            with np.errstate(over="ignore", invalid="ignore"):  # an unstable model runs away
+                centre[:, part], half[:, part] = centre_and_half(
+                    *self.tables, phi, windows.time[part], places, weights, windows.run[:, part]
+                )
+        return centre, half
 
     def to_dict(self) -> dict[str, Any]:
         """As it is in a model file.

@@ -218,8 +218,9 @@ class Schedule:
         for axis, values in zip(self.axes[1:], s[1:], strict=True):
             more, their = axis.corners(values)
             unknown = (places[0] < 0) | (more[0] < 0)
-            places = (places[:, None] * len(axis) + more[None]).reshape(-1, s.shape[1])
-            weights = (weights[:, None] * their[None]).reshape(-1, s.shape[1])
+            shape = len(places) * len(more), s.shape[1]
+            places = (places[:, None] * len(axis) + more[None]).reshape(shape)
+            weights = (weights[:, None] * their[None]).reshape(shape)
             if unknown.any():
                 places[:, unknown], weights[:, unknown] = -1, np.nan
         return places, weights

@@ -25,10 +25,19 @@ from uncertain_lti.model.alarm_rule import (
     containment,
     with_containment,
 )
-from uncertain_lti.model.bounds import Judge, blended, centre_and_half, lower_of, normalised, upper_of
+from uncertain_lti.model.bounds import (
+    Judge,
+    Runs,
+    blended,
+    centre_and_half,
+    lower_of,
+    normalised,
+    upper_of,
+    utilisation_of,
+)
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
-from uncertain_lti.model.horizon import Horizon, checked_horizons
+from uncertain_lti.model.horizon import Horizon, checked_horizons, unbroken_over, windows_of
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
@@ -563,6 +572,67 @@ class UncertainLTI:
             self._positions,
             [data.known for data in self.block_data],
         )
+
+    def runs_of(self, judge: Judge) -> Runs | None:
+        """What judges the state several steps after each measured one.
+
+        Parameters
+        ----------
+        judge : Judge
+            Of `judge_of`.
+
+        Returns
+        -------
+        Runs or None
+            With the same bits as `horizon_utilisation`; None without horizons.
+        """
+        return Runs(judge, self.horizons) if self.horizons else None
+
+    def unbroken(self, k: NDArray[np.intp], z: Array) -> NDArray[np.int64]:
+        """Of each transition the first of those that follow one another up to it, in the same modes.
+
+        Parameters
+        ----------
+        k : array of int (N,)
+            Sample that each begins with.
+        z : array (n + m + q, N)
+            Normalised [x; u; s].
+
+        Returns
+        -------
+        array of int64 (N,)
+            As `horizon.windows_of` takes them.
+        """
+        return unbroken_over(k, z[self._positions], self.schedule)
+
+    def horizon_utilisation(self, k: NDArray[np.intp], z: Array, dt: Array, x_next: Array) -> Array:
+        """Where in the envelopes over several steps the arrivals lie.
+
+        Parameters
+        ----------
+        k : array of int (N,)
+            Sample that each transition begins with.
+        z : array (n + m + q, N)
+            Normalised [x; u; s] of the transitions, in order of time.
+        dt : array (N,)
+            s.
+        x_next : array (N, n)
+            Normalised states at their ends.
+
+        Returns
+        -------
+        array (N, horizons, n)
+            (x - centre) / half; NaN where the window of the horizon is broken.
+        """
+        found = np.full((len(dt), len(self.horizons), self.n), np.nan)
+        judge = self.judge_of(1.0, np.ones(self.n, dtype=bool))
+        steps = [horizon.steps for horizon in self.horizons]
+        for j, windows in enumerate(windows_of(judge, z, (self.n, self.m), dt, self.unbroken(k, z), steps)):
+            corners = () if self.schedule is None else self.schedule.corners(z[self._positions][:, windows.start])
+            centre, half = self.horizons[j].centre_and_half(windows, corners)
+            with np.errstate(over="ignore", invalid="ignore"):
+                found[windows.last, j] = utilisation_of(x_next[windows.last].T - centre, half).T
+        return found
 
     def bounds(
         self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0, s: ArrayLike | None = None

@@ -8,6 +8,7 @@ from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,6 +64,8 @@ class Verdict:
         In place of that of the step, where the monitor gives no verdict on it.
     alarms : Alarm, optional
         The rules after it, whose statistics and reasons it keeps.
+    longer : buffer of doubles, optional
+        Utilisation by the model's horizons, horizon after horizon; for models that have some.
     """
 
     __slots__ = (
@@ -78,6 +81,7 @@ class Verdict:
         "_alarms",
         "_rules",
         "_statistics",
+        "_longer",
     )
 
     def __init__(
@@ -87,13 +91,14 @@ class Verdict:
         judgement: Judgement | None,
         status: Status | None = None,
         alarms: Alarm | None = None,
+        longer: Any = None,
     ) -> None:
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, status or step.status
         self._after, self._before = step.after, step.before
         self.outside_domain = judgement is not None and judgement.outside_domain
         self.unknown_regime = judgement is not None and judgement.unknown_regime
         self.alarm = alarm
-        self._judgement = judgement
+        self._judgement, self._longer = judgement, longer
         self._alarms = alarms
         self._statistics: array[float] | None = None
         self._rules: tuple[int, ...] = ()
@@ -222,7 +227,8 @@ class Verdict:
     @property
     def horizon_utilisation(self) -> Array:
         """The same for one step and for each of the model's horizons (H, n); NaN where a window is broken."""
-        return self.utilisation[None]
+        longer = () if self._longer is None else self._longer
+        return np.concatenate([self.utilisation, longer]).reshape(-1, self.n)
 
 
 @cache
@@ -265,6 +271,8 @@ class Verdicts:
         Which rules raise the alarm after each sample.
     alarms : Alarm
         The rules, with their `labels` and the `names` of the statistics.
+    longer_utilisation : array (N+1, horizons, n)
+        Utilisation by each of the model's horizons; NaN where its window is broken.
     asked : array (N+1,) of bool, optional
         Whether a verdict was asked for; default all.
     """
@@ -283,6 +291,7 @@ class Verdicts:
     statistics: Array
     rule_alarms: NDArray[np.bool_]
     alarms: Alarm
+    longer_utilisation: Array
     asked: NDArray[np.bool_] | None = None
 
     def __repr__(self) -> str:
@@ -336,7 +345,7 @@ class Verdicts:
     @property
     def horizon_utilisation(self) -> Array:
         """Utilisation for one step and for each of the model's horizons (N+1, H, n); NaN where a window is broken."""
-        return self.utilisation[:, None]
+        return np.concatenate([self.utilisation[:, None], self.longer_utilisation], axis=1)
 
     @property
     def statistic_names(self) -> tuple[str, ...]:
@@ -454,6 +463,8 @@ class EnvelopeMonitor:
         self._counted = np.array([name not in masked for name in names])
         self._judge = model.judge_of(self.rule.margin, self._counted)
         self.alarms = Alarm(every, model, self._counted)
+        self._runs = model.runs_of(self._judge)
+        self._nothing = None if self._runs is None else np.full(model.n * len(model.horizons), np.nan)
         self._shortest, self._longest = model.sampling.step_range
 
     def __repr__(self) -> str:
@@ -471,7 +482,7 @@ class EnvelopeMonitor:
         return self.alarms.alarm
 
     def reset(self) -> None:
-        """Forget the recent verdicts and the alarm."""
+        """Forget the recent verdicts and the alarm; windows of the horizons go on."""
         self.alarms.reset()
 
     def predict(self, x: ArrayLike, u: ArrayLike, dt: float, s: ArrayLike = ()) -> tuple[Array, Array]:
@@ -559,13 +570,20 @@ class EnvelopeMonitor:
                 status = Status.MISSING
             elif (judgement := self._judge.judge(step.before, step.after, step.dt)) is None:
                 status = Status.MODE
+        longer = self._nothing
+        if self._runs is not None:
+            if judgement is not None:
+                longer = self._runs.push(step.before, step.after, step.dt)
+            elif not status.dropped:  # what was dropped is no sample, and the next follows the one before
+                self._runs.reset()
         if judgement is not None and armed:
-            alarms.push(step.dt, judgement.violation, self._table(judgement) if alarms.needs_table else None)
-        return Verdict(step, alarms.alarm, judgement, status, alarms)
+            alarms.push(step.dt, judgement.violation, self._table(judgement, longer) if alarms.needs_table else None)
+        return Verdict(step, alarms.alarm, judgement, status, alarms, longer)
 
-    def _table(self, judgement: Judgement) -> array[float]:
+    def _table(self, judgement: Judgement, longer: Any) -> array[float]:
         """Utilisation for one step and for each horizon, and the residual, row by row."""
-        return array("d", judgement.numbers(UTILISATION)) + array("d", judgement.numbers(RESIDUAL))
+        over = array("d") if longer is None else longer
+        return array("d", judgement.numbers(UTILISATION)) + over + array("d", judgement.numbers(RESIDUAL))
 
     def check(self, transient: Transient, armed: Armed | None = None) -> Verdicts:
         """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.
@@ -624,6 +642,8 @@ class EnvelopeMonitor:
             z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
             flags[arrival], low, high, utilisation[arrival], residual = self._judge_all(z, steps.dt, x_next)
             lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
+        longer = np.full((count, len(model.horizons), n), np.nan)
+        longer[arrival] = model.horizon_utilisation(steps.k, z, steps.dt, x_next)
         judged[arrival] = True
         unknown_regime = np.zeros(count, dtype=bool)
         unknown_regime[arrival] = unknown
@@ -632,11 +652,11 @@ class EnvelopeMonitor:
         alarms = Alarm(self.alarms.rules, model, self._counted)
         statistics = np.full((count, len(alarms.names)), np.nan)
         alarm, each = np.zeros(count, dtype=bool), np.zeros((count, len(alarms.rules)), dtype=bool)
-        dt, rows = np.zeros(count), 2 if alarms.needs_table else 0
+        dt, rows = np.zeros(count), 2 + len(model.horizons) if alarms.needs_table else 0
         dt[arrival] = steps.dt
         table = np.empty((count, rows, n))
         if rows:
-            table[:, 0], table[arrival, -1] = utilisation, residual
+            table[:, 0], table[:, 1:-1], table[arrival, -1] = utilisation, longer, residual
         for start, stop in _alarm_spans(transient.t_ns, armed):
             part = slice(start, stop)
             on = np.flatnonzero(judged[part]) + start
@@ -646,7 +666,7 @@ class EnvelopeMonitor:
             each[part] = np.concatenate([np.zeros((1, len(alarms.rules)), dtype=bool), by_rule])[held]
         return Verdicts(
             transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
-            unknown_regime, statistics, each, alarms,
+            unknown_regime, statistics, each, alarms, longer,
         )  # fmt: skip
 
     def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array, Array]:
