@@ -14,19 +14,20 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
-from uncertain_lti.identification import formulation
 from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.passes import Judged, Moments
+from uncertain_lti.identification.horizons import fit_horizons
+from uncertain_lti.identification.optimum import optimum
+from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem, Regimes, assemble, median_step
 from uncertain_lti.identification.regimes import Knots, block_data, scheduled_by
-from uncertain_lti.identification.repair import repair
-from uncertain_lti.identification.row import LEAST, InfeasibleError
+from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.identification.working_set import GOOD, Solution, WorkingSet
+from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -50,6 +51,8 @@ def fit(
     count: Literal["sample", "transient"] = "sample",
     structure: Structure | None = None,
     schedule: Schedule | Mapping[str, Knots] | None = None,
+    horizons: Sequence[int] = (),
+    widths: Widths = "growing",
     discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
@@ -79,6 +82,10 @@ def fit(
         As in `uncertain_lti.fit`.
     schedule : Schedule or mapping, optional
         As there, without "auto", which is refused.
+    horizons : sequence of int
+        Numbers of steps of further envelopes, each at least 2.
+    widths : {"growing", "constant"}
+        Half-widths of these that grow with |x| and |u|, or are the same everywhere.
     discard : int or float, default 0
         As in `uncertain_lti.fit`.
     method : {"working-set", "cvxpy"}
@@ -109,6 +116,10 @@ def fit(
         raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
     if method not in ("working-set", "cvxpy"):
         raise FitError(f"method is {method!r}; it must be working-set or cvxpy")
+    if horizons and method != "working-set":
+        raise FitError("method cvxpy states one step; leave horizons out, or use the working-set method")
+    if any(isinstance(h, bool) or not isinstance(h, (int, np.integer)) or not 2 <= h <= MOST_STEPS for h in horizons):
+        raise FitError(f"horizons are {list(horizons)}; give whole numbers of steps, 2 to {MOST_STEPS}")
     signals = _common_signals(transients)
     n, m = len(signals.states), len(signals.controls)
     if operating_point is None:
@@ -209,7 +220,14 @@ def fit(
         facts["with_discarded"] = {
             key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
         }
-    return model.replace(fit_summary=facts)
+    if not horizons:
+        return model.replace(fit_summary=facts)
+    found, facts["horizons"], dropped = fit_horizons(
+        model, problem, [int(h) for h in horizons], widths, criterion, progress
+    )
+    if "messages" in facts or dropped:
+        facts["messages"] = [*facts.get("messages", []), *dropped]
+    return model.replace(fit_summary=facts, horizons=found)
 
 
 def fit_fleet(
@@ -268,41 +286,14 @@ def fit_fleet(
     """
     engine = WorkingSet(fleet, structure, progress=progress)
     sums = engine.sums
-    if method == "working-set":
-        solution = engine.quadratic() if criterion == "qp" else engine.linear()
-    else:
-        solution = _as_written(engine, criterion)
-
     n, low, high = fleet.n, sums.low, sums.high
     domain = Domain(low[:n], high[:n], low[n:], high[n:], fleet.occupancy(low, high))
 
     def build(theta: Array, d: Array) -> UncertainLTI:
         return _model(fleet.columns, signals, sums, theta, d, dt_median, domain, alarm_rule, engine.tied)
 
-    limits = engine.half_limits
-
-    def repaired(gentle: bool) -> tuple[UncertainLTI, Array, Judged]:
-        return repair(
-            build,
-            fleet,
-            sums,
-            solution.theta,
-            solution.d,
-            solution.violation,
-            limits,
-            np.column_stack([row.size_unit for row in engine.rows]),
-            None if engine.shared is None else engine.shared[1],
-            gentle,
-        )
-
-    model, d, judged = repaired(False)
-    reference = _criterion(engine, criterion, solution.d, judged) if solution.delta is None else solution.delta
-    if not _relative(_criterion(engine, criterion, d, judged), reference, criterion, sums, judged) <= GOOD:
-        gentler = repaired(True)
-        if (_criterion(engine, criterion, *gentler[1:]) < _criterion(engine, criterion, d, judged)).any():
-            model, d, judged = gentler
-    objective = _criterion(engine, criterion, d, judged)
-    gap = _relative(objective, reference, criterion, sums, judged) + (solution.gap or 0.0)
+    names = [s.name for s in signals.states]
+    model, d, judged, objective, gap, solution = optimum(engine, criterion, build, names, method)
     max_width = judged.largest
     mean_width = 2.0 * (sums.width_sum @ d) / sums.count
     X = model.operating_point.X
@@ -378,28 +369,6 @@ def _distance(gap: float) -> list[str]:
     if gap > SMALL:
         return [f"the objective is {100 * gap:.2g} % above the optimum at most: {remedy}"]
     return []
-
-
-def _criterion(engine: WorkingSet, criterion: str, d: Array, judged: Judged) -> Array:
-    """Value of (10), (1,), or of δ in every row of (11), (n,)."""
-    return np.array([_objective(engine.sums, d, engine.weights)]) if criterion == "qp" else judged.weighted
-
-
-def _relative(objective: Array, reference: Array, criterion: str, sums: Moments, judged: Judged) -> float:
-    """How far an objective is above its reference at most, relative; an envelope that is rounding has no distance."""
-    least = LEAST * sums.rate_scale
-    floor = least * judged.weighted / np.where(judged.largest > 0, judged.largest, 1.0)
-    if criterion == "qp":
-        floor = np.array([float(floor @ floor) * sums.count])
-    return float(np.max((objective - reference) / np.maximum(np.maximum(objective, floor), 1e-300), initial=0.0))
-
-
-def _as_written(engine: WorkingSet, criterion: str) -> Solution:
-    """Solve the whole problem by cvxpy, and measure what it left outside."""
-    (problem,) = engine.fleet.partitions
-    assert isinstance(problem, Problem)
-    theta, d, objective = formulation.solve(problem, criterion)
-    return Solution(theta, d, engine.violation(theta, d), objective if criterion == "lp" else None, solvers={"cvxpy"})
 
 
 def _contradiction(
@@ -539,19 +508,6 @@ def _model(
         domain=domain,
         alarm_rule=alarm_rule,
     )
-
-
-def _objective(sums: Moments, d: Array, weights: Array | None) -> float:
-    """Value of (10); weights (n,) where they are constant in time."""
-    if sums.coupled is not None:
-        flat = d.T.ravel()
-        return float(4.0 * flat @ sums.coupled @ flat)
-    n = d.shape[1]
-    grams = [
-        sums.gram[i] if sums.gram is not None else sums.plain_gram * (weights[i] if weights is not None else 1.0)
-        for i in range(n)
-    ]
-    return float(sum(4.0 * d[:, i] @ grams[i] @ d[:, i] for i in range(n)))
 
 
 @cache

@@ -12,11 +12,10 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification import passes
-from uncertain_lti.identification.passes import Candidate, Judged, Moments, Samples
+from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Columns, Partition, Problem
 from uncertain_lti.model.domain import Occupancy, cells_for
 from uncertain_lti.model.residuals import Residuals
-from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 T = TypeVar("T")
 
@@ -159,13 +158,13 @@ class Fleet:
             rows.append((Samples.join([r[i][0] for r in results], self.p), min(r[i][1] for r in results)))
         return rows
 
-    def judge(self, model: UncertainLTI) -> Judged:
+    def judge(self, model: Envelope) -> Judged:
         """What the bounds of a model are on all transitions, by the verdict's own arithmetic.
 
         Parameters
         ----------
-        model : UncertainLTI
-            The model.
+        model : Envelope
+            The model, or a horizon.
 
         Returns
         -------
@@ -175,12 +174,12 @@ class Fleet:
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
 
-    def residuals(self, model: UncertainLTI) -> Residuals:
+    def residuals(self, model: Envelope) -> Residuals:
         """Mean and covariance of what the centre of one step leaves unexplained.
 
         Parameters
         ----------
-        model : UncertainLTI
+        model : Envelope
             Gives the centre.
 
         Returns

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.problem import Block, Columns, Partition, scaled_eigenvalues
-from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of
-from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of, utilisation_of
 
 
 @dataclass
@@ -269,7 +269,7 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
             psi = block.psi(columns) if constant else block.psi(columns) * block.dt
             largest = columns.regimes.main_block(block.z, block.s)
             visits = np.bincount(largest, minlength=columns.count)
-        step = block.x_next - block.z[:n]
+        step = block.x_next - block.origin
         weights = block.weights
         gram = np.stack([_gram(psi * weights[:, i], psi) for i in range(n)]) if weights.ndim == 2 else None
         coupled = None
@@ -306,7 +306,7 @@ def _per_row(blocks: list[Block], index: list[Index], n: int, p: int) -> list[Sa
     if not blocks:
         return [Samples.join([], p)] * n
     z, dt = np.hstack([b.z for b in blocks]), np.concatenate([b.dt for b in blocks])
-    rate = (np.hstack([b.x_next for b in blocks]) - z[:n]) / dt
+    rate = (np.hstack([b.x_next for b in blocks]) - np.hstack([b.origin for b in blocks])) / dt
     root = np.hstack([np.broadcast_to(b.root_weights(), (n, len(b))) for b in blocks])
     order = np.concatenate(index)
     s = _joined([b.s for b in blocks])
@@ -479,7 +479,7 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
             residual = _product(theta[:, :p] * (step or 1.0), block.z)
             if columns.drift:
                 residual += theta[:, p:] * (step or 1.0)
-        rate = block.x_next[rows] - block.z[rows]
+        rate = block.x_next[rows] - block.origin[rows]
         if not step:
             rate /= block.dt
         residual -= rate
@@ -553,7 +553,7 @@ def _near(candidate: Candidate, block: Block, columns: Columns, chosen: Index, r
     samples = Samples(
         k + (block.start + offset),
         z,
-        (block.x_next[which, k] - z[which, np.arange(len(k))]) / dt,
+        (block.x_next[which, k] - block.origin[which, k]) / dt,
         dt,
         root[which, k if root.shape[1] > 1 else 0],
         s,
@@ -607,15 +607,41 @@ class Judged:
         )
 
 
-def judge(part: Partition, model: UncertainLTI) -> Judged:
+class Envelope(Protocol):
+    """What gives bounds: the model over one step, or the elements of a horizon."""
+
+    @property
+    def tables(self) -> tuple[Array, Array, Array]:
+        """Nominal elements and half-widths of the rates, and what the step does not multiply."""
+        ...
+
+    def columns_centre_and_half(
+        self, z: Array, dt: Array, centre: Array, half: Array, base: Array | None = None
+    ) -> None:
+        """Centre and half-width of the bounds of samples in columns, into given arrays.
+
+        Parameters
+        ----------
+        z : array (n + m + q, K)
+            Normalised [x; u; s].
+        dt : array (K,)
+            s.
+        centre, half : array (n, K)
+            Take the result.
+        base : array (n, K), optional
+            What the rates are added to; default the states.
+        """
+
+
+def judge(part: Partition, model: Envelope) -> Judged:
     """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`.
 
     Parameters
     ----------
     part : Partition
         The transitions.
-    model : UncertainLTI
-        The model.
+    model : Envelope
+        The model, or a horizon.
 
     Returns
     -------
@@ -631,9 +657,9 @@ def judge(part: Partition, model: UncertainLTI) -> Judged:
     return total
 
 
-def _judged(block: Block, model: UncertainLTI) -> Judged:
+def _judged(block: Block, model: Envelope) -> Judged:
     """`judge` of one piece, every transition by the verdict's arithmetic."""
-    inside, half = _inside_and_half(model, block.signals, block.x_next, block.dt)
+    inside, half = _inside_and_half(model, block)
     largest = 2.0 * half.max(axis=1)
     if block.weights.ndim == 1:
         weighted = largest * np.sqrt(block.weights)
@@ -642,17 +668,23 @@ def _judged(block: Block, model: UncertainLTI) -> Judged:
     return Judged(len(block) - np.count_nonzero(inside, axis=1), largest, weighted)
 
 
-def _inside_and_half(model: UncertainLTI, z: Array, x_next: Array, dt: Array) -> tuple[NDArray[np.bool_], Array]:
+def _inside_and_half(model: Envelope, block: Block) -> tuple[NDArray[np.bool_], Array]:
     """The verdict on each row of each transition, and its half-width, both (n, K)."""
-    centre, half = np.empty(x_next.shape), np.empty(x_next.shape)
-    model.columns_centre_and_half(z, dt, centre, half)
-    inside: NDArray[np.bool_] = centre - half <= x_next
+    centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
+    if block.base is None:
+        model.columns_centre_and_half(block.signals, block.dt, centre, half)
+    else:
+        model.columns_centre_and_half(block.signals, block.dt, centre, half, block.base)
+    inside: NDArray[np.bool_] = centre - half <= block.x_next
+    if block.base is not None:  # of a horizon the verdict is the utilisation
+        with np.errstate(over="ignore", invalid="ignore"):
+            inside &= np.abs(utilisation_of(block.x_next - centre, half)) <= 1.0
     centre += half
-    inside &= x_next <= centre
+    inside &= block.x_next <= centre
     return inside, half
 
 
-def _judged_in_doubt(block: Block, model: UncertainLTI, known: Array) -> Judged | None:
+def _judged_in_doubt(block: Block, model: Envelope, known: Array) -> Judged | None:
     """`_judged` to the bit, from the transitions alone that the rounding of a faster arithmetic leaves in doubt.
 
     A transition that is inside, or narrower than the widest, by more than any order of the sums can differ is so by the
@@ -663,8 +695,8 @@ def _judged_in_doubt(block: Block, model: UncertainLTI, known: Array) -> Judged 
     ----------
     block : Block
         The transitions, with weights that are constant in time.
-    model : UncertainLTI
-        The model.
+    model : Envelope
+        The model, or a horizon.
     known : array (n,)
         Widths that were found already; transitions that are narrower need not be judged.
 
@@ -685,13 +717,15 @@ def _judged_in_doubt(block: Block, model: UncertainLTI, known: Array) -> Judged 
         floor = longest * steady + v
     else:
         widest = widest + longest * steady
-    size = longest * (np.abs(nominal[:, :p]) @ most + np.abs(nominal[:, p:]).sum(axis=1)) + most[:n] + widest + floor
+    size = longest * (np.abs(nominal[:, :p]) @ most + np.abs(nominal[:, p:]).sum(axis=1)) + widest + floor
+    size += most[:n] if block.base is None else np.abs(block.base).max(axis=1)
     relative = 8.0 * (p + 8) * _EPS
     error = relative * size + _TINY
     if not np.isfinite(error).all():
         return None
     if constant:  # the step goes into the elements
-        distance = _product(nominal[:, :p] * longest + np.eye(n, p), block.z)
+        own = np.eye(n, p) if block.base is None else 0.0
+        distance = _product(nominal[:, :p] * longest + own, block.z)
         half = _product(spread[:, :p] * longest, psi)
         if drift.any():
             distance += (drift * longest)[:, None]
@@ -699,9 +733,12 @@ def _judged_in_doubt(block: Block, model: UncertainLTI, known: Array) -> Judged 
         distance, half = _product(nominal[:, :p], block.z), _product(spread[:, :p], psi)
         distance += drift[:, None]
         distance *= block.dt
-        distance += block.z[:n]
+        if block.base is None:
+            distance += block.z[:n]
         half += steady[:, None]
         half *= block.dt
+    if block.base is not None:
+        distance += block.base
     distance -= block.x_next
     np.abs(distance, out=distance)
     distance += (error - floor)[:, None]
@@ -721,20 +758,20 @@ def _judged_in_doubt(block: Block, model: UncertainLTI, known: Array) -> Judged 
     outside, largest = np.zeros(n, dtype=np.intp), np.zeros(n)
     if len(chosen):
         padded = np.resize(chosen, _FEW)  # a fixed number, as `ordered_sum` tries each shape first
-        inside, widths = _inside_and_half(model, block.signals[:, padded], block.x_next[:, padded], block.dt[padded])
+        inside, widths = _inside_and_half(model, block.take(padded))
         outside = len(chosen) - np.count_nonzero(inside[:, : len(chosen)], axis=1)
         largest = 2.0 * widths.max(axis=1)
     return Judged(outside, largest, largest * np.sqrt(block.weights))
 
 
-def residual_sums(part: Partition, model: UncertainLTI) -> tuple[Array, Array]:
+def residual_sums(part: Partition, model: Envelope) -> tuple[Array, Array]:
     """Sums of the residual of every transition, r = x_next - centre, and of its products.
 
     Parameters
     ----------
     part : Partition
         The transitions.
-    model : UncertainLTI
+    model : Envelope
         Gives the centre.
 
     Returns

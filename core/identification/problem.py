@@ -283,6 +283,8 @@ class Block:
         W(t_{k+1}).
     s : array (q, K), optional
         Scheduling signals that are neither state nor control.
+    base : array (n, K), optional
+        What a step is counted from, over a horizon the run of the nominal model; default the states.
     """
 
     start: int
@@ -291,6 +293,7 @@ class Block:
     dt: Array
     weights: Array
     s: Array | None = None
+    base: Array | None = None
 
     def __len__(self) -> int:
         return len(self.dt)
@@ -318,7 +321,8 @@ class Block:
         weights = self.weights if self.weights.ndim == 1 else self.weights[start:stop]
         part = slice(start, stop)
         s = None if self.s is None else self.s[:, part]
-        return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights, s)
+        base = None if self.base is None else self.base[:, part]
+        return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights, s, base)
 
     def every(self, first: int, stride: int) -> Block:
         """A copy of every stride-th transition from the first.
@@ -338,7 +342,33 @@ class Block:
         weights = self.weights if self.weights.ndim == 1 else self.weights[first::stride].copy()
         part = slice(first, None, stride)
         s = None if self.s is None else self.s[:, part].copy()
-        return Block(self.start, self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy(), weights, s)
+        base = None if self.base is None else self.base[:, part].copy()
+        return Block(
+            self.start, self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy(), weights, s, base
+        )
+
+    def take(self, index: NDArray[np.intp]) -> Block:
+        """A copy of some transitions.
+
+        Parameters
+        ----------
+        index : array of int (K,)
+            Positions in the block.
+
+        Returns
+        -------
+        Block
+            Its start is that of the block.
+        """
+        weights = self.weights if self.weights.ndim == 1 else self.weights[index]
+        s = None if self.s is None else self.s[:, index]
+        base = None if self.base is None else self.base[:, index]
+        return Block(self.start, self.z[:, index], self.x_next[:, index], self.dt[index], weights, s, base)
+
+    @property
+    def origin(self) -> Array:
+        """What a step is counted from, (n, K)."""
+        return self.z[: self.n] if self.base is None else self.base
 
     def rate(self) -> Array:
         """(x_next - x) / Δt.
@@ -348,7 +378,7 @@ class Block:
         array (n, K)
             1/s.
         """
-        rate = self.x_next - self.z[: self.n]
+        rate = self.x_next - self.origin
         rate /= self.dt
         return rate
 
@@ -470,6 +500,8 @@ class Problem:
         Terms that are unknown.
     s_columns : array (q, N), optional
         Scheduling signals that are neither state nor control, samples in columns.
+    base_columns : array (n, N), optional
+        What a step is counted from, over a horizon the run of the nominal model; default the states.
     """
 
     z_columns: Array
@@ -480,6 +512,7 @@ class Problem:
     weights: Array
     columns: Columns
     s_columns: Array | None = None
+    base_columns: Array | None = None
 
     @property
     def N(self) -> int:
@@ -521,7 +554,10 @@ class Problem:
         """
         weights = self.weights if self.weights.ndim == 1 else self.weights[part]
         s = None if self.s_columns is None else self.s_columns[:, part]
-        return Block(part.start or 0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights, s)
+        base = None if self.base_columns is None else self.base_columns[:, part]
+        return Block(
+            part.start or 0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights, s, base
+        )
 
     def blocks(self) -> Iterator[Block]:
         """All transitions, in blocks that stay in the cache.
@@ -547,7 +583,7 @@ class Problem:
         array (K, n)
             1/s.
         """
-        return ((self.next_columns[:, part] - self.z_columns[: self.n, part]) / self.dt[part]).T
+        return self.block(part).rate().T
 
     def phi(self, part: slice = slice(None)) -> Array:
         """Regressors of the nominal row with samples in rows.
@@ -620,6 +656,7 @@ class Problem:
             weights,
             self.columns,
             None if self.s_columns is None else self.s_columns[:, index],
+            None if self.base_columns is None else self.base_columns[:, index],
         )
 
     def without(self, index: NDArray[np.intp]) -> Problem:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,15 +11,16 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.passes import Judged, Moments
-from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.identification.passes import Envelope, Judged, Moments
+
+E = TypeVar("E", bound=Envelope)
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 40
 
 
 def repair(
-    build: Callable[[Array, Array], UncertainLTI],
+    build: Callable[[Array, Array], E],
     fleet: Fleet,
     sums: Moments,
     theta: Array,
@@ -28,7 +30,9 @@ def repair(
     units: Array,
     shared: Index | None = None,
     gentle: bool = False,
-) -> tuple[UncertainLTI, Array, Judged]:
+    names: Sequence[str] = (),
+    sizes: Array | None = None,
+) -> tuple[E, Array, Judged]:
     """Lift d until `Fleet.judge` finds nothing outside in any row.
 
     A solver leaves a violation of at most `violation` x (scaled size of the sample), and the size is linear in |z|,
@@ -39,7 +43,7 @@ def repair(
     Parameters
     ----------
     build : callable
-        (theta (r, n), d (q, n)) -> UncertainLTI.
+        (theta (r, n), d (q, n)) -> what has the bounds.
     fleet : Fleet
         The data of the fit.
     sums : Moments
@@ -58,10 +62,14 @@ def repair(
         Of each half-width the first that it shares its value with; default none but itself.
     gentle : bool
         Try lifts far below an ulp first: for an envelope so narrow that a few ulps are much of it.
+    names : sequence of str
+        Of the states, for errors.
+    sizes : array (n,), optional
+        Largest |x| that the rates are added to; default that of the states. What the step does not multiply covers it.
 
     Returns
     -------
-    model : UncertainLTI
+    model : E
         With the lifted half-widths.
     d : array (q, n)
         Lifted.
@@ -87,6 +95,10 @@ def repair(
         if term in columns.nominal:
             nominal[:, k] = elements[:, p + columns.nominal.index(term)]
     own[:, np.arange(n), np.arange(n)] = 1.0 / sums.dt_min
+    if sizes is not None:
+        for k, term in enumerate(columns.half, start=p):
+            if not term.times_dt:
+                own[:, k] = sizes
     base = np.clip(lifted, low, high)
     rounding = nominal.reshape(d.shape) + base + own.reshape(d.shape)
     for i in np.flatnonzero((fixed & (rounding > 0)).any(axis=0)):  # the others carry what these cannot
@@ -111,7 +123,7 @@ def repair(
     row = int(np.argmax(todo))
     if fixed[free[:, row], row].any():
         raise FitError(
-            f"structure: with half-widths that are fixed, '{model.state_names[row]}' leaves "
+            f"structure: with half-widths that are fixed, '{names[row]}' leaves "
             f"{plural(int(judged.outside[row]), 'transition')} outside, by rounding at least; let a half-width of "
             f"this row be free, or use an additive term"
         )

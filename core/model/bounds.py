@@ -1116,6 +1116,11 @@ class Runs:
     ----------
     count : int
         Number of horizons.
+
+    Raises
+    ------
+    ValueError
+        The horizons do not fit the model, or are not in order.
     """
 
     count = cython.declare(cython.Py_ssize_t, visibility="readonly")

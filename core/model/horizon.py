@@ -45,8 +45,8 @@ class Windows:
         Transitions of each.
     start : array of int (K,)
         Position of the first of them among all transitions.
-    z : array (n + m, K)
-        State at the begin and mean control, [x_k; ū], normalised.
+    z : array (n + m + axes, K)
+        State at the begin, mean control, and scheduling vector at the begin, [x_k; ū; s_k], normalised.
     run : array (n, K)
         x̂, normalised.
     time : array (K,)
@@ -91,7 +91,7 @@ def unbroken_over(k: NDArray[np.intp], vectors: Array, schedule: Schedule | None
 
 
 def windows_of(
-    judge: Judge, z: Array, size: tuple[int, int], dt: Array, begin: NDArray[np.int64], steps: Sequence[int]
+    judge: Judge, z: Array, vectors: Array, dt: Array, begin: NDArray[np.int64], steps: Sequence[int], n: int, m: int
 ) -> Iterator[Windows]:
     """Windows of several lengths over the same transitions.
 
@@ -101,21 +101,24 @@ def windows_of(
         Of the model.
     z : array (n + m + q, N)
         Normalised [x; u; s] of the transitions, in order of time.
-    size : pair of int
-        n and m.
+    vectors : array (axes, N)
+        Scheduling vectors, normalised.
     dt : array (N,)
         s.
     begin : array of int64 (N,)
         Of `unbroken_over`.
     steps : sequence of int
         Lengths, increasing.
+    n : int
+        Number of states.
+    m : int
+        Number of controls.
 
     Yields
     ------
     Windows
         Of each length; good until the next one is asked for.
     """
-    n, m = size
     run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
     done = 0
     for length in steps:
@@ -129,7 +132,7 @@ def windows_of(
         else:
             part = start = start[whole]
         mean = control[:, part] / time[part]
-        yield Windows(length, start, np.concatenate([z[:n, part], mean]), run[:, part], time[part])
+        yield Windows(length, start, np.concatenate([z[:n, part], mean, vectors[:, part]]), run[:, part], time[part])
 
 
 class Horizon:
@@ -217,35 +220,35 @@ class Horizon:
         """Nominal elements and half-widths side by side, and what T does not multiply (`terms.tables`)."""
         return tables({name: getattr(self, name) for name in ARRAYS})
 
-    def centre_and_half(self, windows: Windows, corners: tuple[Any, ...] = ()) -> tuple[Array, Array]:
-        """Centre and half-width of the envelope at the end of windows.
+    def columns_centre_and_half(
+        self, z: Array, time: Array, centre: Array, half: Array, base: Array, schedule: Schedule | None = None
+    ) -> None:
+        """Centre and half-width of the envelope at the end of windows, into given arrays.
 
         Parameters
         ----------
-        windows : Windows
-            Of as many steps; K of them.
-        corners : tuple, optional
-            Blocks that hold where each began, and their weights (`Schedule.corners`); without a schedule none.
-
-        Returns
-        -------
-        array (n, K)
-            Centre, normalised.
-        array (n, K)
-            Half-width, normalised.
+        z : array (n + m + axes, K)
+            State at the begin, mean control and scheduling vector at the begin, normalised.
+        time : array (K,)
+            T, s.
+        centre, half : array (n, K)
+            Take the result, normalised.
+        base : array (n, K)
+            x̂, normalised.
+        schedule : Schedule, optional
+            That of the model.
         """
-        centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
-        n, p = self.tables[0].shape[-2:]
-        size = max(1, _PRODUCTS // (n * p))
-        for first in range(0, len(windows.time), size):
+        n, columns = self.tables[0].shape[-2:]
+        m = columns - n - 1
+        size = max(1, _PRODUCTS // (n * columns))
+        for first in range(0, len(time), size):
             part = slice(first, first + size)
-            phi = regressors(windows.z[:n, part], windows.z[n:, part])
-            places, weights = (a[:, part] for a in corners) if corners else (None, None)
+            phi = regressors(z[:n, part], z[n : n + m, part])
+            places, weights = (None, None) if schedule is None else schedule.corners(z[n + m :, part])
             with np.errstate(over="ignore", invalid="ignore"):  # an unstable model runs away
                 centre[:, part], half[:, part] = centre_and_half(
-                    *self.tables, phi, windows.time[part], places, weights, windows.run[:, part]
+                    *self.tables, phi, time[part], places, weights, base[:, part]
                 )
-        return centre, half
 
     def to_dict(self) -> dict[str, Any]:
         """As it is in a model file.

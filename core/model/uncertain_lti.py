@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -37,7 +37,7 @@ from uncertain_lti.model.bounds import (
 )
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
-from uncertain_lti.model.horizon import Horizon, checked_horizons, unbroken_over, windows_of
+from uncertain_lti.model.horizon import Horizon, Windows, checked_horizons, unbroken_over, windows_of
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
@@ -413,7 +413,9 @@ class UncertainLTI:
         self.columns_centre_and_half(np.vstack(flat), np.broadcast_to(dt, lead).reshape(count), centre, half)
         return centre.T.reshape(*lead, self.n), half.T.reshape(*lead, self.n)
 
-    def columns_centre_and_half(self, z: Array, dt: Array, centre: Array, half: Array) -> None:
+    def columns_centre_and_half(
+        self, z: Array, dt: Array, centre: Array, half: Array, base: Array | None = None
+    ) -> None:
         """`centre_and_half` of samples in columns, into given arrays.
 
         Parameters
@@ -424,14 +426,17 @@ class UncertainLTI:
             s.
         centre, half : array (n, K)
             Take the result.
+        base : array (n, K), optional
+            What the rates are added to; default the states.
         """
         n, m = self.n, self.m
         for start in range(0, len(dt), self._block):
             part = slice(start, start + self._block)
             phi = regressors(z[:n, part], z[n : n + m, part])
-            corners = () if self.schedule is None else self.schedule.corners(z[self._positions, part])
+            places, weights = (None, None) if self.schedule is None else self.schedule.corners(z[self._positions, part])
+            own = None if base is None else base[:, part]
             with np.errstate(over="ignore", invalid="ignore"):  # values that the arithmetic cannot carry give NaN
-                centre[:, part], half[:, part] = centre_and_half(*self.tables, phi, dt[part], *corners)
+                centre[:, part], half[:, part] = centre_and_half(*self.tables, phi, dt[part], places, weights, own)
 
     def normalised_columns(self, steps: Transitions) -> Array:
         """[x; u; s] of transitions.
@@ -588,22 +593,28 @@ class UncertainLTI:
         """
         return Runs(judge, self.horizons) if self.horizons else None
 
-    def unbroken(self, k: NDArray[np.intp], z: Array) -> NDArray[np.int64]:
-        """Of each transition the first of those that follow one another up to it, in the same modes.
+    def windows(self, k: NDArray[np.intp], z: Array, dt: Array, steps: Sequence[int]) -> Iterator[Windows]:
+        """The nominal model run over so many transitions in a row.
 
         Parameters
         ----------
         k : array of int (N,)
-            Sample that each begins with.
+            Sample that each transition begins with; where one does not follow the one before, windows end.
         z : array (n + m + q, N)
-            Normalised [x; u; s].
+            Normalised [x; u; s] of the transitions, in order of time.
+        dt : array (N,)
+            s.
+        steps : sequence of int
+            Lengths, increasing.
 
         Returns
         -------
-        array of int64 (N,)
-            As `horizon.windows_of` takes them.
+        iterator of Windows
+            Of each length; good until the next one is asked for.
         """
-        return unbroken_over(k, z[self._positions], self.schedule)
+        judge, vectors = self.judge_of(1.0, np.ones(self.n, dtype=bool)), z[self._positions]
+        begin = unbroken_over(k, vectors, self.schedule)
+        return windows_of(judge, z, vectors, dt, begin, steps, self.n, self.m)
 
     def horizon_utilisation(self, k: NDArray[np.intp], z: Array, dt: Array, x_next: Array) -> Array:
         """Where in the envelopes over several steps the arrivals lie.
@@ -625,11 +636,11 @@ class UncertainLTI:
             (x - centre) / half; NaN where the window of the horizon is broken.
         """
         found = np.full((len(dt), len(self.horizons), self.n), np.nan)
-        judge = self.judge_of(1.0, np.ones(self.n, dtype=bool))
         steps = [horizon.steps for horizon in self.horizons]
-        for j, windows in enumerate(windows_of(judge, z, (self.n, self.m), dt, self.unbroken(k, z), steps)):
-            corners = () if self.schedule is None else self.schedule.corners(z[self._positions][:, windows.start])
-            centre, half = self.horizons[j].centre_and_half(windows, corners)
+        for j, windows in enumerate(self.windows(k, z, dt, steps)):
+            horizon = self.horizons[j]
+            centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
+            horizon.columns_centre_and_half(windows.z, windows.time, centre, half, windows.run, self.schedule)
             with np.errstate(over="ignore", invalid="ignore"):
                 found[windows.last, j] = utilisation_of(x_next[windows.last].T - centre, half).T
         return found

@@ -1,0 +1,185 @@
+"""Envelopes over several steps: the same programmes, whose transitions are windows.
+
+A window of h transitions in a row gives one transition of step T from x_k with the mean control ū; the state at its end
+is counted from x̂, the run of the fitted model. What is unknown is linear again, so working set, proof and repair are
+those of one step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.optimum import optimum
+from uncertain_lti.identification.problem import Columns, Problem, Regimes
+from uncertain_lti.identification.structure import Structure
+from uncertain_lti.identification.working_set import WorkingSet
+from uncertain_lti.model.horizon import Horizon, Widths
+from uncertain_lti.model.schedule import Schedule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+
+_UNKNOWN = frozenset({"c", "v"})
+
+
+@dataclass(frozen=True)
+class _Envelope:
+    """A horizon with the schedule of its model: what gives bounds."""
+
+    horizon: Horizon
+    schedule: Schedule | None
+
+    @property
+    def tables(self) -> tuple[Array, Array, Array]:
+        """As of the horizon."""
+        return self.horizon.tables
+
+    def columns_centre_and_half(
+        self, z: Array, dt: Array, centre: Array, half: Array, base: Array | None = None
+    ) -> None:
+        """As of the horizon."""
+        assert base is not None
+        self.horizon.columns_centre_and_half(z, dt, centre, half, base, self.schedule)
+
+
+def fit_horizons(
+    model: UncertainLTI,
+    problem: Problem,
+    steps: Sequence[int],
+    widths: Widths = "growing",
+    criterion: str = "qp",
+    progress: Callable[[str], None] | None = None,
+) -> tuple[tuple[Horizon, ...], list[dict[str, Any]], list[str]]:
+    """Envelopes of a fitted model over several steps.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Fitted to the transitions.
+    problem : Problem
+        The transitions; a window ends where one is missing, also by being discarded.
+    steps : sequence of int
+        Numbers of steps, each at least 2.
+    widths : {"growing", "constant"}
+        Half-widths that grow with |x| and |u|, or the noise term alone.
+    criterion : {"qp", "lp"}
+        Eq. (10) or eq. (11).
+    progress : callable, optional
+        Called with one line of text per horizon.
+
+    Returns
+    -------
+    tuple of Horizon
+        Those that there are windows for, with every window inside.
+    list of dict
+        Of each its steps, seconds, windows, widths and distance from the optimum.
+    list of str
+        What was dropped and why.
+
+    Raises
+    ------
+    FitError
+        No solver found an answer; names the horizon.
+    """
+    found: list[Horizon] = []
+    facts: list[dict[str, Any]] = []
+    messages: list[str] = []
+    signals = problem.z_columns if problem.s_columns is None else np.vstack([problem.z_columns, problem.s_columns])
+    k = problem.k + problem.source * (int(problem.k.max(initial=0)) + 2)  # two recordings never follow each other
+    n, p = problem.n, problem.p
+    axes = 0 if model.schedule is None else len(model.schedule.axes)
+    regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))
+    columns = Columns(_UNKNOWN, regimes)
+    zeros = {"dA": np.zeros((n, n)), "dB": np.zeros((n, p - n))}
+    structure = Structure(n, p - n, fixed=zeros) if widths == "constant" else None
+    lengths = sorted(set(steps))
+    for windows in model.windows(k, signals, problem.dt, lengths):
+        if progress is not None:
+            progress(f"horizon of {windows.steps} steps: {plural(len(windows.start), 'window')}")
+        few = 2 * (p + 1) * columns.count
+        if len(windows.start) < few:
+            messages.append(
+                f"no horizon of {windows.steps} steps: {plural(len(windows.start), 'window')} of so many transitions "
+                f"in a row, and {few} are needed; give shorter horizons, or longer recordings"
+            )
+            continue
+        largest = np.abs(windows.run).max(axis=1)
+        if not (largest <= LARGEST).all():
+            name = model.state_names[int(np.argmax(~(largest <= LARGEST)))]
+            messages.append(
+                f"no horizon of {windows.steps} steps: the nominal model runs away, '{name}' beyond all numbers; give "
+                f"shorter horizons"
+            )
+            continue
+        last = windows.last
+        part = Problem(
+            windows.z[:p],
+            problem.next_columns[:, last],
+            windows.time,
+            problem.source[windows.start],
+            problem.k[windows.start],
+            problem.weights if problem.weights.ndim == 1 else problem.weights[last],
+            columns,
+            windows.z[p:] if axes else None,
+            windows.run,
+        )
+        horizon, fact = _fitted(model, part, windows.steps, widths, criterion, structure, largest)
+        found.append(horizon)
+        facts.append(fact)
+    return tuple(found), facts, messages
+
+
+def _fitted(
+    model: UncertainLTI,
+    part: Problem,
+    steps: int,
+    widths: Widths,
+    criterion: str,
+    structure: Structure | None,
+    largest: Array,
+) -> tuple[Horizon, dict[str, Any]]:
+    """One horizon."""
+    n, p, columns = part.n, part.p, part.columns
+    engine = WorkingSet(Fleet.of(part), structure)
+    sums = engine.sums
+
+    def build(theta: Array, d: Array) -> _Envelope:
+        nominal, half = theta.reshape(columns.count, -1, n), d.reshape(columns.count, -1, n)
+        arrays = {
+            "A": nominal[:, :n].transpose(0, 2, 1),
+            "B": nominal[:, n:p].transpose(0, 2, 1),
+            "c": nominal[:, p],
+            "dA": half[:, :n].transpose(0, 2, 1),
+            "dB": half[:, n:p].transpose(0, 2, 1),
+            "v": half[:, p],
+        }
+        if columns.regimes is None:
+            arrays = {name: values[0] for name, values in arrays.items()}
+        return _Envelope(Horizon(steps, **arrays, widths=widths), model.schedule)
+
+    try:
+        envelope, d, judged, objective, gap, _ = optimum(engine, criterion, build, model.state_names, sizes=largest)
+    except FitError as error:
+        raise FitError(f"horizon of {steps} steps: {error}") from None
+    mean_width = 2.0 * (sums.width_sum @ d) / sums.count
+    X = model.operating_point.X
+    return envelope.horizon, {
+        "steps": steps,
+        "seconds": float(np.median(part.dt)),
+        "widths": widths,
+        "windows": sums.count,
+        "mean_width": mean_width,
+        "max_width": judged.largest,
+        "mean_width_recorded": mean_width * X,
+        "max_width_recorded": judged.largest * X,
+        "violations": 0,
+        "objective": float(objective[0]) if criterion == "qp" else objective,
+        "optimality_gap": gap if np.isfinite(gap) else None,
+    }
