@@ -1,0 +1,172 @@
+"""Fitted envelopes over several steps: every window inside, least width, and which windows count."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from uncertain_lti import EnvelopeMonitor, Transient
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import fit
+from uncertain_lti.identification.horizons import fit_horizons
+from uncertain_lti.identification.problem import assemble
+from uncertain_lti.identification.regimes import Modes
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+
+STEPS = (2, 5, 11)
+
+
+def runs(seed: int = 0, count: int = 3, length: int = 160, noise: float = 1e-3, modes: bool = False) -> list[Transient]:
+    """A damped, driven pair of states whose stiffness depends on the first."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(count):
+        u = rng.choice([-1.0, 0.0, 1.0], size=length // 20 + 1).repeat(20)[:length, None]
+        x = np.zeros((length, 2))
+        for k in range(length - 1):
+            rate = np.array([x[k, 1], -(4.0 + 3.0 * x[k, 0]) * x[k, 0] - 1.5 * x[k, 1] + 2.0 * u[k, 0]])
+            x[k + 1] = x[k] + 0.02 * rate
+        x += rng.uniform(-noise, noise, x.shape)
+        t = np.arange(length) * 20_000_000
+        found.append(
+            Transient(t, x, u, s=rng.choice([1.0, 2.0], size=8).repeat(length // 8)[:, None] if modes else None)
+        )
+    return found
+
+
+def utilisation(model: UncertainLTI, transients: list[Transient]) -> Any:
+    return np.concatenate([EnvelopeMonitor(model).check(t).horizon_utilisation[:, 1:] for t in transients])
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize("widths", ["growing", "constant"])
+@pytest.mark.parametrize("schedule", [{}, {"x1": 2}])
+def test_every_window_is_inside_by_the_arithmetic_of_the_verdict(criterion: Any, widths: Any, schedule: Any) -> None:
+    transients = runs()
+    model = fit(transients, criterion, additive="noise", schedule=schedule, horizons=STEPS, widths=widths)
+    table = utilisation(model, transients)
+    assert [h.steps for h in model.horizons] == list(STEPS)
+    for j, facts in enumerate(model.fit_summary["horizons"]):
+        there = ~np.isnan(table[:, j, 0])
+        assert there.sum() == facts["windows"] == sum(len(t) - facts["steps"] for t in transients)
+        assert np.abs(table[there, j]).max() <= 1.0
+        assert np.abs(table[there, j]).max(axis=0).min() > 0.99  # and no wider than it must be
+        assert facts["optimality_gap"] < 1e-6 and facts["seconds"] == pytest.approx(0.02 * facts["steps"])
+    for horizon in model.horizons:
+        assert horizon.widths == widths and bool(horizon.dA.any()) == (widths == "growing")
+    assert UncertainLTI.from_dict(model.to_dict()).to_dict() == model.to_dict()
+
+
+def windows_naively(model: UncertainLTI, transients: list[Transient], steps: int) -> tuple[Any, Any]:
+    """Regressors [x_k; ū; 1] and what is left of the state after the run of the model."""
+    phi, left = [], []
+    for t in transients:
+        for k in range(len(t) - steps):
+            x = t.x[k].copy()
+            for j in range(steps):
+                x = x + t.dt[k + j] * (model.A @ x + model.B @ t.u[k + j] + model.c)
+            phi.append([*t.x[k], t.u[k : k + steps].mean(), 1.0])
+            left.append(t.x[k + steps] - x)
+    return np.array(phi), np.array(left)
+
+
+@pytest.mark.parametrize("widths", ["growing", "constant"])
+def test_the_largest_width_is_that_of_the_programme_as_written(widths: Any) -> None:
+    transients = runs(count=2, length=80)
+    model = fit(transients, "lp", additive="noise", horizons=[6], widths=widths)
+    phi, left = windows_naively(model, transients, 6)
+    T = 6 * 0.02
+    K, p = len(phi), 3
+    for i in range(2):
+        half = np.column_stack([T * np.abs(phi[:, :p]), np.ones(K)])
+        if widths == "constant":
+            half[:, :p] = 0.0
+        zero, one = np.zeros((K, 1)), np.ones((K, 1))
+        rows = [
+            np.hstack([T * phi, -half, zero]), np.hstack([-T * phi, -half, zero]), np.hstack([0.0 * phi, half, -one]),
+        ]  # fmt: skip
+        answer = linprog(
+            [*np.zeros(2 * p + 2), 1.0], np.vstack(rows), np.concatenate([left[:, i], -left[:, i], np.zeros(K)]),
+            bounds=[(None, None)] * (p + 1) + [(0, None)] * (p + 2),
+        )  # fmt: skip
+        found = model.fit_summary["horizons"][0]["max_width"][i]
+        assert found == pytest.approx(2.0 * answer.x[-1], rel=1e-6)
+
+
+def test_a_window_with_a_discarded_transition_is_left_out() -> None:
+    transients = runs(count=1)
+    x = transients[0].x.copy()
+    x[80] += 3.0
+    spoilt = [Transient(transients[0].t_ns, x, transients[0].u)]
+    model = fit(spoilt, additive="noise", horizons=STEPS, discard=2)
+    assert sorted(entry["k"] for entry in model.fit_summary["discarded"]) == [79, 80]
+    for facts in model.fit_summary["horizons"]:
+        assert facts["windows"] == sum(max(part - facts["steps"] + 1, 0) for part in (79, 78))
+        assert facts["max_width"].max() < 0.5
+    table = utilisation(model, spoilt)
+    assert (np.abs(table[80]) > 1.0).any(axis=1).all()
+
+
+def test_recordings_are_never_joined_and_modes_never_mixed() -> None:
+    first, other, _ = runs()
+    start = int(first.transitions().k[-1]) + 1  # the second recording begins at the number that would follow
+    gone = np.full((start, 2), np.nan)
+    second = Transient(
+        np.arange(start + len(other)) * 20_000_000,
+        np.vstack([gone, other.x]),
+        np.vstack([np.zeros((start, 1)), other.u]),
+    )
+    model = fit([first, second], additive="noise", horizons=[4])
+    assert model.fit_summary["horizons"][0]["windows"] == 2 * (len(first) - 4)
+    transients = runs(modes=True)
+    scheduled = fit(transients, additive="noise", schedule={"s1": Modes((1.0, 2.0))}, horizons=[4])
+    expected = 0
+    for t in transients:
+        s = t.s[:-1, 0]
+        expected += sum(len(set(s[k : k + 4])) == 1 for k in range(len(s) - 3))
+    assert scheduled.fit_summary["horizons"][0]["windows"] == expected < sum(len(t) - 4 for t in transients)
+    table = utilisation(scheduled, transients)
+    assert (~np.isnan(table[:, 0, 0])).sum() == expected and np.nanmax(np.abs(table)) <= 1.0
+
+
+def test_weights_are_those_of_the_arrival() -> None:
+    (transient,) = runs(count=1, length=60)
+    weights = np.ones((59, 2))
+    weights[40] = 1e6  # the arrival at sample 41 is to have the least width of all
+    plain = fit([transient], "lp", additive="noise", horizons=[5])
+    model = fit([transient], "lp", weights=weights, additive="noise", horizons=[5])
+    assert not np.array_equal(plain.horizons[0].v, model.horizons[0].v)
+    z = np.hstack([transient.x, transient.u])[:-1].T
+
+    def width_at(one: UncertainLTI, arrival: int) -> float:
+        (windows,) = one.windows(np.arange(59), z, transient.dt, [5])
+        centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
+        one.horizons[0].columns_centre_and_half(windows.z, windows.time, centre, half, windows.run)
+        return float(half[0, list(windows.last).index(arrival - 1)])
+
+    assert width_at(model, 41) < width_at(plain, 41)
+
+
+def test_horizons_without_windows_or_numbers_are_dropped_by_name() -> None:
+    transients = runs(length=40)
+    model = fit(transients, additive="noise", horizons=[4, 39])
+    assert [h.steps for h in model.horizons] == [4]
+    assert any("no horizon of 39 steps: 3 windows" in text for text in model.fit_summary["messages"])
+    away = model.replace(A=1e4 * np.eye(2))
+    problem = assemble(runs(), model.operating_point, None, "noise")
+    found, _, messages = fit_horizons(away, problem, [2, 140])
+    assert [h.steps for h in found] == [2] and "'x1' beyond all numbers" in messages[0]
+
+
+@pytest.mark.parametrize("bad", [[1], [2.5], [True], [0, 4]])
+def test_what_is_no_number_of_steps_is_refused(bad: Any) -> None:
+    with pytest.raises(FitError, match="whole numbers of steps"):
+        fit(runs(count=1), horizons=bad)
+
+
+def test_the_problem_as_written_has_one_step() -> None:
+    with pytest.raises(FitError, match="cvxpy states one step"):
+        fit(runs(count=1), horizons=[3], method="cvxpy")
