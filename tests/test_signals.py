@@ -442,7 +442,10 @@ def control(entry: str) -> str:
         ("[" * 5000, "is not YAML"),
         ("a: \x07", "is not YAML"),
         (b"\xff\xfe\x00", "is not YAML"),
-        ("clocks: /a\n" + X, "unknown key 'clocks' \\(is clock meant\\?\\); known are .*clock, controls, max_gap"),
+        (
+            "clocks: /a\n" + X,
+            "unknown key 'clocks' \\(is clock meant\\?\\); known are .*clock, controls, horizons, max_gap",
+        ),
         ("states: []", "'states' is empty; list at least one state"),
         ("controls: []", "'states' is empty"),
         ("states: {name: x}", "states: a list is wanted here, not a mapping"),

@@ -58,6 +58,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "knots or modes in recorded units; once or twice (default: what the signals file says)",
     )
     parser.add_argument(
+        "--horizons",
+        type=_horizons,
+        metavar="auto[:S]|S,...",
+        help="further envelopes, over these seconds, or over those up to S that hold on left-out data (auto) "
+        "(default: what the signals file says)",
+    )
+    parser.add_argument(
+        "--widths",
+        choices=("auto", "constant", "growing"),
+        help="their half-widths: growing with the state, constant, or what holds better on left-out data (auto)",
+    )
+    parser.add_argument(
         "--no-suggest",
         action="store_true",
         help="do not try, on a part of the recordings (some 4000 transitions), whether a schedule, or lags and "
@@ -105,8 +117,8 @@ def run(options: argparse.Namespace) -> int:
     """
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
-    from uncertain_lti.proposal.fitting import asked_for, is_auto
-    from uncertain_lti.reports.fit_text import fit_text, next_text, recording_text, schedule_text
+    from uncertain_lti.proposal.fitting import asked_for, horizons_asked_for, is_auto
+    from uncertain_lti.reports.fit_text import fit_text, horizons_text, next_text, recording_text, schedule_text
     from uncertain_lti.reports.validation_text import left_out_text
     from uncertain_lti.validation.fitted_model import leave_out_with_fit
     from uncertain_lti.validation.groups import resolve_groups
@@ -125,13 +137,16 @@ def run(options: argparse.Namespace) -> int:
     resolve_groups(transients, options.group)  # what is wrong with the key is found before the fit
     suggest = not options.no_suggest
     asked = asked_for(transients, schedule)
-    leaves_out = is_auto(asked) if asked else suggest
+    rule = horizons_asked_for(transients, options.horizons, options.widths)
+    leaves_out = (is_auto(asked) if asked else suggest) or (rule is not None and rule.leaves_out)
     with options.progress.stage("fitting") as step:
         model = fit(
             transients,
             options.criterion,
             additive=options.additive,
             schedule=schedule,
+            horizons=options.horizons,
+            widths=options.widths,
             groups=options.group if leaves_out else None,
             suggest=suggest,
             discard=options.discard,
@@ -154,6 +169,8 @@ def run(options: argparse.Namespace) -> int:
     else:
         for choice in model.fit_summary.get("schedule", []):
             print_summary(options, schedule_text(choice))
+        if choice := model.fit_summary.get("horizon_choice"):
+            print_summary(options, horizons_text(choice))
         print_summary(options, fit_text(model, transients))
         print_summary(options, left_out_text(left_out))
         print_summary(options, f"model written to {output}")
@@ -170,6 +187,10 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
 
     if options.discard:
         raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
+    if options.horizons is not None or options.widths is not None:
+        raise FitError(
+            "--horizons needs all recordings in memory; leave out --cache, --scheduler and --workers, or --horizons"
+        )
     schedule = _asked(options)
     if options.group is not None:
         raise FitError("--group needs all recordings in memory; leave out --cache, --scheduler and --workers")
@@ -254,6 +275,20 @@ def _schedule(text: str) -> tuple[str, str, Any]:
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"{knots!r} is neither auto, a number of knots, knots such as 0.2,0.5,0.9 nor modes such as modes:1,2,3"
+        ) from None
+
+
+def _horizons(text: str) -> Any:
+    """Auto, perhaps with the longest in seconds behind a colon, or seconds."""
+    if text == "auto":
+        return text
+    try:
+        if text.startswith("auto:"):
+            return {"longest": float(text.removeprefix("auto:"))}
+        return {"seconds": [float(value) for value in text.split(",")]}
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither auto, auto with the longest such as auto:1.0 nor seconds such as 0.1,0.5"
         ) from None
 
 

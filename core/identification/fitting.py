@@ -52,7 +52,7 @@ def fit(
     structure: Structure | None = None,
     schedule: Schedule | Mapping[str, Knots] | None = None,
     horizons: Sequence[int] = (),
-    widths: Widths = "growing",
+    widths: Widths | Mapping[int, Widths] = "growing",
     discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
@@ -84,8 +84,8 @@ def fit(
         As there, without "auto", which is refused.
     horizons : sequence of int
         Numbers of steps of further envelopes, each at least 2.
-    widths : {"growing", "constant"}
-        Half-widths of these that grow with |x| and |u|, or are the same everywhere.
+    widths : {"growing", "constant"} or mapping
+        Half-widths of these that grow with |x| and |u|, or are the same everywhere; for all, or by the steps.
     discard : int or float, default 0
         As in `uncertain_lti.fit`.
     method : {"working-set", "cvxpy"}

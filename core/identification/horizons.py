@@ -7,7 +7,7 @@ those of one step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,7 +53,7 @@ def fit_horizons(
     model: UncertainLTI,
     problem: Problem,
     steps: Sequence[int],
-    widths: Widths = "growing",
+    widths: Widths | Mapping[int, Widths] = "growing",
     criterion: str = "qp",
     progress: Callable[[str], None] | None = None,
 ) -> tuple[tuple[Horizon, ...], list[dict[str, Any]], list[str]]:
@@ -67,8 +67,8 @@ def fit_horizons(
         The transitions; a window ends where one is missing, also by being discarded.
     steps : sequence of int
         Numbers of steps, each at least 2.
-    widths : {"growing", "constant"}
-        Half-widths that grow with |x| and |u|, or the noise term alone.
+    widths : {"growing", "constant"} or mapping
+        Half-widths that grow with |x| and |u|, or the noise term alone; for all, or by the steps.
     criterion : {"qp", "lp"}
         Eq. (10) or eq. (11).
     progress : callable, optional
@@ -98,7 +98,6 @@ def fit_horizons(
     regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))
     columns = Columns(_UNKNOWN, regimes)
     zeros = {"dA": np.zeros((n, n)), "dB": np.zeros((n, p - n))}
-    structure = Structure(n, p - n, fixed=zeros) if widths == "constant" else None
     lengths = sorted(set(steps))
     for windows in model.windows(k, signals, problem.dt, lengths):
         if progress is not None:
@@ -130,7 +129,9 @@ def fit_horizons(
             windows.z[p:] if axes else None,
             windows.run,
         )
-        horizon, fact = _fitted(model, part, windows.steps, widths, criterion, structure, largest)
+        kind = widths[windows.steps] if isinstance(widths, Mapping) else widths
+        structure = Structure(n, p - n, fixed=zeros) if kind == "constant" else None
+        horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
         found.append(horizon)
         facts.append(fact)
     return tuple(found), facts, messages

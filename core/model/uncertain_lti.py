@@ -636,14 +636,38 @@ class UncertainLTI:
             (x - centre) / half; NaN where the window of the horizon is broken.
         """
         found = np.full((len(dt), len(self.horizons), self.n), np.nan)
-        steps = [horizon.steps for horizon in self.horizons]
-        for j, windows in enumerate(self.windows(k, z, dt, steps)):
-            horizon = self.horizons[j]
-            centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
-            horizon.columns_centre_and_half(windows.z, windows.time, centre, half, windows.run, self.schedule)
+        for j, (windows, centre, half) in enumerate(self._envelopes(k, z, dt)):
             with np.errstate(over="ignore", invalid="ignore"):
                 found[windows.last, j] = utilisation_of(x_next[windows.last].T - centre, half).T
         return found
+
+    def horizon_halves(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[Array]:
+        """Half-widths of the envelopes over several steps.
+
+        Parameters
+        ----------
+        k : array of int (N,)
+            As of `windows`.
+        z : array (n + m + q, N)
+            As of `windows`.
+        dt : array (N,)
+            s.
+
+        Yields
+        ------
+        array (n, K)
+            Of each horizon at the ends of its windows, normalised.
+        """
+        for _, _, half in self._envelopes(k, z, dt):
+            yield half
+
+    def _envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:
+        """Windows of each horizon, with the centre and half-width of the envelope at their ends."""
+        windows_of_each = self.windows(k, z, dt, [horizon.steps for horizon in self.horizons])
+        for horizon, windows in zip(self.horizons, windows_of_each, strict=True):
+            centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
+            horizon.columns_centre_and_half(windows.z, windows.time, centre, half, windows.run, self.schedule)
+            yield windows, centre, half
 
     def bounds(
         self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0, s: ArrayLike | None = None

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Knots, asked_by, check_names
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.horizon import Widths
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.proposal.horizons import choose_horizons, lengths_of
 from uncertain_lti.proposal.memories import suggest_memories
 from uncertain_lti.proposal.scheduling import choose_knots, knots_of
 from uncertain_lti.proposal.suggestion import suggest_schedule
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.additive import Additive
+from uncertain_lti.signals.horizon_rule import HorizonRule, WidthChoice
 
 
 def fit(
@@ -35,6 +39,8 @@ def fit(
     count: Literal["sample", "transient"] = "sample",
     structure: Structure | None = None,
     schedule: Schedule | Mapping[str, Knots] | None = None,
+    horizons: HorizonRule | Mapping[str, Any] | Sequence[int] | Literal["auto"] | None = None,
+    widths: WidthChoice | None = None,
     discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
@@ -77,6 +83,14 @@ def fit(
         "auto": as many as the recordings carry, by what is left out of the fit (`choose_knots`), with the table in
         `model.fit_summary["schedule"]`. Default: that of the signals file, else one block. With a
         schedule and an additive term the drift c is unknown, too: it moves the steady state from knot to knot.
+    horizons : HorizonRule, mapping, sequence of int or "auto", optional
+        Envelopes over several steps beside that of one: numbers of steps; `{"seconds": [0.1, 0.5]}`;
+        `{"longest": 1.0}`, a geometric set of horizons up to so many seconds, of which those stay that hold on what is
+        left out of the fit (`choose_horizons`); or "auto": the longest is chosen as well. The table is in
+        `model.fit_summary["horizon_choice"]`. Default: that of the signals file, else none.
+    widths : {"auto", "growing", "constant"}, optional
+        Half-widths over these horizons: growing with |x| and |u|, the same everywhere, or what holds better on what is
+        left out. Default: that of the signals file, else auto.
     discard : int or float, default 0
         Budget of transitions that need not be contained: a whole number, or a share of all below 1. They are chosen by
         their effect on the objective and listed in `model.fit_summary["discarded"]`, next to the widths with them.
@@ -92,7 +106,7 @@ def fit(
     progress : callable, optional
         Called with one line of text per pass over the data, and per discard.
     groups : sequence or str, optional
-        What is left out together, for "auto" and `suggest`: one name per recording, or a key, as in `validate`.
+        What is left out together, for what is chosen and `suggest`: one name per recording, or a key, as in `validate`.
     suggest : bool, default False
         Try, where no schedule is asked for, whether one would pay, or a lag, rate or difference of a signal, on a part
         of the recordings (`suggest_schedule`, `suggest_memories`). The answer is among the messages, its tables in
@@ -123,10 +137,11 @@ def fit(
         "method": method,
     }
     asked = asked_for(transients, schedule)
+    rule = horizons_asked_for(transients, horizons, widths)
     chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
     automatic = [name for name, knots in chosen.items() if _is_auto(knots)]
     suggest = suggest and not asked
-    if groups is not None and not (automatic or suggest):
+    if groups is not None and not (automatic or suggest or (rule is not None and rule.leaves_out)):
         raise FitError("groups are given, and the fit leaves nothing out; leave them out, or choose knots auto")
     if automatic and transient_weights is not None:
         raise FitError(
@@ -147,17 +162,40 @@ def fit(
         at = knots_of(choice.chosen.model, name) if choice.chosen.model is not None else []
         chosen = {**chosen, name: at or 1}
         resolved = choice.chosen.model.schedule if choice.chosen.model is not None else None
+    asked = (resolved or {}) if automatic else asked  # to the bit as it was judged
+    lengths: dict[int, Widths] = {}
+    choice_of_horizons: dict[str, Any] = {}
+    if rule is not None:
+        steps = lengths_of(rule, transients)
+        if not rule.leaves_out:
+            lengths = {h: "growing" if rule.widths == "growing" else "constant" for h in steps}
+        elif transient_weights is not None:
+            raise FitError(
+                "horizons are chosen by leaving recordings out, and transient_weights are for all of them; give steps "
+                "or seconds with widths, or count='transient'"
+            )
+        else:
+            chosen_horizons = choose_horizons(
+                transients, rule, steps, groups=groups, progress=progress, schedule=asked, **options
+            )
+            lengths, choice_of_horizons = chosen_horizons.chosen, chosen_horizons.facts()
+            listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
+            messages.append(f"{listed}: {chosen_horizons.reason}")
     model = fitting.fit(
         transients,
         **options,
         transient_weights=transient_weights,
-        schedule=(resolved or {}) if automatic else asked,  # to the bit as it was judged
+        schedule=asked,
+        horizons=list(lengths),
+        widths=lengths,
         describe_data=describe_data,
         seek_carriers=seek_carriers,
         alarm_rule=alarm_rule,
         progress=progress,
     )
     added: dict[str, Any] = {"schedule": facts} if facts else {}
+    if choice_of_horizons:
+        added["horizon_choice"] = choice_of_horizons
     if suggest:
         if transient_weights is not None or not _per_state(weights):
             added["suggestion"] = {"not_done": "the weights belong to the samples, of which a part is looked at"}
@@ -203,6 +241,50 @@ def asked_for(
         first = transients[0]
         check_names(schedule, [*first.state_names, *first.control_names, *first.scheduling_names])
     return schedule
+
+
+def horizons_asked_for(
+    transients: Sequence[Transient],
+    horizons: HorizonRule | Mapping[str, Any] | Sequence[int] | Literal["auto"] | None,
+    widths: WidthChoice | None = None,
+) -> HorizonRule | None:
+    """The horizons that a fit is asked for, by its arguments or by the signals file.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    horizons : HorizonRule, mapping, sequence of int, "auto" or None
+        As `fit` takes it.
+    widths : {"auto", "growing", "constant"} or None
+        As `fit` takes it.
+
+    Returns
+    -------
+    HorizonRule or None
+        None for one step.
+
+    Raises
+    ------
+    FitError
+        They are none, or there are half-widths and no horizons.
+    """
+    signals = transients[0].signals if transients else None
+    if horizons is None:
+        rule = None if signals is None else signals.horizons
+    else:
+        try:
+            rule = HorizonRule.of(dict(horizons) if isinstance(horizons, Mapping) else horizons)
+        except SignalError as error:
+            raise FitError(str(error)) from None
+    if widths is None:
+        return rule
+    if rule is None:
+        raise FitError(f"widths are {widths}, and no horizons are asked for; give horizons as well")
+    try:
+        return replace(rule, widths=widths)
+    except SignalError as error:
+        raise FitError(str(error)) from None
 
 
 def is_auto(schedule: Schedule | Mapping[str, Knots]) -> bool:

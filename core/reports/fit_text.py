@@ -78,6 +78,11 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
         table(("one-step envelope", "mean width", "largest", "rms step", "range", "width/range"), rows),
         *dynamics_text(model),
     ]
+    if over := facts.get("horizons"):
+        rows = [
+            [f"{h['steps']}", f"{h['seconds']:.3g}", h["widths"], *map(number, h["mean_width_recorded"])] for h in over
+        ]
+        lines.append(table(("mean width after steps", "s", "half-widths", *model.state_names), rows))
     if "discarded" in facts:
         gone, before = facts["discarded"], facts["with_discarded"]["mean_width_recorded"]
         lines.append(
@@ -119,6 +124,36 @@ def schedule_text(choice: Mapping[str, Any]) -> str:
     if rows:
         lines.append(table(("knots", "outside", "excess", "mean width", "at"), rows))
     return "\n".join([*lines, *(f"  {text}" for text in refused)])
+
+
+def horizons_text(choice: Mapping[str, Any]) -> str:
+    """How the horizons and their half-widths were chosen.
+
+    Parameters
+    ----------
+    choice : mapping of str to object
+        `fit_summary["horizon_choice"]`.
+
+    Returns
+    -------
+    str
+        A table of what was left out; the reason is among the notes of the fit.
+    """
+    rows = [
+        [
+            f"{c['steps']}{' (chosen)' if c['taken'] else ''}",
+            c["widths"],
+            f"{c['outside']:.2%}",
+            f"x {c['width']:.3g}",
+            f"x {c['per_step']:.3g}",
+            c["why"],
+        ]
+        for c in choice["candidates"]
+    ]
+    if not rows:
+        return f"horizons: {choice['reason']}"
+    title = f"horizons, by leaving out one {choice['left_out']} of {choice['units']} at a time (one step: x 1):"
+    return title + "\n" + table(("steps", "half-widths", "outside", "width", "per step", ""), rows)
 
 
 def _optimality_gap(facts: Mapping[str, Any]) -> str:

@@ -17,6 +17,7 @@ from uncertain_lti.signals.additive import CHOICES, CHOICES_TEXT, Additive
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti.signals.file_values import checked_mapping, checked_number, kind_in_yaml, load_yaml
+from uncertain_lti.signals.horizon_rule import HorizonRule
 from uncertain_lti.signals.memory import LONGEST_DELAY, Memory, parse_memory
 from uncertain_lti.signals.table_layout import TableLayout
 from uncertain_lti.signals.templates import expand
@@ -198,6 +199,8 @@ class SignalMap:
         The additive term of a fit that is given none.
     schedule : tuple of ScheduleRule, optional
         How a fit that is given no schedule is scheduled; empty for one block.
+    horizons : HorizonRule or None, optional
+        Over which horizons a fit that is given none has envelopes; None for one step.
     structure : object, optional
         The rules on single elements that a fit keeps (`identification.structure`); None for no rule.
     table : TableLayout or None, optional
@@ -222,6 +225,7 @@ class SignalMap:
     time: Mapping[str, TimeSource] = field(default_factory=dict)
     additive: Additive | None = None
     schedule: tuple[ScheduleRule, ...] = ()
+    horizons: HorizonRule | None = None
     structure: Any = None
     table: TableLayout | None = None
     source: str = "signals"
@@ -531,6 +535,7 @@ class SignalMap:
                 "step",
                 "additive",
                 "schedule",
+                "horizons",
                 "structure",
                 "table",
                 "topics",
@@ -567,6 +572,9 @@ class SignalMap:
             time=time,
             additive=additive,
             schedule=_schedule(top.get("schedule"), f"{source}: schedule"),
+            horizons=HorizonRule.of(top["horizons"], f"{source}: horizons")
+            if top.get("horizons") is not None
+            else None,
             structure=top.get("structure"),
             table=TableLayout.from_dict(top["table"], f"{source}: table") if top.get("table") is not None else None,
             source=source,

@@ -66,7 +66,7 @@ def validate(
     progress : callable, optional
         Called with one line of text per fit.
     **options : object
-        Further arguments of `fit`. Every fit has the schedule of the fit to all recordings, with its knots.
+        Further arguments of `fit`. Every fit has the schedule and the horizons of the fit to all recordings.
 
     Returns
     -------
@@ -90,6 +90,8 @@ def validate(
     elif alarm_rule is not None:
         full = full.replace(alarm_rule=alarm_rule)
     options["schedule"] = full.schedule or {}  # none, even where the signals file asks for one
+    options["horizons"] = [horizon.steps for horizon in full.horizons]
+    options["widths"] = {horizon.steps: horizon.widths for horizon in full.horizons}
     if groups is not None and blocks is not None:
         raise FitError("groups leave out whole recordings, and blocks cut them; choose one")
     names, grouping = resolve_groups(transients, groups)

@@ -13,7 +13,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, Transitions
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,6 +54,10 @@ class Part:
         Fitted without it.
     transient : Transient, optional
         What was left out.
+    longer : array (K, H, n), optional
+        Utilisation by each horizon of the full model; NaN where a window is broken, or the left-out model has none.
+    longer_width : array (H, n), optional
+        Mean width of the left-out model's envelopes over each horizon on this part, recorded units; NaN likewise.
     """
 
     name: str
@@ -72,6 +76,8 @@ class Part:
     block: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     model: UncertainLTI | None = None
     transient: Transient | None = None
+    longer: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    longer_width: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
@@ -189,7 +195,21 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         full.main_block(full.normalised_columns(steps)),
         model,
         transient,
+        *_longer(model, full, steps, verdicts.horizon_utilisation[judged][:, 1:]),
     )
+
+
+def _longer(model: UncertainLTI, full: UncertainLTI, steps: Transitions, table: Array) -> tuple[Array, Array]:
+    """Utilisation and mean widths over the horizons of the full model."""
+    places = {horizon.steps: j for j, horizon in enumerate(full.horizons)}
+    utilisation = np.full((len(steps.dt), len(places), model.n), np.nan)
+    width = np.full((len(places), model.n), np.nan)
+    halves = model.horizon_halves(steps.k, model.normalised_columns(steps), steps.dt)
+    for j, (horizon, half) in enumerate(zip(model.horizons, halves, strict=True)):
+        utilisation[:, places[horizon.steps]] = table[:, j]
+        if half.size:
+            width[places[horizon.steps]] = 2.0 * half.mean(axis=1) * model.operating_point.X
+    return utilisation, width
 
 
 def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:

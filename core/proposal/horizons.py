@@ -1,0 +1,304 @@
+"""Choice of horizons: which envelopes over several steps hold on left-out data and see slower changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import fit
+from uncertain_lti.model.horizon import MOST_STEPS, Widths
+from uncertain_lti.proposal.scheduling import EXCESS, FOLDS, PAYS, SLACK, fold_of
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.horizon_rule import HorizonRule
+from uncertain_lti.validation.left_out import validate
+from uncertain_lti.validation.part import by_unit
+
+MOST = 64
+"""Steps of the longest horizon that is chosen; longer ones are listed one by one."""
+SHARE = 0.1
+"""Longest horizon that is tried where none is asked for, relative to the median recording."""
+ALLOWED = 5 * EXCESS
+"""Share of all left-out windows that may be outside beyond 1 + SLACK times the share of one step: a single transition
+outside is in as many windows as they have steps."""
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonCandidate:
+    """One horizon with one kind of half-widths, judged on what was left out of its fits.
+
+    Parameters
+    ----------
+    steps : int
+        Number of steps.
+    widths : {"growing", "constant"}
+        Half-widths.
+    judged : array (units,)
+        Left-out windows of each recording, group or block.
+    outside : array (units,)
+        Those outside the envelope of some state.
+    log_width : float
+        Logarithm of the mean half-width relative to that of one step, the mean over states and left-out parts.
+    """
+
+    steps: int
+    widths: Widths
+    judged: Array = field(default_factory=lambda: np.zeros(0))
+    outside: Array = field(default_factory=lambda: np.zeros(0))
+    log_width: float = math.nan
+
+    @property
+    def share(self) -> float:
+        """Share of the left-out windows outside."""
+        return float(self.outside.sum() / self.judged.sum()) if self.judged.sum() else math.nan
+
+    @property
+    def per_step(self) -> float:
+        """Mean half-width over the steps, relative to that of one step: how slow a change must be to pass unseen."""
+        return math.exp(self.log_width) / self.steps
+
+    def excess(self, base: HorizonCandidate) -> float:
+        """Share outside beyond 1 + SLACK times that of another, over the parts in which there is any.
+
+        Parameters
+        ----------
+        base : HorizonCandidate
+            The other, on the same left-out parts.
+
+        Returns
+        -------
+        float
+            Of all left-out windows.
+        """
+        share = np.divide(base.outside, base.judged, out=np.zeros_like(base.judged), where=base.judged > 0)
+        beyond = np.maximum(self.outside - (1.0 + SLACK) * share * self.judged, 0.0)
+        return float(beyond.sum() / max(self.judged.sum(), 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonChoice:
+    """The horizons that hold on left-out data.
+
+    Parameters
+    ----------
+    chosen : dict of int to {"growing", "constant"}
+        Half-widths of each number of steps; empty if none is worth having.
+    rows : tuple of dict
+        The table: every candidate with its numbers, whether it was taken, and why.
+    what : str
+        What was left out at a time.
+    units : int
+        How many times.
+    reason : str
+        In words.
+    """
+
+    chosen: dict[int, Widths]
+    rows: tuple[dict[str, Any], ...]
+    what: str
+    units: int
+    reason: str
+
+    def facts(self) -> dict[str, Any]:
+        """As plain data for `fit_summary`.
+
+        Returns
+        -------
+        dict
+            The table, the choice and the reason.
+        """
+        return {
+            "left_out": self.what,
+            "units": self.units,
+            "candidates": list(self.rows),
+            "chosen": {str(steps): widths for steps, widths in self.chosen.items()},
+            "reason": self.reason,
+        }
+
+
+def lengths_of(rule: HorizonRule, transients: Sequence[Transient]) -> list[int]:
+    """Numbers of steps that a rule asks for, or that are to be tried.
+
+    Parameters
+    ----------
+    rule : HorizonRule
+        The rule.
+    transients : sequence of Transient
+        The recordings, for their median step and length.
+
+    Returns
+    -------
+    list of int
+        Increasing.
+
+    Raises
+    ------
+    FitError
+        A horizon is shorter than two steps, or longer than a model holds.
+    """
+    steps = [t.dt[t.usable] for t in transients]
+    every = np.concatenate(steps)
+    if not len(every):
+        return []
+    step = float(np.median(every))
+    if rule.steps:
+        lengths = sorted(set(rule.steps))
+    elif rule.seconds:
+        lengths = sorted({round(value / step) for value in rule.seconds})
+    else:
+        longest = SHARE * float(np.median([s.sum() for s in steps])) if rule.longest is None else rule.longest
+        last = min(round(longest / step), MOST)
+        lengths = []
+        while last >= 2:
+            lengths.insert(0, last)
+            last = round(last / 2)
+    wanted = rule.steps or rule.seconds or rule.longest is not None
+    if wanted and (not lengths or lengths[0] < 2):
+        raise FitError(f"horizons: the median step is {step:.4g} s, and a horizon has at least two; give longer ones")
+    if lengths and lengths[-1] > MOST_STEPS:
+        raise FitError(f"horizons: {lengths[-1]} steps of {step:.4g} s; at most {MOST_STEPS} are possible")
+    return lengths
+
+
+def choose_horizons(
+    transients: Sequence[Transient],
+    rule: HorizonRule,
+    lengths: Sequence[int],
+    *,
+    groups: Sequence[Any] | str | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> HorizonChoice:
+    """Which horizons, and which half-widths, hold on what is left out of the fit.
+
+    Each recording, group, or block of a single recording is left out in turn and judged. Of one horizon, half-widths
+    that grow are taken if no more than ALLOWED of the left-out windows are outside beyond 1 + SLACK times those of
+    constant ones, and they are narrower by PAYS; else constant ones. A horizon that was not asked for by its length
+    stays if the same holds of its windows and the transitions of one step, and if its half-width per step is at most
+    PAYS of that of the horizon before it: then it sees slower changes.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    rule : HorizonRule
+        What is asked for.
+    lengths : sequence of int
+        Of `lengths_of`.
+    groups : sequence or str, optional
+        As in `validate`.
+    progress : callable, optional
+        Called with one line of text per kind of half-widths.
+    **options : object
+        Further arguments of `fit`, with the schedule.
+
+    Returns
+    -------
+    HorizonChoice
+        The choice with its table.
+
+    Raises
+    ------
+    FitError
+        No model can be fitted.
+    """
+    kinds: tuple[Widths, ...] = get_args(Widths) if rule.widths == "auto" else (rule.widths,)
+    asked = bool(rule.steps or rule.seconds)
+    base: HorizonCandidate | None = None
+    found: dict[int, dict[str, HorizonCandidate]] = {}
+    what, units = "recording", 0
+    for kind in kinds:
+        if progress is not None:
+            progress(f"{kind} half-widths over {', '.join(map(str, lengths))} steps")
+        model = fit(transients, describe_data=False, horizons=lengths, widths=kind, **options)
+        try:
+            fold = fold_of(transients, groups, model, FOLDS)
+            left = validate(
+                transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap,
+                **{k: v for k, v in options.items() if k not in ("operating_point", "schedule")},
+            )  # fmt: skip
+        except FitError as error:
+            text = f"nothing can be left out: {error}"
+            chosen: dict[int, Widths] = {h.steps: "constant" for h in model.horizons} if asked else {}
+            return HorizonChoice(chosen, (), what, 0, text)
+        what = fold.what
+        parts = left.parts
+        judged = by_unit(parts, [part.judged for part in parts])
+        units = len(judged)
+        base = base or HorizonCandidate(1, "growing", judged, by_unit(parts, [part.violated for part in parts]), 0.0)
+        for j, horizon in enumerate(model.horizons):
+            windows = [np.abs(part.longer[:, j]) for part in parts]
+            logs = [
+                float(np.mean(np.log(np.maximum(part.longer_width[j], 1e-300) / np.maximum(part.mean_width, 1e-300))))
+                for part in parts
+                if np.isfinite(part.longer_width[j]).all()
+            ]
+            found.setdefault(horizon.steps, {})[kind] = HorizonCandidate(
+                horizon.steps,
+                kind,
+                by_unit(parts, [float(np.isfinite(w).all(axis=1).sum()) for w in windows]),
+                by_unit(parts, [float((w > 1.0).any(axis=1).sum()) for w in windows]),
+                float(np.mean(logs)) if logs else math.nan,
+            )
+    assert base is not None
+    return _decided(found, base, asked, what, units)
+
+
+def _decided(
+    found: dict[int, dict[str, HorizonCandidate]], base: HorizonCandidate, asked: bool, what: str, units: int
+) -> HorizonChoice:
+    """The table and what it says."""
+    rows: list[dict[str, Any]] = []
+    chosen: dict[int, Widths] = {}
+    reached = 1.0
+    for steps, kinds in sorted(found.items()):
+        constant, growing = kinds.get("constant"), kinds.get("growing")
+        best = constant or growing
+        assert best is not None
+        if constant is not None and growing is not None and growing.excess(constant) <= ALLOWED:
+            if growing.log_width <= constant.log_width + math.log(PAYS):
+                best = growing
+        why = "asked for" if asked else ""
+        if not asked:
+            if not best.judged.sum():
+                why = "no left-out part is so long"
+            elif best.excess(base) > ALLOWED:
+                why = f"{best.share:.1%} of the left-out windows are outside, {base.share:.1%} of the single steps"
+            elif not best.per_step <= PAYS * reached:
+                why = "sees no slower changes than the horizon before it"
+        taken = asked or not why
+        if taken:
+            chosen[steps], reached = best.widths, best.per_step
+        for one in (constant, growing):
+            if one is None:
+                continue
+            other = f"{best.widths} half-widths hold better" if constant and growing else ""
+            rows.append(
+                {
+                    "steps": steps,
+                    "widths": one.widths,
+                    "outside": one.share,
+                    "width": math.exp(one.log_width),
+                    "per_step": one.per_step,
+                    "taken": taken and one is best,
+                    "why": (why or "holds, and sees slower changes") if one is best else other,
+                }
+            )
+    if not found:
+        reason = "no recording is long enough for a horizon"
+    elif not chosen:
+        reason = "none holds on left-out data as well as one step and sees slower changes"
+    else:
+        last = max(chosen)
+        row = next(r for r in rows if r["steps"] == last and r["taken"])
+        reason = (
+            f"{plural(last, 'step')}, {row['widths']} half-widths: {1 - row['outside']:.2%} of the left-out windows "
+            f"are inside, and the half-width is x {row['width']:.3g} of one step's"
+        )
+    return HorizonChoice(chosen, tuple(rows), what, units, reason)

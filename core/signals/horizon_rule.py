@@ -1,0 +1,104 @@
+"""HorizonRule: over which horizons a fit is to have envelopes, as it is asked for."""
+
+from __future__ import annotations
+
+import reprlib
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.signals.file_values import checked_mapping, checked_number
+
+WidthChoice = Literal["auto", "growing", "constant"]
+"""Half-widths that grow with |x| and |u|, are the same everywhere, or what holds better on left-out data."""
+_KEYS = ("longest", "steps", "seconds")
+
+
+@dataclass(frozen=True)
+class HorizonRule:
+    """What a fit is asked for; without a length the longest horizon is chosen as well.
+
+    Parameters
+    ----------
+    longest : float or None, optional
+        Longest horizon, s: a geometric set of horizons up to it, of which those stay that hold on left-out data.
+    steps : tuple of int, optional
+        Numbers of steps, each at least 2; all stay.
+    seconds : tuple of float, optional
+        The same in s.
+    widths : {"auto", "growing", "constant"}
+        Half-widths.
+
+    Raises
+    ------
+    SignalError
+        More than one of the lengths is given, or they are no such numbers.
+    """
+
+    longest: float | None = None
+    steps: tuple[int, ...] = ()
+    seconds: tuple[float, ...] = ()
+    widths: WidthChoice = "auto"
+
+    def __post_init__(self) -> None:
+        given = [key for key in _KEYS if getattr(self, key) not in (None, ())]
+        if len(given) > 1:
+            raise SignalError(f"horizons: {' and '.join(given)} are given; give one of them")
+        if self.widths not in get_args(WidthChoice):
+            raise SignalError(f"horizons: widths is {self.widths!r}; write auto, growing or constant")
+        for h in self.steps:
+            if isinstance(h, bool) or not isinstance(h, int) or h < 2:
+                raise SignalError(f"horizons: steps has {reprlib.repr(h)}; write whole numbers of at least 2")
+        for value in (*self.seconds, *(() if self.longest is None else (self.longest,))):
+            if not (isinstance(value, (int, float)) and 0.0 < value < float("inf")):
+                raise SignalError(f"horizons: {reprlib.repr(value)} is no length of a horizon; write seconds above 0")
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether something is to be chosen by what is left out of the fit."""
+        return self.widths == "auto" or not (self.steps or self.seconds)
+
+    @classmethod
+    def of(cls, data: Any, where: str = "horizons") -> HorizonRule:
+        """From what a signals file, or an argument of `fit`, has.
+
+        Parameters
+        ----------
+        data : Any
+            "auto", a list of numbers of steps, or an object with one of longest, steps and seconds, and widths.
+        where : str, default "horizons"
+            What errors call it.
+
+        Returns
+        -------
+        HorizonRule
+            The rule.
+
+        Raises
+        ------
+        SignalError
+            It is none; names the key.
+        """
+        if isinstance(data, cls):
+            return data
+        if isinstance(data, str) and data == "auto":
+            return cls()
+        if isinstance(data, (list, tuple)):
+            data = {"steps": list(data)}
+        if not isinstance(data, dict):
+            raise SignalError(f"{where} is {reprlib.repr(data)}; write auto, or longest, steps or seconds with widths")
+        entry = checked_mapping(data, where, {*_KEYS, "widths"})
+        lists: dict[str, tuple[Any, ...]] = {}
+        for key in ("steps", "seconds"):
+            values = entry.get(key)
+            if values is None:
+                continue
+            if not isinstance(values, (list, tuple)) or not values:
+                raise SignalError(f"{where}: {key} is {reprlib.repr(values)}; write a list of numbers")
+            lists[key] = tuple(values)
+        longest = entry.get("longest")
+        longest = None if longest in (None, "auto") else checked_number(longest, f"{where}: longest")
+        try:
+            return cls(longest, **lists, widths=entry.get("widths", "auto"))
+        except SignalError as error:
+            raise SignalError(f"{where}: {str(error).removeprefix('horizons: ')}") from None
