@@ -25,7 +25,8 @@ from test_sampler_arrays import columns
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli.main import main
-from uncertain_lti.monitor.outputs import JUDGED, NODE, RECORDED
+from uncertain_lti.monitor import outputs
+from uncertain_lti.monitor.outputs import NODE, RECORDED
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, NamedVector, VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag
@@ -36,7 +37,8 @@ from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.sampler_arrays import Decisions, decided
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
-TOPICS = {output.name: output.type for output in RECORDED}
+JUDGED = [output for output in outputs.JUDGED if output.of == "states"]
+TOPICS = {output.name: output.type for output in RECORDED if output.of == "states"}
 SIGNALS_FOLDER = BAGS.parent / "config" / "signals"
 
 

@@ -1,16 +1,26 @@
 """The table of output topics: what a verdict publishes, one row each."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from uncertain_lti import EnvelopeMonitor, Transient
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.model.domain import Domain
+from uncertain_lti.model.horizon import Horizon
+from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor.envelope_monitor import NUMBERS
-from uncertain_lti.monitor.outputs import FLAG_TYPE, OUTPUTS, RECORDED, VECTOR_TYPE, VIOLATION, Output
+from uncertain_lti.monitor.outputs import FLAG_TYPE, OUTPUTS, RECORDED, VECTOR_TYPE, VIOLATION, Output, names_of
 from uncertain_lti.monitor.verdict_messages import NamedVector, VerdictMessages, VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
+
+
+def with_horizons() -> UncertainLTI:
+    model = leibov2006()
+    arrays = {name: getattr(model, name) for name in ARRAYS}
+    return model.replace(horizons=[Horizon(h, **arrays) for h in (2, 3)])
 
 
 @pytest.mark.parametrize("output", OUTPUTS, ids=[output.name for output in OUTPUTS])
@@ -20,10 +30,11 @@ def test_every_row_is_whole(output: Output) -> None:
     assert bool(output.position) == (output.type == VECTOR_TYPE) == (output is not VIOLATION)
     assert bool(output.title) == (output.view in ("states", "steps"))
     if output.position:
-        assert output.position in NUMBERS
-        model = leibov2006()
+        assert (output.position in NUMBERS) == (output.of == "states")
+        model = with_horizons() if output.of == "horizons" else leibov2006()
         verdicts = EnvelopeMonitor(model).check(Transient(np.arange(3.0), np.ones((3, 5)), np.ones((3, 4))))
-        assert getattr(verdicts, output.position).shape == (3, model.n)
+        rows = names_of(model.state_names, model.steps)[output.of]
+        assert getattr(verdicts, output.position).reshape(3, -1).shape == (3, len(rows))
         assert not output.velocity or getattr(verdicts, output.velocity).shape == (3,)
 
 
@@ -33,9 +44,10 @@ def test_names_are_unique_and_those_of_every_message_come_first() -> None:
     assert every == sorted(every, reverse=True)
 
 
-def test_one_message_and_many_records_have_the_same_bytes() -> None:
+@pytest.mark.parametrize("make", [leibov2006, with_horizons])
+def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], UncertainLTI]) -> None:
     """Of a judged sample, one outside the domain, and one without a verdict, for every vector of the table."""
-    model = leibov2006()
+    model = make()
     model = model.replace(domain=Domain(*(sign * np.ones(k) for k in (model.n, model.m) for sign in (-1.0, 1.0))))
     monitor, names = EnvelopeMonitor(model), model.state_names
     inside, outside = [0.0] * (model.n + model.m), [1e6] * (model.n + model.m)
@@ -46,10 +58,15 @@ def test_one_message_and_many_records_have_the_same_bytes() -> None:
     ]
     verdicts = [monitor.judge(step) for step in steps]
     assert [v.judged for v in verdicts] == [True, True, False] and verdicts[1].outside_domain
-    encode = VerdictMessages(names).encode
-    numbers = {o.position: np.array([v.numbers(o.position) for v in verdicts]) for o in RECORDED if o.position}
+    encode = VerdictMessages(names, steps=model.steps).encode
+    outputs = [o for o in RECORDED if not o.position or names_of(names, model.steps)[o.of]]
+    assert ("horizon_utilisation" in encode) == bool(model.horizons) == (len(outputs) == len(RECORDED))
+    numbers = {o.position: np.array([v.numbers(o.position) for v in verdicts]) for o in outputs if o.position}
+    for verdict in verdicts:
+        for name in numbers:
+            assert verdict.packed(name) == np.array(verdict.numbers(name)).tobytes()
     numbers |= {o.velocity: np.array([getattr(v, o.velocity) for v in verdicts]) for o in RECORDED if o.velocity}
-    records = VerdictRecords(names, {output.name: i for i, output in enumerate(RECORDED)})
+    records = VerdictRecords(names, {output.name: i for i, output in enumerate(outputs)}, model.steps)
     times = np.arange(3)
     data, _ = records.encode(
         times,
@@ -58,7 +75,7 @@ def test_one_message_and_many_records_have_the_same_bytes() -> None:
         np.array([v.alarm for v in verdicts]),
         numbers,
     )
-    for output in RECORDED:
+    for output in outputs:
         for verdict in verdicts:
             if output.position:
                 message = encode[output.name](verdict)
@@ -67,3 +84,9 @@ def test_one_message_and_many_records_have_the_same_bytes() -> None:
     flags = [encode["flags"](verdict) for verdict in verdicts]
     velocities = [np.frombuffer(f[marks.velocity : marks.velocity + 8 * model.n], "<f8") for f in flags]
     np.testing.assert_array_equal(velocities, np.repeat([[0.0], [1.0], [np.nan]], model.n, axis=1))
+
+
+def test_the_numbers_of_horizons_are_named_by_state_and_steps() -> None:
+    every = names_of(["speed", "pressure"], [5, 40])
+    assert every["horizons"] == ("speed@1", "pressure@1", "speed@5", "pressure@5", "speed@40", "pressure@40")
+    assert names_of(["speed"], [])["horizons"] == ()

@@ -107,18 +107,20 @@ class Outputs:
             self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered)
         self._violation = self.publishers[VIOLATION.name]
 
-    def prepare(self, names: Sequence[str]) -> None:
+    def prepare(self, names: Sequence[str], steps: Sequence[int] = ()) -> None:
         """Lay out the messages of a model.
 
         Parameters
         ----------
         names : sequence of str
             Of its states.
+        steps : sequence of int
+            Of its horizons.
         """
-        encode = VerdictMessages(names, sendable).encode
+        encode = VerdictMessages(names, sendable, steps).encode
 
         def vectors(*when: str) -> list[_Vector]:
-            chosen = [output.name for output in OUTPUTS if output.position and output.when in when]
+            chosen = [output.name for output in OUTPUTS if output.name in encode and output.when in when]
             return [(self.publishers[name], encode[name]) for name in chosen]
 
         self._vectors = vectors("message"), vectors("message", "judged")

@@ -165,6 +165,7 @@ class Snapshots:
                 "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
             },
             definition,
+            session.model.steps,
         )
 
     @property

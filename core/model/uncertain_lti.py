@@ -227,6 +227,11 @@ class UncertainLTI:
         """Number of further scheduling signals, which are neither state nor control."""
         return len(self.signals.scheduling)
 
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """Steps of each horizon, the shortest first."""
+        return tuple(horizon.steps for horizon in self.horizons)
+
     @cached_property
     def blocks(self) -> tuple[UncertainLTI, ...]:
         """Each block as a model of its own, without a schedule; of a model without one, itself."""
@@ -663,7 +668,7 @@ class UncertainLTI:
 
     def _envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:
         """Windows of each horizon, with the centre and half-width of the envelope at their ends."""
-        windows_of_each = self.windows(k, z, dt, [horizon.steps for horizon in self.horizons])
+        windows_of_each = self.windows(k, z, dt, self.steps)
         for horizon, windows in zip(self.horizons, windows_of_each, strict=True):
             centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
             horizon.columns_centre_and_half(windows.z, windows.time, centre, half, windows.run, self.schedule)

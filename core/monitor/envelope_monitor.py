@@ -155,13 +155,18 @@ class Verdict:
             return ()
         return self._alarms.reasons(self._rules, self.statistics.tolist(), self.horizon_utilisation, self.flags)
 
+    @property
+    def horizons(self) -> int:
+        """Number of horizons of the model."""
+        return 0 if self._longer is None else len(self._longer) // self.n
+
     def numbers(self, name: str) -> list[float]:
         """Numbers of one kind.
 
         Parameters
         ----------
         name : str
-            One of `NUMBERS`.
+            One of `NUMBERS`, or horizon_utilisation, row by row.
 
         Returns
         -------
@@ -170,6 +175,8 @@ class Verdict:
         """
         if name == "state":
             return list(self._after)
+        if name == "horizon_utilisation":
+            return [*self.numbers("utilisation"), *(() if self._longer is None else self._longer)]
         if self._judgement is None:
             return [math.nan] * len(self._after)
         return list[float](self._judgement.numbers(_OF_JUDGEMENT[name]).tolist())
@@ -180,7 +187,7 @@ class Verdict:
         Parameters
         ----------
         name : str
-            One of `NUMBERS`.
+            One of `NUMBERS`, or horizon_utilisation, row by row.
 
         Returns
         -------
@@ -188,6 +195,8 @@ class Verdict:
             Little-endian doubles.
         """
         found = self._after
+        if name == "horizon_utilisation":
+            return self.packed("utilisation") + (b"" if self._longer is None else bytes(self._longer.tobytes()))
         if name != "state":
             if self._judgement is not None:
                 return bytes(self._judgement.numbers(_OF_JUDGEMENT[name]).tobytes())

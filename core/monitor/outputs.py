@@ -5,6 +5,7 @@ Publishers of the node, snapshots, annotated recordings, layouts of viewers and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -38,6 +39,9 @@ class Output:
         Title of its plot, for the views "states" and "steps".
     limits : tuple of (str, float)
         Constant lines of its plot, for the view "states".
+    of : {"states", "horizons"}
+        What its numbers are of: the states, or the states at one step and at each horizon of the model. A model without
+        horizons does not have the latter.
     """
 
     name: str
@@ -49,6 +53,7 @@ class Output:
     view: Literal["", "bound", "sample", "states", "steps", "alarm"] = ""
     title: str = ""
     limits: tuple[tuple[str, float], ...] = ()
+    of: Literal["states", "horizons"] = "states"
 
 
 FLAGS = Output(
@@ -87,6 +92,15 @@ OUTPUTS = (
         limits=(("upper bound", 1.0), ("lower bound", -1.0)),
     ),
     Output(
+        "horizon_utilisation",
+        VECTOR_TYPE,
+        "judged",
+        "of a model with horizons, the utilisation after one step and after each number of steps; `name` is "
+        "`state@steps`, NaN where fewer transitions follow one another",
+        position="horizon_utilisation",
+        of="horizons",
+    ),
+    Output(
         "predicted_lower",
         VECTOR_TYPE,
         "predicted",
@@ -102,3 +116,22 @@ RECORDED = tuple(output for output in OUTPUTS if output.when != "predicted")
 """The outputs that files hold: all that depend on verdicts alone."""
 JUDGED = tuple(output for output in OUTPUTS if output.when == "judged")
 """The outputs that only a verdict has."""
+
+
+def names_of(states: Sequence[str], steps: Sequence[int]) -> dict[str, tuple[str, ...]]:
+    """Names of the numbers that outputs carry, by what they are of.
+
+    Parameters
+    ----------
+    states : sequence of str
+        Of the model.
+    steps : sequence of int
+        Of its horizons.
+
+    Returns
+    -------
+    dict of str to tuple of str
+        `state@steps` for horizons, one step first; none without horizons.
+    """
+    over = [1, *steps] if steps else []
+    return {"states": tuple(states), "horizons": tuple(f"{name}@{h}" for h in over for name in states)}

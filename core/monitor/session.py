@@ -860,7 +860,9 @@ class Session:
         values["masked"] = str(int(masked))
         violated = period.violations[i]
         if self.last is not None:
-            values |= {output.name: repr(self.last.numbers(output.position)[i]) for output in JUDGED}
+            values |= {
+                output.name: repr(self.last.numbers(output.position)[i]) for output in JUDGED if output.of == "states"
+            }
             if not period.verdicts:  # the clock is slower than the reports
                 violated = int(self.last.numbers("flags")[i] == 1.0)
         age = f"last verdict {without:.1f} s ago: "

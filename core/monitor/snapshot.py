@@ -120,6 +120,8 @@ class Scene:
         Pairs for a metadata record.
     definition : callable
         Type name -> text of its definition.
+    steps : sequence of int
+        Of the horizons of the model.
     """
 
     entries: Sequence[Entry]
@@ -128,6 +130,7 @@ class Scene:
     outputs: Mapping[str, str]
     notes: Mapping[str, str]
     definition: Callable[[str], str]
+    steps: Sequence[int] = ()
 
     def write(self, path: Path) -> int:
         """Write an MCAP file.
@@ -148,7 +151,7 @@ class Scene:
             The file cannot be written.
         """
         count = 0
-        encode = VerdictMessages(self.names).encode
+        encode = VerdictMessages(self.names, steps=self.steps).encode
         with open(path, "xb") as stream:
             writer = McapWriter(stream, "uncertain-lti")
             writer.metadata("uncertain_lti", self.notes)
@@ -156,7 +159,7 @@ class Scene:
             outputs = {
                 output: writer.channel(self.outputs[output.name], output.type, self.definition(output.type))
                 for output in RECORDED
-                if output.name in self.outputs
+                if output.name in self.outputs and (not output.position or output.name in encode)
             }
             log_time = 0
             for entry in self.entries:
@@ -166,7 +169,7 @@ class Scene:
                 writer.message(inputs[entry.topic], log_time, entry.data)
                 count += 1
                 for verdict in entry.verdicts:
-                    if verdict.n != len(self.names):
+                    if (verdict.n, verdict.horizons) != (len(self.names), len(self.steps)):
                         continue
                     for output, channel in outputs.items():
                         if output.when == "judged" and not verdict.judged:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.monitor.outputs import FLAG_TYPE, OUTPUTS, RECORDED, Output
+from uncertain_lti.monitor.outputs import FLAG_TYPE, OUTPUTS, RECORDED, Output, names_of
 from uncertain_lti.recordings.mcap_writer import INDEX_ENTRY, MESSAGE_HEAD
 
 _ENCAPSULATION = 4
@@ -97,6 +97,10 @@ class AnyVerdict(Protocol):
         """Number of states."""
 
     @property
+    def horizons(self) -> int:
+        """Number of horizons of the model."""
+
+    @property
     def judged(self) -> bool:
         """Whether there is a verdict."""
 
@@ -110,7 +114,7 @@ class AnyVerdict(Protocol):
         Parameters
         ----------
         name : str
-            One of `NUMBERS`.
+            One of `NUMBERS`, or horizon_utilisation.
 
         Returns
         -------
@@ -128,23 +132,35 @@ class VerdictMessages:
         Of the states.
     make_vector : callable, default NamedVector
         Makes the messages from names and `velocities`; raises ModelError.
+    steps : sequence of int
+        Of the model's horizons.
 
     Attributes
     ----------
     encode : dict
-        Of each vector of `OUTPUTS`, by name, the function that makes the message of a verdict.
+        Of each vector of `OUTPUTS` that the model has, by name, the function that makes the message of a verdict.
     """
 
-    def __init__(self, names: Sequence[str], make_vector: Callable[[Sequence[str], bool], NamedVector] = NamedVector):
+    def __init__(
+        self,
+        names: Sequence[str],
+        make_vector: Callable[[Sequence[str], bool], NamedVector] = NamedVector,
+        steps: Sequence[int] = (),
+    ) -> None:
+        every = names_of(names, steps)
+        self._over = make_vector(every["horizons"], False) if every["horizons"] else None
         self._plain, self._marked = make_vector(names, False), make_vector(names, True)  # shared: their stamps repeat
         n = len(names)
         self._marks = {mark: struct.pack(f"<{n}d", *[mark] * n) for mark in (False, True)}
         self._no_mark = struct.pack(f"<{n}d", *[_NAN] * n)
-        self.encode = {output.name: self._encoder(output) for output in OUTPUTS if output.position}
+        self.encode = {output.name: self._encoder(output) for output in OUTPUTS if output.position and every[output.of]}
 
     def _encoder(self, output: Output) -> Callable[[AnyVerdict], bytes]:
         plain, marked, marks, no_mark = self._plain, self._marked, self._marks, self._no_mark
         position, velocity = output.position, output.velocity
+        if output.of == "horizons":
+            assert self._over is not None and not velocity
+            plain = self._over
 
         def encode(verdict: AnyVerdict) -> bytes:
             return plain(verdict.t_ns, verdict.packed(position))
@@ -164,19 +180,21 @@ class VerdictRecords:
     names : sequence of str
         Of the states.
     channels : mapping of str to int
-        Number of the channel of each of `RECORDED`, by name.
+        Number of the channel of each of `RECORDED` that is to be there, by name.
+    steps : sequence of int
+        Of the model's horizons.
     """
 
-    def __init__(self, names: Sequence[str], channels: Mapping[str, int]) -> None:
-        self._n = len(names)
-        self._channels = [channels[output.name] for output in RECORDED]
-        self._count = [0] * len(RECORDED)
-        vectors = NamedVector(names), NamedVector(names, velocities=True)
-        self._vectors = {output.name: vectors[bool(output.velocity)] for output in RECORDED if output.position}
+    def __init__(self, names: Sequence[str], channels: Mapping[str, int], steps: Sequence[int] = ()) -> None:
+        self._n, every = len(names), names_of(names, steps)
+        self._outputs = [o for o in RECORDED if o.name in channels and (not o.position or every[o.of])]
+        self._channels = [channels[output.name] for output in self._outputs]
+        self._count = [0] * len(self._outputs)
+        self._vectors = {o.name: NamedVector(every[o.of], bool(o.velocity)) for o in self._outputs if o.position}
         row = bytearray()
         self._begins: list[int] = []
         self._unjudged = 0  # bytes of the records without a verdict, which come first
-        for output, channel in zip(RECORDED, self._channels, strict=True):
+        for output, channel in zip(self._outputs, self._channels, strict=True):
             data = FALSE if output.type == FLAG_TYPE else self._vectors[output.name].template
             self._begins.append(len(row))
             row += MESSAGE_HEAD.pack(_MESSAGE, MESSAGE_HEAD.size - 9 + len(data), channel, 0, 0, 0) + data
@@ -211,7 +229,7 @@ class VerdictRecords:
         alarm : array (K,) of bool
             As in `Verdicts`.
         numbers : mapping of str to array
-            Of each `position` in `RECORDED` the numbers (K, n), of each `velocity` the truth values (K,).
+            Of each `position` in `RECORDED` the numbers (K, ...), of each `velocity` the truth values (K,).
 
         Returns
         -------
@@ -227,7 +245,7 @@ class VerdictRecords:
         lengths = np.where(judged, self.size, self._unjudged)
         starts = np.cumsum(lengths) - lengths
         index: dict[int, bytes] = {}
-        for kind, (output, begin) in enumerate(zip(RECORDED, self._begins, strict=True)):
+        for kind, (output, begin) in enumerate(zip(self._outputs, self._begins, strict=True)):
             published = judged if output.when == "judged" else np.ones(count, dtype=bool)
             _fill(rows, begin + 11, (self._count[kind] + np.cumsum(published) - 1).astype("<u4"))
             self._count[kind] += int(published.sum())
@@ -240,7 +258,7 @@ class VerdictRecords:
                 vector = self._vectors[output.name]
                 _fill(rows, data + 4, seconds.astype("<i4"))
                 _fill(rows, data + 8, nanoseconds.astype("<u4"))
-                position = np.where(judged[:, None], numbers[output.position], _NAN)
+                position = np.where(judged[:, None], numbers[output.position].reshape(count, -1), _NAN)
                 _fill(rows, data + vector.position, position.astype("<f8"))
                 if output.velocity:
                     velocity = np.where(judged, numbers[output.velocity], _NAN)

@@ -26,7 +26,7 @@ from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
-from uncertain_lti.monitor.outputs import NODE, RECORDED
+from uncertain_lti.monitor.outputs import NODE, RECORDED, names_of
 from uncertain_lti.monitor.verdict_messages import VerdictRecords
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.containers import scan
@@ -183,12 +183,15 @@ def annotate(
             copier = Copier(writer)
             numbers = [copier.declare(part) for part in contents]
             base = _base({c.topic for part in contents for c in part.channels.values()})
+            there = names_of(model.state_names, model.steps)
             channels = {
                 output.name: copier.channel(_schema(copier, contents, output.type), f"{base}/{output.name}", "cdr", {})
                 for output in RECORDED
+                if there[output.of]
             }
             writer.metadata(METADATA, _about(contents, base, model, model_file, rule))
-            verdict_stream = _VerdictStream(writer, VerdictRecords(model.state_names, channels), verdicts, decisions)
+            records = VerdictRecords(model.state_names, channels, model.steps)
+            verdict_stream = _VerdictStream(writer, records, verdicts, decisions)
             total = sum(part.count for part in contents)
             counted: Iterable[object] = _weave(copier, contents, numbers, verdict_stream)
             if progress is not None:
