@@ -324,7 +324,7 @@ class WorkingSet:
         left: list[Row] = []
         while rows:
             for row in rows:
-                if deltas[row.i] <= (1.0 + NEAR) * bounds[row.i]:
+                if self._largest_width(row) <= (1.0 + NEAR) * bounds[row.i]:  # lifted over what is left outside
                     row.near = row.theta.copy(), row.d.copy(), row.limit, float(deltas[row.i])
                 row.regularisation *= 1e-2
             settle(rows)
