@@ -29,6 +29,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.repeats import repeats_of
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
@@ -220,6 +221,7 @@ def fit(
         facts["with_discarded"] = {
             key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
         }
+    model = model.replace(repeats=repeats_of(model, transients))
     if not horizons:
         return model.replace(fit_summary=facts)
     found, facts["horizons"], dropped = fit_horizons(

@@ -39,6 +39,7 @@ from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
 from uncertain_lti.model.horizon import Horizon, Windows, checked_horizons, unbroken_over, windows_of
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
@@ -96,6 +97,8 @@ class UncertainLTI:
         Every rule that raises the alarm; default the containment of one step alone.
     residuals : Residuals, optional
         Of the recordings of the fit; default unknown.
+    repeats : Repeats, optional
+        Exact repeats of healthy recordings; without them no state is called frozen.
     fit_summary : mapping, optional
         How the model was fitted; plain data that goes to the file as it is.
     validation : mapping, optional
@@ -126,6 +129,7 @@ class UncertainLTI:
         alarm_rule: AlarmRule | None = None,
         alarm: Sequence[Rule] | None = None,
         residuals: Residuals | None = None,
+        repeats: Repeats | None = None,
         fit_summary: Mapping[str, Any] | None = None,
         validation: Mapping[str, Any] | None = None,
     ) -> None:
@@ -183,6 +187,9 @@ class UncertainLTI:
         self.domain = domain or unbounded
         self.residuals = residuals
         self.alarm = self._alarm(alarm, alarm_rule)
+        self.repeats = repeats
+        if repeats is not None and len(repeats.longest_repeat_s) != n:
+            raise ModelError(f"field 'frozen' has {len(repeats.longest_repeat_s)} numbers for {plural(n, 'state')}")
         self.fit_summary = dict(fit_summary or {})
         self.validation = dict(validation or {})
         self.tables = tables({name: getattr(self, name) for name in ARRAYS})
@@ -553,6 +560,24 @@ class UncertainLTI:
         at = zip(self.schedule.recorded_values(signals), self.schedule.indices[r], self._positions, strict=True)
         return ", ".join(f"{signals[i].name} = {values[k]:.6g} {signals[i].unit}".rstrip() for values, k, i in at)
 
+    def own_rates(self, z: Array) -> Array:
+        """The elements a_ii of the nominal model, blended where there is a schedule.
+
+        Parameters
+        ----------
+        z : array (n + m + q, K)
+            Normalised [x; u; s].
+
+        Returns
+        -------
+        array (n, K)
+            1/s; NaN for a mode that is not listed.
+        """
+        own = np.diagonal(self.A, axis1=-2, axis2=-1)
+        if self.schedule is None:
+            return np.repeat(own[:, None], z.shape[1], axis=1)
+        return np.asarray(blended(own, *self.schedule.corners(z[self._positions])))
+
     def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
         """What judges one transition after another by the bounds of this model.
 
@@ -887,9 +912,11 @@ class UncertainLTI:
             name: getattr(self, name)
             for name in (
                 *ARRAYS, "schedule", "block_data", "horizons", "signals", "sampling", "domain", "alarm", "residuals",
-                "fit_summary", "validation",
+                "repeats", "fit_summary", "validation",
             )
         }  # fmt: skip
+        if self.repeats is not None and not {*ARRAYS, "schedule"}.isdisjoint(changes):
+            arguments["repeats"] = Repeats(self.repeats.longest_repeat_s)  # how far another model moves is not known
         return UncertainLTI(**{**arguments, **changes})
 
     # --- other tools ---

@@ -7,7 +7,7 @@ import struct
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -28,15 +28,18 @@ from uncertain_lti.model.bounds import (
     Judgement,
     contained,
     lower_of,
+    normalised,
     upper_of,
     utilisation_of,
 )
+from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, Raised
 from uncertain_lti.monitor.arming import Armed
+from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Looked
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, Transitions
 
 NUMBERS = ("flags", "lower", "upper", "state", "utilisation")
 """Numbers of a verdict, for each state."""
@@ -66,6 +69,13 @@ class Verdict:
         The rules after it, whose statistics and reasons it keeps.
     longer : buffer of doubles, optional
         Utilisation by the model's horizons, horizon after horizon; for models that have some.
+    looked : Looked, optional
+        What the step says of repeats.
+
+    Attributes
+    ----------
+    frozen, repeating : tuple of Moved
+        States that are frozen, and others that repeat for longer than ever in the fit.
     """
 
     __slots__ = (
@@ -75,6 +85,8 @@ class Verdict:
         "outside_domain",
         "unknown_regime",
         "alarm",
+        "frozen",
+        "repeating",
         "_after",
         "_judgement",
         "_before",
@@ -84,6 +96,9 @@ class Verdict:
         "_longer",
     )
 
+    frozen: tuple[Moved, ...]
+    repeating: tuple[Moved, ...]
+
     def __init__(
         self,
         step: Step,
@@ -92,7 +107,9 @@ class Verdict:
         status: Status | None = None,
         alarms: Alarm | None = None,
         longer: Any = None,
+        looked: Looked | None = None,
     ) -> None:
+        self.frozen, self.repeating = (looked.frozen, looked.repeating) if looked is not None else ((), ())
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, status or step.status
         self._after, self._before = step.after, step.before
         self.outside_domain = judgement is not None and judgement.outside_domain
@@ -274,6 +291,12 @@ class Verdicts:
     unknown_regime : array (N+1,) of bool
         A scheduling signal lies beyond the end knots, or no recording visited the regime; then the sample counts as
         outside the domain, too.
+    frozen : array (N+1, n) of bool
+        The state repeats exactly although the model moves it, so there is no verdict.
+    thawed : array (N+1,) of bool
+        A state was frozen one sample before and is not any more, so there is no verdict either.
+    repeating : array (N+1, n) of bool
+        The state repeats exactly for longer than ever in the fit, and is not frozen.
     statistics : array (N+1, S)
         Each statistic of the alarm over its threshold: beyond 1 and -1 it raises the alarm; NaN without a verdict.
     rule_alarms : array (N+1, rules) of bool
@@ -297,6 +320,9 @@ class Verdicts:
     unfitted_step: NDArray[np.bool_]
     unlisted_mode: NDArray[np.bool_]
     unknown_regime: NDArray[np.bool_]
+    frozen: NDArray[np.bool_]
+    thawed: NDArray[np.bool_]
+    repeating: NDArray[np.bool_]
     statistics: Array
     rule_alarms: NDArray[np.bool_]
     alarms: Alarm
@@ -337,13 +363,18 @@ class Verdicts:
         -------
         list of Status
             N+1, as of `Transient.statuses`, with STEP where a step is out of the range of the fit, MODE where the
-            model lists no such mode, and UNASKED where no verdict was asked for.
+            model lists no such mode, FROZEN where a state is frozen, and UNASKED where no verdict was asked for.
         """
         kinds = self.transient.statuses()
         for k in np.flatnonzero(~self.judged):
             if kinds[k] is Status.OK:  # but for the two below, a value is beyond what the arithmetic carries
                 kinds[k] = Status.MISSING
-        for which, kind in ((self.unfitted_step, Status.STEP), (self.unlisted_mode, Status.MODE)):
+        frozen = self.frozen.any(axis=1) | self.thawed
+        for which, kind in (
+            (self.unfitted_step, Status.STEP),
+            (self.unlisted_mode, Status.MODE),
+            (frozen, Status.FROZEN),
+        ):
             for k in np.flatnonzero(which):
                 kinds[k] = kind
         if self.asked is not None:
@@ -411,7 +442,8 @@ class EnvelopeMonitor:
     A sample is contained when lower <= x_next <= upper in the normalised quantities, nothing else (Leibov (2006),
     eqs. (8)(9)). Every rule of the alarm (m of n violations, a statistic over a window) looks at the last verdicts
     (messages without a verdict do not count) and starts over when time jumps back. A step shorter than half of, or
-    longer than twice, those that the model was fitted to has no verdict.
+    longer than twice, those that the model was fitted to has no verdict. Nor has one at whose end a state is frozen
+    (`frozen`), which raises the alarm.
 
     Parameters
     ----------
@@ -474,6 +506,10 @@ class EnvelopeMonitor:
         self.alarms = Alarm(every, model, self._counted)
         self._runs = model.runs_of(self._judge)
         self._nothing = None if self._runs is None else np.full(model.n * len(model.horizons), np.nan)
+        self.frozen_watch = self._watch()
+        self._frozen_alarm = False
+        own = np.diagonal(model.A).tolist() if model.schedule is None else None
+        self._own: list[float] | None = own
         self._shortest, self._longest = model.sampling.step_range
 
     def __repr__(self) -> str:
@@ -487,12 +523,36 @@ class EnvelopeMonitor:
 
     @property
     def alarm(self) -> bool:
-        """The alarm after the last verdict."""
-        return self.alarms.alarm
+        """The alarm after the last verdict, or that of a state that is frozen."""
+        return self.alarms.alarm or self._frozen_alarm
 
     def reset(self) -> None:
-        """Forget the recent verdicts and the alarm; windows of the horizons go on."""
+        """Forget the recent verdicts and the alarm.
+
+        Windows of the horizons go on, and a state that stays frozen raises the alarm again.
+        """
         self.alarms.reset()
+        self._frozen_alarm = False
+
+    def _watch(self) -> FrozenWatch | None:
+        """What tells frozen states; None if the model knows no repeats."""
+        if self.model.repeats is None:
+            return None
+        return FrozenWatch(self.model.repeats, self.rule.margin, self._counted.tolist())
+
+    def _forget_repeats(self) -> None:
+        self._frozen_alarm = False
+        if self.frozen_watch is not None:
+            self.frozen_watch.forget()
+
+    def _bounds_of(self, step: Step, judgement: Judgement) -> Bounds:
+        """What the watch asks for if a state repeats."""
+        own = self._own
+        if own is None:
+            point = self.model.operating_point
+            z = normalised(np.array(step.before, dtype=np.float64), point.steady, point.scale)
+            own = self.model.own_rates(z[:, None])[:, 0].tolist()
+        return judgement.numbers(LOWER).tolist(), judgement.numbers(UPPER).tolist(), own
 
     def predict(self, x: ArrayLike, u: ArrayLike, dt: float, s: ArrayLike = ()) -> tuple[Array, Array]:
         """Bounds one step ahead, recorded units.
@@ -568,10 +628,11 @@ class EnvelopeMonitor:
         Verdict
             With the alarm after it.
         """
-        alarms = self.alarms
+        alarms, watch = self.alarms, self.frozen_watch
         if step.status is Status.RESET or not armed:
             alarms.reset()
-        judgement, status = None, step.status
+            self._frozen_alarm = False
+        judgement, status, looked = None, step.status, None
         if status is Status.OK:
             if not contained(self._shortest, step.dt, self._longest):
                 status = Status.STEP
@@ -579,6 +640,13 @@ class EnvelopeMonitor:
                 status = Status.MISSING
             elif (judgement := self._judge.judge(step.before, step.after, step.dt)) is None:
                 status = Status.MODE
+        if judgement is not None and watch is not None:
+            looked = watch.look(step.t_ns, step.dt, step.before, step.after, partial(self._bounds_of, step, judgement))
+            self._frozen_alarm = armed and bool(looked.frozen)
+            if looked.no_verdict:
+                judgement, status = None, Status.FROZEN
+        elif not status.dropped:
+            self._forget_repeats()
         longer = self._nothing
         if self._runs is not None:
             if judgement is not None:
@@ -587,7 +655,7 @@ class EnvelopeMonitor:
                 self._runs.reset()
         if judgement is not None and armed:
             alarms.push(step.dt, judgement.violation, self._table(judgement, longer) if alarms.needs_table else None)
-        return Verdict(step, alarms.alarm, judgement, status, alarms, longer)
+        return Verdict(step, self.alarm, judgement, status, alarms, longer, looked)
 
     def _table(self, judgement: Judgement, longer: Any) -> array[float]:
         """Utilisation for one step and for each horizon, and the residual, row by row."""
@@ -651,6 +719,13 @@ class EnvelopeMonitor:
             z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
             flags[arrival], low, high, utilisation[arrival], residual = self._judge_all(z, steps.dt, x_next)
             lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
+        frozen, thawed, repeating = self._look_all(transient, steps, z, lower, upper)
+        if (without := frozen.any(axis=1) | thawed).any():
+            for numbers in (flags, lower, upper, utilisation):
+                numbers[without] = np.nan
+            kept = ~without[arrival]
+            steps, arrival, z, x_next = steps.take(kept), arrival[kept], z[:, kept], x_next[kept]
+            residual, unknown = residual[kept], unknown[kept]
         longer = np.full((count, len(model.horizons), n), np.nan)
         longer[arrival] = model.horizon_utilisation(steps.k, z, steps.dt, x_next)
         judged[arrival] = True
@@ -673,10 +748,47 @@ class EnvelopeMonitor:
             held = np.cumsum(judged[part])  # without a verdict the alarm stays as it was
             alarm[part] = np.concatenate([[False], after])[held]
             each[part] = np.concatenate([np.zeros((1, len(alarms.rules)), dtype=bool), by_rule])[held]
+        alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
         return Verdicts(
             transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
-            unknown_regime, statistics, each, alarms, longer,
+            unknown_regime, frozen, thawed, repeating, statistics, each, alarms, longer,
         )  # fmt: skip
+
+    def _look_all(
+        self, transient: Transient, steps: Transitions, z: Array, lower: Array, upper: Array
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+        """`frozen`, `thawed` and `repeating` of `Verdicts`, by the watch of `judge`, where some state repeats."""
+        count, n = lower.shape
+        frozen, repeating = np.zeros((count, n), dtype=bool), np.zeros((count, n), dtype=bool)
+        thawed = np.zeros(count, dtype=bool)
+        watch = self._watch()
+        if watch is None:
+            return frozen, thawed, repeating
+        repeats = np.asarray((steps.x == steps.x_next).any(axis=1))
+        after = np.concatenate([[False], repeats[:-1] & (np.diff(steps.k) == 1)]) if len(repeats) else repeats
+        rows = np.flatnonzero(repeats | after)  # what follows a repeat may thaw
+        own = self.model.own_rates(z[:, rows]).T
+        at = steps.k[rows] + 1
+        taken = (steps.dt[rows], steps.x[rows], steps.x_next[rows], lower[at], upper[at], own)
+        last, given = -1, list[list[float]]()
+
+        def bounds() -> Bounds:
+            lower, upper, own = given
+            return lower, upper, own
+
+        for k, t_ns, dt, x, x_next, *three in zip(
+            at.tolist(), transient.t_ns[at].tolist(), *(a.tolist() for a in taken), strict=True
+        ):
+            if k != last + 1:
+                watch.forget()
+            last, given = k, three
+            looked = watch.look(t_ns, dt, x, x_next, bounds)
+            thawed[k] = looked.thawed
+            for moved in looked.frozen:
+                frozen[k, moved.state] = True
+            for moved in looked.repeating:
+                repeating[k, moved.state] = True
+        return frozen, thawed, repeating
 
     def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array, Array]:
         """flags, lower, upper, utilisation, residual of transitions [x; u; s] (n + m + q, K), (K,), (K, n)."""

@@ -101,9 +101,12 @@ class EventLog:
             return
         self._alarm = session.alarm
         if session.alarm:
+            frozen = next((v.frozen for v in verdicts if v.alarm and v.frozen), ())
             cause = next((v for v in verdicts if v.alarm and v.violated), session.last)
             left = f": {_left(session, cause)}" if cause is not None and cause.violated else ""
             line = f"alarm, {session.rule_text()}{left}"
+            if frozen:
+                line = f"alarm, frozen: {'; '.join(session.frozen_text(moved) for moved in frozen[:_SHOWN])}"
             line += "; it lasts until ~/reset" if session.rule.latch else ""
             self._alarm_since = now
             self._named = self._matter("alarm").may(now)
@@ -211,6 +214,7 @@ class EventLog:
             (Status.RESET, "resets"),
             (Status.STEP, Status.STEP.value),
             (Status.MODE, Status.MODE.value),
+            (Status.FROZEN, Status.FROZEN.value),
         ):
             if since[name]:
                 found.append(WHY[status])

@@ -9,11 +9,13 @@ from dataclasses import dataclass, field
 
 from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Arming, Condition
 from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Waiting
 from uncertain_lti.monitor.deployed import condition_words
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
+from uncertain_lti.monitor.frozen import frozen_words, repeat_words
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
 from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
@@ -148,6 +150,9 @@ class Period:
         The last of these.
     alarm : bool, default False
         The alarm was raised at some time in it.
+    frozen, repeating : dict of int to Moved
+        By number of the state, the last repeat of those that were frozen, and of others that repeat for longer than
+        ever in the fit.
     violations : Counter of int
         By number of the state.
     statuses : Counter of Status
@@ -168,6 +173,8 @@ class Period:
     unknown: int = 0
     last_unknown: Verdict | None = None
     alarm: bool = False
+    frozen: dict[int, Moved] = field(default_factory=dict)
+    repeating: dict[int, Moved] = field(default_factory=dict)
     violations: Counter[int] = field(default_factory=Counter)
     statuses: Counter[Status] = field(default_factory=Counter)
     counters: Counter[str] = field(default_factory=Counter)
@@ -613,8 +620,11 @@ class Session:
         period = self.period
         if verdict.status is not Status.OK:  # looking up one of these is slow
             period.statuses[verdict.status] += 1
-            if verdict.status in (Status.STEP, Status.MODE):  # the sampler does not know the model
+            if verdict.status in (Status.STEP, Status.MODE, Status.FROZEN):  # the sampler does not know the model
                 self.sampler.counters[verdict.status.value] += 1
+        if verdict.frozen or verdict.repeating:
+            period.frozen |= {moved.state: moved for moved in verdict.frozen}
+            period.repeating |= {moved.state: moved for moved in verdict.repeating}
         alarm = self.alarm
         self.alarms += alarm and not alarm_before
         period.alarm |= alarm
@@ -770,7 +780,7 @@ class Session:
             complaints.append(f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}")
         if outside := period.outside - period.unknown:
             complaints.append(f"outside the fitted domain in {outside} of {period.verdicts} verdicts")
-        for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE):
+        for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE, Status.FROZEN):
             if period.statuses[status]:
                 which = ""
                 if status is Status.MISSING:
@@ -792,11 +802,15 @@ class Session:
             calm.append(f"masked: {', '.join(self.monitor.masked)}")
         if self.latched and not self.monitor.alarm:
             complaints.insert(0, "alarm: latched until ~/reset")
-        if without > timeout or not self.verdicts:
+        silent = self.silent_for(now)
+        frozen = [self.frozen_text(moved) for moved in period.frozen.values()]
+        if frozen and self.monitor.alarm and silent <= timeout:
+            level = ERROR
+            complaints.insert(0, f"alarm: frozen: {'; '.join(frozen)}")
+        elif without > timeout or not self.verdicts:
             level = ERROR if self.latched else STALE
             if self.monitor.alarm:
                 complaints.insert(0, "alarm: it was on at the last verdict")
-            silent = self.silent_for(now)
             if silent > timeout and self.sampler.clock in self._heard:
                 complaints.insert(0, f"no message on {self.sampler.clock} for {silent:.1f} s")
             else:
@@ -812,6 +826,22 @@ class Session:
         well = f"{period.verdicts} verdicts" if period.verdicts else f"last verdict {without:.1f} s ago"
         message = "; ".join([*(complaints or [f"{well}, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
+
+    def frozen_text(self, moved: Moved) -> str:
+        """What is said of a frozen state.
+
+        Parameters
+        ----------
+        moved : Moved
+            Its repeat.
+
+        Returns
+        -------
+        str
+            Names it.
+        """
+        assert self.model.repeats is not None
+        return frozen_words(self.model.state_names[moved.state], moved, self.model.repeats)
 
     def lacking(self, before: Counter[str]) -> list[str]:
         """Signals that samples had no value of since some counters.
@@ -866,7 +896,9 @@ class Session:
             if not period.verdicts:  # the clock is slower than the reports
                 violated = int(self.last.numbers("flags")[i] == 1.0)
         age = f"last verdict {without:.1f} s ago: "
-        if without > timeout:
+        if i in period.frozen:
+            level, message = ERROR, f"frozen: {self.frozen_text(period.frozen[i]).removeprefix(name).lstrip()}"
+        elif without > timeout:
             level, message = STALE, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet"
         elif violated:
             level = OK if masked else ERROR if period.alarm else WARN
@@ -878,6 +910,9 @@ class Session:
             level, message = OK, f"{age}within its bounds"
             if period.verdicts:
                 message = f"within its bounds in {period.verdicts} verdicts"
+        if i in period.repeating and i not in period.frozen and self.model.repeats is not None:
+            longest = self.model.repeats.longest_repeat_s[i]
+            level, message = max(level, WARN), f"{message}; {repeat_words(period.repeating[i].seconds, longest)}"
         return Report(level, name, f"{message} (masked)" if masked else message, values)
 
     def counts(self, now: float) -> dict[str, str]:
@@ -930,4 +965,5 @@ WHY = {
     Status.MISSING: "a signal is missing, stale or not finite",
     Status.MODE: "the scheduling signal has a value that the model does not list",
     Status.STEP: "the step is shorter or longer than those that the model was fitted to",
+    Status.FROZEN: "a state is frozen",
 }

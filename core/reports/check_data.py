@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.monitor.frozen import repeat_words
 from uncertain_lti.reports.regimes import check_regimes, sample_blocks, unknown_in_words
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.status import Status
@@ -29,7 +30,9 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     Counts, the first and the longest violation of each state, the spans in which the alarm was raised, widths and
     coverage; with samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no
     verdict). Of a scheduled model also `regimes`, what became of the verdicts in each, `unknown`, in words why a regime
-    is unknown or a mode has no verdict, and of each sample its `regime`, a position in `regimes`.
+    is unknown or a mode has no verdict, and of each sample its `regime`, a position in `regimes`. `frozen` and
+    `repeats` have the exact repeats that raised the alarm, and others longer than any of the fit, each from its last
+    fresh sample.
 
     Parameters
     ----------
@@ -49,6 +52,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     t = transient.t_ns
     judged = int(verdicts.judged.sum())
     odd = [(int(verdicts.unfitted_step.sum()), Status.STEP), (int(verdicts.unlisted_mode.sum()), Status.MODE)]
+    odd.append((int((verdicts.frozen.any(axis=1) | verdicts.thawed).sum()), Status.FROZEN))
     if verdicts.asked is not None:
         odd.append((int((~verdicts.asked).sum()), Status.UNASKED))
     width = np.where(verdicts.judged[:, None], verdicts.upper - verdicts.lower, np.nan)
@@ -84,6 +88,8 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "states": states,
         "alarm": bool(alarms),
         "alarms": [{**_instant(transient, start), **_length(t, (start, stop))} for start, stop in alarms],
+        "frozen": _repeats(model, verdicts, verdicts.frozen),
+        "repeats": _repeats(model, verdicts, verdicts.repeating & ~_before(verdicts.frozen, verdicts.repeating)),
     }
     share = data["outside_domain"] / judged if judged else 1.0
     unknown = share > UNVOUCHED
@@ -119,6 +125,40 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
             for k, status in enumerate(verdicts.statuses())
         ]
     return data
+
+
+def _repeats(model: UncertainLTI, verdicts: Verdicts, which: NDArray[np.bool_]) -> list[dict[str, Any]]:
+    """The repeats that some samples (N+1, n) belong to, in order of time."""
+    if model.repeats is None or not which.any():
+        return []
+    transient, found = verdicts.transient, []
+    for i, name in enumerate(model.state_names):
+        fresh = np.concatenate([[True], (np.diff(transient.x[:, i]) != 0) | (np.diff(transient.segment) > 0)])
+        begins = np.maximum.accumulate(np.where(fresh, np.arange(len(fresh)), 0))
+        for start, stop in _runs(which[:, i]):
+            begin = int(begins[start])
+            seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, start))
+            longest = float(model.repeats.longest_repeat_s[i])
+            found.append(
+                {
+                    "state": name,
+                    **_instant(transient, begin),
+                    "seconds": seconds,
+                    "told_after": told,
+                    "longest_in_fit": longest,
+                    "text": f"{name} {repeat_words(seconds, longest)} from {transient.t[begin]:.4f} s",
+                }
+            )
+    return sorted(found, key=lambda repeat: (repeat["k"], repeat["state"]))
+
+
+def _before(frozen: NDArray[np.bool_], longer: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Samples of `longer` whose repeat goes on to be frozen, which is told already."""
+    found = np.zeros_like(longer)
+    for i in range(longer.shape[1]):
+        for start, stop in _runs(longer[:, i]):
+            found[start:stop, i] = stop < len(frozen) and frozen[stop, i]
+    return found
 
 
 def outcome(recordings: Sequence[dict[str, Any]]) -> str:

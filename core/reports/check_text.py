@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.reports.regimes import MOST_REGIMES
 from uncertain_lti.reports.tables import number, table
+
+MOST_REPEATS = 5
+"""Frozen repeats that the text lists."""
 
 
 def check_text(data: dict[str, Any]) -> str:
@@ -54,6 +58,7 @@ def check_text(data: dict[str, Any]) -> str:
             share = data["unknown_regime"] / data["verdicts"]
             lines.append(f"unknown regime: {share:.2%} of the verdicts, which nothing vouches for")
     lines += [f"  {text}" for text in data["unknown"]]
+    lines += repeats_text(data)
     if data["alarm"]:
         first = data["alarms"][0]
         lines.append(
@@ -64,6 +69,30 @@ def check_text(data: dict[str, Any]) -> str:
     else:
         lines.append("no alarm" if data["verdicts"] else data["reason"])
     return "\n".join(lines)
+
+
+def repeats_text(data: Mapping[str, Any]) -> list[str]:
+    """What `check_data` has of frozen states, and of other long repeats.
+
+    Parameters
+    ----------
+    data : mapping
+        Of `check_data`.
+
+    Returns
+    -------
+    list of str
+        Lines without a full stop.
+    """
+    lines = [f"FROZEN: {r['text']}, while the model moves it" for r in data["frozen"][:MOST_REPEATS]]
+    if (more := len(data["frozen"]) - MOST_REPEATS) > 0:
+        lines.append(f"  and {plural(more, 'more frozen repeat')}; --json has all")
+    longest: dict[str, dict[str, Any]] = {}
+    for repeat in data["repeats"]:
+        if repeat["seconds"] > longest.get(repeat["state"], {"seconds": 0.0})["seconds"]:
+            longest[repeat["state"]] = repeat
+    lines += [f"warning: {r['text']}, as of a machine at rest: the model does not move it" for r in longest.values()]
+    return lines
 
 
 def _regime(regime: dict[str, Any]) -> list[str]:

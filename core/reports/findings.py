@@ -252,6 +252,16 @@ def _worst(verdicts: Verdicts, state: int, rows: NDArray[np.intp]) -> dict[str, 
 
 def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     """One sentence, and whether there is something to look at."""
+    found = _violated(recording)
+    if not recording["frozen"]:
+        return found
+    first = f"frozen: {recording['frozen'][0]['text']}, while the model moves it"
+    more = len(recording["frozen"]) - 1
+    return {**found, "state": "alarm", "text": f"{first}{f', and {more} more' * bool(more)}. {found['text']}"}
+
+
+def _violated(recording: Mapping[str, Any]) -> dict[str, Any]:
+    """What is said of its verdicts."""
     judged, bad = recording["verdicts"], recording["violated"]
     if not judged:
         return {"recording": recording["recording"], "state": "unknown", "text": "no verdict was possible"}

@@ -15,6 +15,7 @@ class Status(StrEnum):
     MISSING = "missing"  # a signal at either end is missing, stale, not finite, or too large for the bounds
     STEP = "step out of range"  # the step is shorter or longer than those that the model was fitted to
     MODE = "mode not in the model"  # the scheduling signal has a value that the model does not list
+    FROZEN = "frozen"  # a state repeats exactly although the nominal model moves it: no value of this instant
     UNASKED = "outside the time asked for"  # a check from one instant to another leaves the rest alone
     EQUAL = "equal stamp"  # dropped: the instant of the sample before
     SHORT = "short step"  # dropped: less than min_step after the sample before

@@ -1,0 +1,180 @@
+"""Frozen inputs: a state that repeats exactly while the nominal model moves it.
+
+A parked machine repeats too, so a repeat alone is a warning. A state is frozen if the nominal model, run over the
+repeat, moves it by more than its half-width, and farther than over any repeat of the fit; twice as far if the fit has
+repeats as long. Where another state has left the place that it had when the repeat began, the machine is not
+parked: there the sum of the model's one-step movements counts like its run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from operator import eq
+from typing import NamedTuple
+
+import numpy as np
+
+from uncertain_lti.model.repeats import Moved, Repeating, Repeats
+
+FARTHER = 2.0
+"""How much farther than over any repeat of the fit the model must move a state whose repeat is no longer than those."""
+
+Bounds = tuple[Sequence[float], Sequence[float], Sequence[float]]
+"""Of one transition: lower and upper bound (n,) each, recorded units, and the elements a_ii of the nominal model."""
+
+
+class Looked(NamedTuple):
+    """What one transition says of repeats.
+
+    Parameters
+    ----------
+    frozen : tuple of Moved
+        States that are frozen at its end; empty for none.
+    thawed : bool
+        A state was frozen at its begin and is not any more: its bounds begin at no measurement.
+    repeating : tuple of Moved
+        Other states that repeat for longer than ever in the fit.
+    """
+
+    frozen: tuple[Moved, ...] = ()
+    thawed: bool = False
+    repeating: tuple[Moved, ...] = ()
+
+    @property
+    def no_verdict(self) -> bool:
+        """The value of a state at one of the ends is no measurement of that instant."""
+        return self.thawed or bool(self.frozen)
+
+
+_NOTHING = Looked()
+
+
+class FrozenWatch:
+    """Tells frozen states, one transition after another.
+
+    Parameters
+    ----------
+    repeats : Repeats
+        Those of the fit.
+    margin : float
+        Of the bounds that it will be given.
+    counted : sequence of bool (n,)
+        States to look at: one that is masked is never frozen.
+    """
+
+    __slots__ = ("_counted", "_follow", "_frozen", "_longest", "_margin", "_on", "_run", "_run_within", "_sum")
+
+    def __init__(self, repeats: Repeats, margin: float, counted: Sequence[bool]) -> None:
+        self._longest: list[float] = repeats.longest_repeat_s.tolist()
+        run, total = repeats.largest_run, repeats.largest_sum
+        # how far the model must move a state, by its run in a repeat that is no longer than those of the fit, and in a
+        # longer one, and by its sum there
+        self._run_within: list[float] = np.maximum(1.0, FARTHER * run).tolist()
+        self._run: list[float] = np.maximum(1.0, np.where(np.isfinite(run), run, 0.0)).tolist()
+        self._sum: list[float] = np.maximum(1.0, np.where(np.isfinite(total), total, 0.0)).tolist()
+        self._counted, self._margin = list(counted), margin
+        self._follow = Repeating(len(self._longest), margin)
+        self.forget()
+
+    def forget(self) -> None:
+        """No transition leads to the next sample: nothing is known to repeat."""
+        self._follow.forget()
+        self._frozen: frozenset[int] = frozenset()
+        self._on = False  # something repeats
+
+    def look(
+        self, t_ns: int, dt: float, before: Sequence[float], after: Sequence[float], bounds: Callable[[], Bounds]
+    ) -> Looked:
+        """Take one transition.
+
+        Parameters
+        ----------
+        t_ns : int
+            Instant of its arrival, ns.
+        dt : float
+            Δt, s.
+        before : sequence of float, at least (n,)
+            States at its begin, and what follows them, recorded units.
+        after : sequence of float (n,)
+            States at its end.
+        bounds : callable
+            Called only if some state repeats.
+
+        Returns
+        -------
+        Looked
+            With the same bits for the same transitions.
+        """
+        if not any(map(eq, before, after)):
+            if not self._on:
+                return _NOTHING
+            thawed = bool(self._frozen)
+            self.forget()
+            return Looked(thawed=thawed)
+        self._on = True
+        lower, upper, own = bounds()
+        frozen, repeating = [], []
+        for moved in self._follow.push(t_ns, dt, before, after, lower, upper, own):
+            i = moved.state
+            if not self._counted[i]:
+                continue
+            if i in self._frozen or self._is_frozen(moved, after, lower, upper):
+                frozen.append(moved)
+            elif moved.seconds > self._longest[i]:
+                repeating.append(moved)
+        now = frozenset(moved.state for moved in frozen)
+        thawed, self._frozen = not self._frozen <= now, now
+        return Looked(tuple(frozen), thawed, tuple(repeating))
+
+    def _is_frozen(self, moved: Moved, after: Sequence[float], lower: Sequence[float], upper: Sequence[float]) -> bool:
+        i = moved.state
+        if moved.seconds <= self._longest[i]:
+            return moved.run > self._run_within[i]
+        if moved.run > self._run[i]:
+            return True
+        return moved.sum > self._sum[i] and any(
+            abs(value - start) > 0.5 * (high - low) / self._margin
+            for value, start, low, high in zip(after, moved.start, lower, upper, strict=True)
+        )
+
+
+def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
+    """What is said of a frozen state.
+
+    Parameters
+    ----------
+    name : str
+        Of the state.
+    moved : Moved
+        Its repeat.
+    repeats : Repeats
+        Those of the fit.
+
+    Returns
+    -------
+    str
+        Without a full stop.
+    """
+    return (
+        f"{name} {repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])}, while the model moves it by "
+        f"{max(moved.run, moved.sum):.3g} half-widths"
+    )
+
+
+def repeat_words(seconds: float, longest: float) -> str:
+    """What is said of a repeat.
+
+    Parameters
+    ----------
+    seconds : float
+        How long it is, s.
+    longest : float
+        The longest of the fit, s.
+
+    Returns
+    -------
+    str
+        Begins with a verb.
+    """
+    most = f"at most {longest:.3g} s" if longest > 0.0 else "never"
+    return f"repeats exactly for {seconds:.3g} s ({most} in the fit)"

@@ -1,0 +1,377 @@
+"""Frozen inputs: what repeats exactly while the nominal model moves it raises an alarm; what rests does not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_event_log import Rig
+from test_live import CONTROL, STATE, joint_state, vector
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.repeats import Repeats
+from uncertain_lti.model.schedule import Axis, Schedule
+from uncertain_lti.monitor.session import ERROR, WARN
+from uncertain_lti.reports.check_data import check_data
+from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.sampling.reading import read_as_fitted
+from uncertain_lti.sampling.sampler import Step
+from uncertain_lti.sampling.status import Status
+
+DT = 0.01
+MS = 1_000_000
+
+
+def run(seed: int, seconds: float = 8.0, rest: tuple[float, float] = (0.0, 0.0), noise: float = 1e-4) -> Transient:
+    """Position and velocity of a mass on a spring under steps of force; without noise while it rests at 0."""
+    rng = np.random.default_rng(seed)
+    count = round(seconds / DT)
+    t = DT * np.arange(count + 1)
+    u = np.repeat(rng.uniform(-1, 1, count // 50 + 2), 50)[: count + 1]
+    x = np.zeros((count + 1, 2))
+    resting = (t >= rest[0]) & (t < rest[1])
+    u[resting] = 0.0
+    for k in range(count):
+        if resting[k]:
+            x[k] = 0.0
+        x[k + 1] = x[k] + DT * np.array([x[k, 1], -20 * x[k, 0] - 4 * x[k, 1] + 20 * u[k]])
+    read = x + rng.uniform(-noise, noise, x.shape)
+    read[resting] = 0.0
+    return Transient(t, read, u[:, None], state_names=("position", "velocity"))
+
+
+def held(transient: Transient, state: int | slice, begin: int, end: int) -> Transient:
+    x = transient.x.copy()
+    x[begin + 1 : end, state] = x[begin, state]
+    return changed(transient, x=x)
+
+
+def changed(transient: Transient, **arrays: Any) -> Transient:
+    given = {"t": transient.t_ns, "x": transient.x, "u": transient.u, "s": transient.s, **arrays}
+    return Transient(
+        given["t"], given["x"], given["u"], s=given["s"], signals=transient.signals, max_gap=transient.max_gap,
+        state_names=None if transient.signals else transient.state_names,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def model() -> UncertainLTI:
+    return fit([run(1), run(2, rest=(3.0, 4.0))], additive="noise")
+
+
+def steps_of(transient: Transient) -> list[Step]:
+    """As the sampler gives them."""
+    found = []
+    z = np.hstack([transient.x, transient.u, transient.s])
+    for k, status in enumerate(transient.statuses()):
+        none = [float("nan")] * z.shape[1]
+        before = z[k - 1].tolist() if k and not status.opens_segment else none
+        dt = (transient.t_ns[k] - transient.t_ns[k - 1]) * 1e-9 if k else float("nan")
+        found.append(Step(status, int(transient.t_ns[k]), 0, float(dt), before, transient.x[k].tolist()))
+    return found
+
+
+def same_as_live(model: UncertainLTI, transient: Transient, **rule: Any) -> None:
+    """Every verdict of `check` is that of `judge`, its bits included."""
+    whole, live = EnvelopeMonitor(model, **rule).check(transient), EnvelopeMonitor(model, **rule)
+    statuses = whole.statuses()
+    for k, step in enumerate(steps_of(transient)):
+        verdict = live.judge(step)
+        assert (verdict.status, verdict.judged) == (statuses[k], whole.judged[k]), k
+        assert verdict.alarm == live.alarm == whole.alarm[k]
+        assert [m.state for m in verdict.frozen] == np.flatnonzero(whole.frozen[k]).tolist()
+        assert [m.state for m in verdict.repeating] == np.flatnonzero(whole.repeating[k]).tolist()
+        for name in ("flags", "lower", "upper", "utilisation"):
+            assert np.array(verdict.numbers(name)).tobytes() == getattr(whole, name)[k].tobytes()
+        if verdict.judged:
+            assert verdict.horizon_utilisation.tobytes() == whole.horizon_utilisation[k].tobytes()
+
+
+def test_a_fit_learns_the_longest_repeat_of_each_state(model: UncertainLTI, tmp_path: Path) -> None:
+    assert model.repeats is not None
+    assert model.repeats.longest_repeat_s == pytest.approx([0.99, 0.99])
+    assert (model.repeats.largest_run < 0.5).all(), "the model does not move a machine at rest"
+    model.save(tmp_path / "m.model.json")
+    data = json.loads((tmp_path / "m.model.json").read_text())
+    assert data["format"] == "uncertain-lti/2" and list(data["frozen"]) == [
+        "longest_repeat_s",
+        "largest_run",
+        "largest_sum",
+    ]
+    again = UncertainLTI.load(tmp_path / "m.model.json")
+    assert again.to_dict() == model.to_dict()
+    data["frozen"] = {"longest_repeat_s": [0.5, 0.25]}
+    few = UncertainLTI.from_dict(data).repeats
+    assert few is not None and few.to_dict() == data["frozen"]
+    assert few is not None and few.longest_repeat_s.tolist() == [0.5, 0.25] and np.isinf(few.largest_run).all()
+
+
+@pytest.mark.parametrize(
+    ("frozen", "named"),
+    [
+        ({"longest_repeat_s": [1.0]}, "frozen"),
+        ({"longest_repeat_s": [1.0, -1.0]}, "longest_repeat_s"),
+        ({"longest_repeat_s": [1.0, float("inf")]}, "longest_repeat_s"),
+        ({"longest_repeat_s": [1.0, True]}, "longest_repeat_s"),
+        ({"longest_repeat_s": [1.0, 1.0], "largest_run": [1.0]}, "largest_run"),
+        ({"longest_repeat_s": [1.0, 1.0], "more": 1}, "frozen.more"),
+        ({"largest_run": [1.0, 1.0]}, "longest_repeat_s"),
+        ([1.0, 1.0], "frozen"),
+    ],
+)
+def test_a_wrong_section_is_refused_by_name(model: UncertainLTI, frozen: Any, named: str) -> None:
+    with pytest.raises(ModelError, match=named):
+        UncertainLTI.from_dict({**model.to_dict(), "frozen": frozen})
+
+
+def test_the_recordings_of_the_fit_raise_no_alarm(model: UncertainLTI) -> None:
+    for transient in (run(1), run(2, rest=(3.0, 4.0))):
+        verdicts = EnvelopeMonitor(model).check(transient)
+        assert not (verdicts.frozen.any() or verdicts.repeating.any() or verdicts.alarm.any())
+
+
+@pytest.mark.parametrize("state", [0, 1, slice(None)])
+def test_a_held_state_is_reported_while_the_machine_moves(model: UncertainLTI, state: int | slice) -> None:
+    late = []
+    for seed, begin in zip(range(10, 20), np.random.default_rng(0).integers(100, 600, 10), strict=True):
+        healthy = run(seed)
+        assert not EnvelopeMonitor(model).check(healthy).frozen.any()
+        frozen = held(healthy, state, int(begin), int(begin) + 150)
+        verdicts = EnvelopeMonitor(model).check(frozen)
+        assert not verdicts.frozen[: begin + 1].any()
+        told = np.flatnonzero(verdicts.frozen.any(axis=1))
+        late.append((told[0] - begin) * DT if len(told) else np.inf)
+        first, end = told[0], begin + 150
+        of = {(0, 1)[state]} if isinstance(state, int) else set(np.flatnonzero(verdicts.frozen.any(axis=0)).tolist())
+        assert set(np.flatnonzero(verdicts.frozen.any(axis=0)).tolist()) == of
+        assert verdicts.alarm[first:end].all() and not verdicts.judged[first:end].any()
+        assert not verdicts.judged[end] and verdicts.thawed[end], "its bounds would begin at a stale value"
+        assert verdicts.judged[end + 1]
+    assert max(late) <= 1.0
+
+
+def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
+    parked = run(5, seconds=12.0, rest=(2.0, 9.0))
+    verdicts = EnvelopeMonitor(model).check(parked)
+    assert not verdicts.frozen.any() and not verdicts.alarm[210:900].any()
+    told = np.flatnonzero(verdicts.repeating[:, 0])
+    assert told[0] == pytest.approx(300, abs=1) and told[-1] == 899
+    data = check_data(model, verdicts)
+    assert {r["state"] for r in data["repeats"]} == {"position", "velocity"} and not data["frozen"]
+    assert data["repeats"][0]["seconds"] == pytest.approx(6.99)
+    assert "warning: position repeats exactly for 6.99 s (at most 0.99 s in the fit) from 2.0000 s" in check_text(data)
+
+
+def test_a_state_that_stops_in_a_moving_machine_is_no_parked_one(model: UncertainLTI) -> None:
+    """Held where the model's own equation comes to rest, it is told by what the model leaves unexplained."""
+    frozen = held(run(21), 1, 300, 500)
+    assert EnvelopeMonitor(model).check(frozen).frozen[300:400, 1].any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_offline_and_live_give_the_same(model: UncertainLTI, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    transient = run(30 + seed, rest=(5.0, 7.5))
+    x, t, u = transient.x.copy(), transient.t_ns.copy(), transient.u.copy()
+    for _ in range(6):
+        begin, length = int(rng.integers(0, 700)), int(rng.integers(1, 120))
+        i = int(rng.integers(0, 3))
+        x[begin : begin + length, [i] if i < 2 else [0, 1]] = x[begin, [i] if i < 2 else [0, 1]]
+    x[rng.integers(0, 800, 5), 0] = np.nan
+    u[rng.integers(0, 800, 3)] = np.nan
+    t[int(rng.integers(100, 700)) :] += 50 * MS  # a gap
+    t[int(rng.integers(100, 700)) :] += 22 * MS  # a step that the model was not fitted to
+    same_as_live(model, changed(transient, t=t, x=x, u=u), margin=[1.0, 2.5][seed % 2])
+
+
+def test_offline_and_live_give_the_same_with_a_schedule() -> None:
+    rng = np.random.default_rng(3)
+    schedule = Schedule((Axis("x1", knots=(-1.0, 0.0, 2.0)),))
+    A = np.stack([-np.diag([1.0, 2.0]), -np.diag([3.0, 1.0]), -np.diag([2.0, 4.0])]) + rng.normal(size=(3, 2, 2))
+    model = UncertainLTI(
+        A, rng.normal(size=(3, 2, 1)), np.zeros((3, 2, 2)), np.zeros((3, 2, 1)), v=np.full((3, 2), 0.02),
+        schedule=schedule, repeats=Repeats([0.05, 0.0]),
+    )  # fmt: skip
+    x = np.cumsum(rng.normal(size=(400, 2)) * 0.05, axis=0)
+    for begin in (50, 150, 300):
+        x[begin : begin + 40, begin % 4 // 2] = x[begin, begin % 4 // 2]
+    transient = Transient(DT * np.arange(400), x, np.sin(0.1 * np.arange(400))[:, None])
+    assert EnvelopeMonitor(model).check(transient).frozen.any()
+    same_as_live(model, transient)
+
+
+def test_a_frozen_state_breaks_the_windows_of_the_horizons() -> None:
+    model = fit([run(1), run(2, rest=(3.0, 4.0))], additive="noise", horizons={"steps": [2, 5]})
+    frozen = held(run(12), 0, 200, 350)
+    verdicts = EnvelopeMonitor(model).check(frozen)
+    assert verdicts.frozen.any() and np.isnan(verdicts.horizon_utilisation[340:351]).all()
+    assert (
+        np.isnan(verdicts.horizon_utilisation[351:355, 2]).all()
+        and not np.isnan(verdicts.horizon_utilisation[355]).any()
+    )
+    same_as_live(model, frozen)
+
+
+def test_a_masked_state_is_not_watched(model: UncertainLTI) -> None:
+    frozen = held(run(12), 0, 200, 350)
+    assert EnvelopeMonitor(model).check(frozen).frozen.any()
+    masked = EnvelopeMonitor(model, masked=["position"]).check(frozen)
+    assert not masked.frozen.any() and masked.judged[1:].all()
+
+
+def test_a_model_without_repeats_judges_as_ever(model: UncertainLTI) -> None:
+    frozen = held(run(12), 0, 200, 350)
+    assert EnvelopeMonitor(model.replace(repeats=None)).check(frozen).judged[1:].all()
+
+
+def test_a_slow_sensor_repeats_regularly() -> None:
+    """A state at a tenth of the clock's rate repeats nine times of ten, and that is no fault."""
+
+    def slow(transient: Transient) -> Transient:
+        x = transient.x.copy()
+        x[:, 0] = np.repeat(x[::10, 0], 10)[: len(x)]
+        return changed(transient, x=x)
+
+    model = fit([slow(run(1)), slow(run(2))], additive="noise")
+    assert model.repeats is not None and model.repeats.longest_repeat_s[0] == pytest.approx(0.09)
+    for seed in range(40, 46):
+        assert not EnvelopeMonitor(model).check(slow(run(seed))).frozen.any()
+        verdicts = EnvelopeMonitor(model).check(held(slow(run(seed)), 0, 200, 400))
+        assert verdicts.frozen[200:300, 0].any()
+
+
+class FrozenRig(Rig):
+    """A session whose model knows that nothing repeats; what is read is frozen on demand."""
+
+    def __init__(self, repeats: Repeats, **rule: Any) -> None:
+        super().__init__(**rule)
+        types, fields, make = self.session._model_types, self.session._type_fields, self.session._make_reader
+        self.session = type(self.session)(
+            self.model.replace(repeats=repeats), self.session.rule, types, fields, make, self.now
+        )
+        self.event_log.begin(self.session, self.now)
+
+    def hold(self, samples: int, state: int) -> None:
+        point, value = self.model.operating_point, None
+        for _ in range(samples):
+            read = point.recorded_x(self.x)
+            value = read[state] if value is None else value
+            read[state] = value
+            self.take(CONTROL, vector(self.t_ns, *(point.u_s + point.U * self.u)))
+            self.take(STATE, joint_state(self.t_ns, read))
+            self.x = self.model.centre_and_half(self.x, self.u, DT)[0]
+            self.wait(DT)
+
+
+def test_a_session_names_what_is_frozen() -> None:
+    rig = FrozenRig(Repeats([0.0, 0.0]))
+    rig.send(30)
+    assert not rig.session.alarm
+    rig.lines.clear()
+    rig.u[:] = -0.5
+    rig.hold(60, 1)
+    assert rig.session.alarm and rig.session.last is not None
+    (line,) = [line for line in rig.lines if line.startswith("alarm")]
+    assert line.startswith("alarm, frozen: b repeats exactly for ") and "half-widths" in line
+    monitor, a, b = rig.session.report(rig.now, 10.0)
+    assert monitor.level == b.level == ERROR and "alarm: frozen: b repeats exactly for 0." in monitor.message
+    assert "a state is frozen" in monitor.message and b.message.startswith("frozen: repeats exactly")
+    assert a.level != ERROR and int(monitor.values["frozen"]) > 30 and monitor.values["alarm"] == "1"
+    monitor, *_ = rig.session.report(rig.now + 20.0, 10.0)
+    assert "frozen" not in monitor.message.split(";")[0], "nothing arrives, so nothing is known to be frozen"
+    rig.send(5)
+    assert not rig.session.alarm and "the alarm is over" in " ".join(rig.lines)
+
+
+def test_a_session_warns_of_a_long_repeat() -> None:
+    rig = FrozenRig(Repeats([0.1, 0.0]), masked="b")
+    rig.x[:] = 0.0
+    rig.u[:] = 0.0
+    rig.send(40)
+    assert not rig.session.alarm
+    monitor, a, b = rig.session.report(rig.now, 10.0)
+    assert a.level == WARN and "repeats exactly for 0.39 s (at most 0.1 s in the fit)" in a.message
+    assert monitor.level != ERROR and b.level != WARN
+
+
+def test_not_armed_it_is_named_and_raises_no_alarm(model: UncertainLTI) -> None:
+    live, frozen = EnvelopeMonitor(model), held(run(12), 0, 200, 350)
+    verdicts = [live.judge(step, armed=False) for step in steps_of(frozen)]
+    assert not any(v.alarm for v in verdicts) and any(v.frozen for v in verdicts)
+    assert Status.FROZEN in [v.status for v in verdicts]
+
+
+def test_reset_clears_the_alarm_and_a_state_that_stays_frozen_raises_it_again(model: UncertainLTI) -> None:
+    live = EnvelopeMonitor(model, 50, 50)
+    for step in steps_of(held(run(12), 0, 200, 350))[:320]:
+        live.judge(step)
+    assert live.alarm
+    live.reset()
+    assert not live.alarm
+    assert live.judge(steps_of(held(run(12), 0, 200, 350))[320]).alarm
+
+
+def test_reports_name_what_is_frozen(model: UncertainLTI, tmp_path: Path) -> None:
+    from uncertain_lti.reports.findings import findings
+    from uncertain_lti.reports.html import html_report
+
+    checked = [EnvelopeMonitor(model, 50, 50).check(held(run(12), 0, 200, 350))]
+    data = check_data(model, checked[0])
+    assert data["alarm"] and data["outcome"] == "alarm" and len(data["frozen"]) == 1
+    (frozen,) = data["frozen"]
+    assert frozen["state"] == "position" and frozen["k"] == 200 and frozen["seconds"] == pytest.approx(1.49)
+    assert frozen["told_after"] < 1.0 and frozen["longest_in_fit"] == pytest.approx(0.99)
+    assert any(said.endswith(" frozen") for said in data["no_verdict"])
+    assert data["verdict_per_sample"][340]["status"] == "frozen" and data["verdict_per_sample"][340]["alarm"]
+    line = (
+        "FROZEN: position repeats exactly for 1.49 s (at most 0.99 s in the fit) from 2.0000 s, while the model moves"
+    )
+    assert line in check_text(data)
+    facts = findings(model, "m", checked)
+    assert facts["alarm"] and facts["happened"][0]["text"].startswith("frozen: position repeats exactly for 1.49 s")
+    assert line in html_report(model, checked, facts)
+
+
+def test_a_quadruped_with_a_held_joint(recordings: Path, signals_folder: Path, tmp_path: Path) -> None:
+    """Three instants of three joints, held to the end of the second, of a recording fitted on every other second."""
+    for joint in (0, 4, 11):
+        text = (signals_folder / "go2_joint.yaml").read_text().replace("[j0]", f"[j{joint}]")
+        (tmp_path / "signals.yaml").write_text(text)
+        (whole,) = read_transients(recordings / "go2/test_3.mcap", tmp_path / "signals.yaml")
+        seconds = [part_of(whole, start, start + 500) for start in range(0, 6500, 500)]
+        model = fit(seconds[::2])
+        for part in seconds[1::2]:
+            assert not EnvelopeMonitor(model).check(part).frozen.any()
+        for begin in (2900, 3900, 4900):  # the joints do not move before
+            for state in (0, 1):
+                frozen = held(part_of(whole, begin - 100, begin + 600), state, 100, 700)
+                told = np.flatnonzero(EnvelopeMonitor(model).check(frozen).frozen[:, state])
+                assert len(told) and frozen.t[told[0]] - frozen.t[100] <= 1.0, (joint, begin, state)
+
+
+@pytest.mark.parametrize(
+    ("signals", "fitted", "checked"),
+    [
+        ("neato", ["neato/person_follower.mcap"], ["neato/draw_square.mcap"]),
+        ("neato", ["neato/draw_square.mcap"], ["neato/person_follower.mcap"]),
+        ("hunter_se", ["hunter_se/straight_odd_t_0_5_run_01.mcap"], ["hunter_se/straight_even_t_0_2_run_01.mcap"]),
+        ("crazyflie_vicon", ["crazyflie/rollbag_0.mcap"], ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"]),
+    ],
+)
+def test_healthy_recordings_raise_none(
+    recordings: Path, signals_folder: Path, signals: str, fitted: list[str], checked: list[str]
+) -> None:
+    model = fit(read_transients([recordings / name for name in fitted], signals_folder / f"{signals}.yaml"))
+    for name in checked:
+        assert not EnvelopeMonitor(model).check(read_as_fitted(recordings / name, model.signals)).frozen.any()
+
+
+def part_of(transient: Transient, begin: int, end: int) -> Transient:
+    return Transient(
+        transient.t_ns[begin:end], transient.x[begin:end], transient.u[begin:end], signals=transient.signals,
+        max_gap=transient.max_gap,
+    )  # fmt: skip
