@@ -531,3 +531,68 @@ def test_a_late_answer_becomes_the_delay_that_the_fit_would_name(tmp_path, late)
     proposal = propose([path])
     assert [c.delay for c in proposal.controls] == [late]
     assert not any("better when it is taken" in m for m in fitted([path], proposal).fit_summary["messages"])
+
+
+# --- numbers that are none, memories, many alike, and what is asked for ---------------------------------------------
+
+
+def test_numbers_that_stand_for_none_are_ignored_by_the_proposal(tmp_path):
+    messages = driven()
+    for k in range(0, len(messages), 100):
+        messages[k] = f64("/plant/state", messages[k].log_time, 2146000000.0)
+    path = save(tmp_path / "run.mcap", messages, {})
+    proposal = propose([path])
+    (entry,) = yaml.safe_load(proposal.text)["states"]
+    assert entry["ignore"] == [2146000000.0] and entry["scale"] < 100
+    (run,) = read_transients(path, SignalMap.from_dict(yaml.safe_load(proposal.text)))
+    assert set(run.counters.of("invalid").values()) == {8}
+    assert np.nanmax(run.x) < 100
+
+
+def swinging(count=900):
+    """A swing whose rate is not recorded, 50 Hz."""
+    rng = np.random.default_rng(4)
+    y, v, u, messages = 0.0, 0.0, 0.0, []
+    for k in range(count):
+        u = float(rng.normal()) if k % 40 == 0 else u
+        t = 10**18 + k * 20 * MS
+        messages += [f64("/plant/state", t, y + 1e-5 * rng.normal()), f64("/plant/cmd", t, u)]
+        v += 0.02 * (-40.0 * y - v + u)
+        y += 0.02 * v
+    return messages
+
+
+def test_a_rate_that_is_not_recorded_is_proposed_with_what_it_gains(tmp_path):
+    path = save(tmp_path / "run.mcap", swinging(), {})
+    proposal = propose([path])
+    entry = yaml.safe_load(proposal.text)["states"][1]
+    assert entry["field"] in ("rate(data)", "lag(data, 1)") and "on left-out data" in proposal.text
+    blind = SignalMap.from_dict(
+        {**yaml.safe_load(proposal.text), "states": yaml.safe_load(proposal.text)["states"][:1]}
+    )
+    width = [m.fit_summary["mean_width"][0] for m in (fitted([path], proposal), fit(read_transients(path, blind)))]
+    assert width[0] < 0.3 * width[1]
+
+
+def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
+    other = driven(("/other/state", "/other/cmd"), seed=3)
+    path = save(tmp_path / "run.mcap", [*driven(), *other], {})
+    proposal = propose([path], states=["/other/st*:data"], controls=["/other/cmd"])
+    assert signals_of(proposal) == ([("/other/state", "data")], [("/other/cmd", "data")])
+    assert "not asked for by --controls" in proposal.text
+    for asked in ({"states": ["/none"]}, {"controls": ["/other/cmd:date"]}):
+        with pytest.raises(BagError, match="meets nothing that moves"):
+            propose([path], **asked)
+
+
+def test_the_file_of_one_joint_is_that_of_all(recordings):
+    path = recordings / "go2/test_3.mcap"
+    proposal = propose([path], like="j5")
+    data = yaml.safe_load(proposal.text)
+    assert data["structure"] == "own" and len(data["states"]) == 2 and data["states"][0]["for"][-1] == "j11"
+    signals = SignalMap.from_dict(data)
+    assert (len(signals.states), len(signals.controls)) == (24, 12)
+    (run,) = read_transients(path, signals)
+    assert run.usable.sum() > 6000
+    with pytest.raises(BagError, match="no state and command of a member 'j55' \\(is j5 meant\\?\\)"):
+        propose([path], like="j55")

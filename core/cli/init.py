@@ -24,6 +24,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)"
     )
+    parser.add_argument(
+        "--states",
+        metavar="TOPIC[:FIELD]",
+        nargs="+",
+        default=[],
+        help="what may be a state, in place of what looks like one; * stands for any letters",
+    )
+    parser.add_argument("--controls", metavar="TOPIC[:FIELD]", nargs="+", default=[], help="likewise for the controls")
+    parser.add_argument(
+        "--like",
+        metavar="MEMBER",
+        default="",
+        help="write the file for all members (joints, motors) that have what this one has, such as j3",
+    )
     parser.add_argument("--json", action="store_true", help="print what is proposed as JSON, with the text of the file")
 
 
@@ -53,7 +67,13 @@ def run(options: argparse.Namespace) -> int:
     output = options.output
     if output is not None and os.path.exists(output):
         raise SignalError(f"{output}: is there already; choose another output, or move it away")
-    proposal = propose(options.bags, options.progress.iterate("reading"))
+    proposal = propose(
+        options.bags,
+        options.progress.iterate("reading"),
+        states=options.states,
+        controls=options.controls,
+        like=options.like,
+    )
     print_notes(options, proposal.warnings)
     if output is None and not options.json:
         print(proposal.text, end="")

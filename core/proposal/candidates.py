@@ -46,6 +46,8 @@ class Candidate:
         Scale, recorded units.
     delay : int, default 0
         Samples by which the states follow a control later.
+    ignore : tuple of float, default ()
+        Values that stand for none.
     """
 
     topic: str
@@ -58,6 +60,7 @@ class Candidate:
     steady: float = 0.0
     scale: float = 1.0
     delay: int = 0
+    ignore: tuple[float, ...] = ()
 
     @property
     def element(self) -> str:

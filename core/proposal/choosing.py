@@ -21,7 +21,7 @@ PER_UNKNOWN = 20
 MOST_STATES, MOST_CONTROLS = 8, 6
 
 
-def choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[Candidate], str]:
+def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "") -> tuple[list[Candidate], str]:
     """States of the model, and a sentence where they look like none; reasons go to what is left out.
 
     Parameters
@@ -30,6 +30,8 @@ def choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[C
         Topics that may be the state; those left out get a reason.
     controls : sequence of Source
         Topics of the controls; numbers left out get a reason.
+    like : str, default ""
+        The member of many alike that is looked at; default the one whose command shows most.
 
     Returns
     -------
@@ -58,7 +60,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source]) -> tuple[list[C
     drop_copies(pool)
     pool = [c for c in pool if not c.reason]
     used = [c for s in controls for c in s.free]
-    pool, used = _one_element(pool, used, every)
+    pool, used = _one_element(pool, used, every, like)
     drop_copies(used)
     used = [c for c in used if not c.reason]
     steps = steps_of(pool, every, used)
@@ -94,7 +96,7 @@ def _is_pose(pool: Sequence[Candidate]) -> bool:
 
 
 def _one_element(
-    pool: list[Candidate], used: list[Candidate], every: dict[str, Source]
+    pool: list[Candidate], used: list[Candidate], every: dict[str, Source], like: str
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Where state and command name the same joints, those of the joint whose command shows most."""
     shared = [e for e in dict.fromkeys(c.element for c in used) if e and any(s.element == e for s in pool)]
@@ -106,7 +108,7 @@ def _one_element(
         steps = steps_of(mine, every, [c for c in used if c.element == element])
         return float(np.max(steps.effect(range(len(mine))), initial=0.0)) if len(steps.X) >= FEWEST else 0.0
 
-    best = max(shared, key=effect)
+    best = like if like in shared else max(shared, key=effect)
     for candidate in [*pool, *used]:
         if candidate.element != best:
             candidate.reason = f"another joint than {best}; one model per joint holds better than one for all"

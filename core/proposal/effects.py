@@ -131,7 +131,7 @@ def steps_of(
         positive = step[step > 0]
         limit = 2.5 * float(np.median(positive)) if len(positive) else 0.0
         for j, lag in enumerate(lags):
-            u[:, j] = np.concatenate([np.full(lag, np.nan), u[: len(u) - lag, j]])
+            u[:, j] = earlier(u[:, j], lag)
         good = (step > 0) & (step <= limit)
         good &= np.isfinite(x[:-1]).all(axis=1) & np.isfinite(x[1:]).all(axis=1) & np.isfinite(u[:-1]).all(axis=1)
         if len(good) > 200_000:  # enough to tell
@@ -145,6 +145,24 @@ def steps_of(
         np.concatenate([np.empty((0, m)), *U]),
         np.concatenate([np.empty((0, n)), *dX]),
     )
+
+
+def earlier(values: Array, samples: int) -> Array:
+    """Each value some samples before.
+
+    Parameters
+    ----------
+    values : array (N,)
+        One per sample.
+    samples : int
+        How many samples earlier; 0 for the values themselves.
+
+    Returns
+    -------
+    array (N,)
+        NaN where there is none.
+    """
+    return np.concatenate([np.full(min(samples, len(values)), np.nan), values[: max(len(values) - samples, 0)]])
 
 
 def held(candidate: Candidate, source: Source, number: int, clock: Source, oldest: float | None = None) -> Array:

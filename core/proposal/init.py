@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from uncertain_lti.base.errors import BagError
-from uncertain_lti.proposal.candidates import Candidate
+import numpy as np
+
+from uncertain_lti.base.english import meant, shortlist
+from uncertain_lti.base.errors import BagError, TransientError
+from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
 from uncertain_lti.proposal.choosing import choose
+from uncertain_lti.proposal.effects import earlier, held
+from uncertain_lti.proposal.memories import choose_memories
 from uncertain_lti.proposal.naming import name_signals
-from uncertain_lti.proposal.quantities import set_operating_point, set_own_scale
+from uncertain_lti.proposal.quantities import longest_hold, set_operating_point, set_own_scale
 from uncertain_lti.proposal.reading import Iterate, read_sources
-from uncertain_lti.proposal.roles import assign_roles
-from uncertain_lti.proposal.signals_file import signals_file
+from uncertain_lti.proposal.roles import ask_for, assign_roles
+from uncertain_lti.proposal.signals_file import entry, signals_file
 from uncertain_lti.recordings.formats import group_recordings
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.memory import Memory
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,14 @@ class Proposal:
     warnings: tuple[str, ...] = ()
 
 
-def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = None) -> Proposal:
+def propose(
+    paths: Sequence[str | os.PathLike[str]],
+    progress: Iterate | None = None,
+    *,
+    states: Sequence[str] = (),
+    controls: Sequence[str] = (),
+    like: str = "",
+) -> Proposal:
     """Suggest states and controls of a machine from recordings of it.
 
     Topics are classified by their names and types, and if these say nothing by what helps to predict what; of a
@@ -53,6 +67,13 @@ def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = 
         As for `read_transients`.
     progress : callable, optional
         As for `read_transients`.
+    states : sequence of str, optional
+        Topics, or TOPIC:FIELD, with `*` for any letters: what may be a state, in place of what looks like one.
+    controls : sequence of str, optional
+        Likewise for the controls.
+    like : str, default ""
+        A member of many that are alike, such as a joint: the file is for all members that have what this one has, each
+        with a state and controls of its own.
 
     Returns
     -------
@@ -62,18 +83,26 @@ def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = 
     Raises
     ------
     BagError
-        A recording cannot be read, or holds nothing that could be a state.
+        A recording cannot be read, or holds nothing that could be a state, or nothing that was asked for.
     """
     bags = group_recordings(list(paths))
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
     sources = read_sources(bags, progress)
-    controls, states = assign_roles(sources)
-    if not states:
+    if states or controls:
+        ask_for(sources, states, controls, str(bags[0].path))
+    commands, measured = assign_roles(sources)
+    if not measured:
         reasons = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])
         raise BagError(f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})")
-    chosen, doubt = choose(states, controls)
-    used = [c for s in controls for c in s.free]
+    chosen, doubt = choose(measured, commands, like)
+    used = [c for s in commands for c in s.free]
+    if like and {c.element for c in [*chosen, *used]} != {like}:
+        there = dict.fromkeys(c.element for s in sources for c in s.candidates if c.element)
+        raise BagError(
+            f"{bags[0].path}: no state and command of a member '{like}'{meant(like, there)}; members that have a name: "
+            f"{shortlist(list(there), 20) or 'none'}"
+        )
     ready = [c for s in sources for c in s.candidates if c.ready]
     name_signals(
         [*chosen, *(c for c in ready if c.ready == "state")], [*used, *(c for c in ready if c.ready == "control")]
@@ -82,7 +111,60 @@ def propose(paths: Sequence[str | os.PathLike[str]], progress: Iterate | None = 
     for candidate in ready:
         set_own_scale(candidate)
     warnings = (*(warning for bag in bags for warning in bag.warnings), *([doubt] if doubt else []))
-    return Proposal(tuple(chosen), tuple(used), signals_file(bags, sources, chosen, used, doubt), warnings)
+    members = _members(chosen, used, sources, like) if like else []
+    text = signals_file(bags, sources, chosen, used, doubt, _memories(chosen, used, sources), members)
+    return Proposal(tuple(chosen), tuple(used), text, warnings)
+
+
+def _members(
+    states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source], like: str
+) -> list[str]:
+    """Members that have every number that a member has, in the order of the messages."""
+    there = {(c.topic, c.path) for s in sources for c in s.candidates if c.values}
+    every = dict.fromkeys(c.element for s in sources for c in s.candidates if c.element)
+    return [
+        m for m in every if all((c.topic, c.path.replace(f"[{like}]", f"[{m}]")) in there for c in [*states, *controls])
+    ]
+
+
+def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[str]:
+    """Lines of what narrows the envelope of the proposed states on left-out data."""
+    every = {s.topic: s for s in sources}
+    clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
+    group = [*states, *controls]
+    limits = [longest_hold(every[c.topic], clock)[0] if c in controls else None for c in group]
+    transients = []
+    for number, arrival in enumerate(clock.arrival):
+        if len(arrival) < FEWEST:
+            continue
+        z = np.column_stack(
+            [
+                earlier(held(c, every[c.topic], number, clock, limit), c.delay)
+                for c, limit in zip(group, limits, strict=True)
+            ]
+        )
+        z = (z - [c.steady for c in group]) / [c.scale or 1.0 for c in group]
+        t, _ = clock.instants(clock, number)
+        x, u = z[:, : len(states)], z[:, len(states) :]
+        names = [c.name for c in group]
+        try:
+            transients.append(Transient(t, x, u, state_names=names[: x.shape[1]], control_names=names[x.shape[1] :]))
+        except TransientError:
+            continue
+    found = choose_memories(transients, additive="noise") if transients else None
+    if found is None or not found.chosen:
+        return []
+    gain = f"with it, mean width x {found.facts['width']:.2g} on left-out data"
+    lines = ["  # known before the step, so without a row of its own and without a verdict"]
+    by_name = {c.name: c for c in group}
+    for one in found.chosen:
+        of = by_name[one.of]
+        memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
+        lag, rate = memory.kind == "lag", memory.kind == "rate"
+        recalled = replace(of, name=one.name, path=memory.of(of.path), steady=of.steady if lag else 0.0, delay=0)
+        recalled.unit += "/s" if of.unit and rate else ""
+        lines.append(entry(recalled, comment=gain))
+    return lines
 
 
 __all__: list[Any] = ["Candidate", "Proposal", "propose"]

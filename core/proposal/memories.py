@@ -161,7 +161,7 @@ def suggest_memories(
     Returns
     -------
     Suggestion
-        `facts["memories"]` lists what was tried, `facts["suggested"]` the fields to add.
+        `facts["memories"]` lists what was tried, `facts["suggested"]` the names of what to add.
 
     Raises
     ------
@@ -170,16 +170,73 @@ def suggest_memories(
     """
     if options.get("structure") is not None or options.get("operating_point") is not None:
         return Suggestion({"not_done": "structure or operating point are for the signals as they are"}, "")
+    found = choose_memories(transients, groups, progress, **options)
+    if not found.chosen:
+        return Suggestion(found.facts, "")
+    entries = ", ".join(one.words(transients) for one in found.chosen)
+    return Suggestion(
+        found.facts,
+        f"a memory would pay: with {entries} among the controls, mean width x {found.facts['width']:.2g} and "
+        f"{found.facts['inside_with']:.1%} inside on left-out data (now {found.facts['inside']:.1%})",
+    )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Memories that pay, and what was tried.
+
+    Parameters
+    ----------
+    chosen : tuple of Remembered
+        Empty where none pays.
+    facts : dict
+        Plain data: `memories` that were tried, the share `inside` without, the names `suggested`, and with them `width`
+        and the share `inside_with`.
+    """
+
+    chosen: tuple[Remembered, ...]
+    facts: dict[str, Any]
+
+
+def choose_memories(
+    transients: Sequence[Transient],
+    groups: Sequence[Any] | str | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Choice:
+    """What `suggest_memories` suggests.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    groups : sequence or str, optional
+        As in `validate`.
+    progress : callable, optional
+        Called with one line of text per candidate.
+    **options : object
+        Further arguments of `fit`, but no weights per sample.
+
+    Returns
+    -------
+    Choice
+        The memories to add.
+
+    Raises
+    ------
+    FitError
+        The groups do not fit the recordings.
+    """
     sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), options.get("additive") or "noise")
     if not sets:
-        return Suggestion({"memories": []}, "")
+        return Choice((), {"memories": []})
     base = thinned(transients, TRANSITIONS)
     try:
         model = fit(base, schedule={}, describe_data=False, **options)
         fold = fold_of(base, groups, model, FOLDS)
         before = _judged(base, model, fold, options)
     except FitError as error:
-        return Suggestion({"not_done": str(error)}, "")
+        return Choice((), {"not_done": str(error)})
     tried: list[dict[str, Any]] = []
     states = {*transients[0].state_names}
     chosen: tuple[Remembered, ...] = ()
@@ -198,18 +255,12 @@ def suggest_memories(
             ratio = math.exp(float(np.mean(np.log(after[0] / widths[0]))))
             pays = ratio <= PAYS and after[1] >= before[1] - ALLOWED
             tried.append({"added": [one.name for one in some], "width": ratio, "inside": after[1], "pays": pays})
-            if pays and after[0].sum() < best[0].sum():
+            if pays and np.mean(np.log(after[0] / best[0])) < 0:
                 best, chosen = after, (*beside, *some)
-    facts = {"memories": tried, "inside": before[1], "suggested": [one.name for one in chosen]}
-    if not chosen:
-        return Suggestion(facts, "")
-    ratio = math.exp(float(np.mean(np.log(best[0] / before[0]))))
-    entries = ", ".join(one.words(transients) for one in chosen)
-    return Suggestion(
-        facts,
-        f"a memory would pay: with {entries} among the controls, mean width x {ratio:.2g} and {best[1]:.1%} inside on "
-        f"left-out data (now {before[1]:.1%})",
-    )
+    facts: dict[str, Any] = {"memories": tried, "inside": before[1], "suggested": [one.name for one in chosen]}
+    if chosen:
+        facts |= {"width": math.exp(float(np.mean(np.log(best[0] / before[0])))), "inside_with": best[1]}
+    return Choice(chosen, facts)
 
 
 def _judged(

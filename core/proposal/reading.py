@@ -18,6 +18,7 @@ from uncertain_lti.proposal.roles import role_by_name, role_of_column
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.recording import Recording, TopicFacts
 from uncertain_lti.recordings.table import TYPE
+from uncertain_lti.sampling.codes import codes
 from uncertain_lti.signals.field_path import FieldPath
 
 Iterate = Callable[[Iterable[object], int], Iterable[object]]
@@ -183,11 +184,20 @@ def _sift(source: Source) -> None:
     source.candidates = [c for c in source.candidates if c.reason != "|"]
     for candidate in source.candidates:
         if not candidate.reason:
+            _ignore(candidate)
             _judge(candidate, source)
     _wrapped(source)
     if all(c.reason for c in source.candidates):
         source.reason = "; ".join(f"{c.path} {c.reason}" for c in source.candidates[:3])
         source.reason += f" and {len(source.candidates) - 3} more" * (len(source.candidates) > 3)
+
+
+def _ignore(candidate: Candidate) -> None:
+    """Take numbers that stand for none out of the values."""
+    found = codes(np.concatenate([np.empty(0), *candidate.values]))
+    if found:
+        candidate.ignore = tuple(sorted(found))
+        candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
 
 
 def _judge(candidate: Candidate, source: Source) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 
+from uncertain_lti.base.english import shortlist
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.proposal.candidates import Source
 from uncertain_lti.proposal.effects import SHOWS, explained
 
@@ -99,6 +102,63 @@ def role_of_column(name: str) -> str:
     if _REFERENCE.search(low):
         return "reference"
     return "control" if _COMMAND.search(low) or _COLUMN.search(low) else "state"
+
+
+def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
+    """Give the roles that a person asks for in place of those by name.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+        All topics.
+    states : sequence of str
+        Patterns: TOPIC or TOPIC:FIELD; none to leave the states to their names.
+    controls : sequence of str
+        Likewise.
+    where : str
+        What errors call the recording.
+
+    Raises
+    ------
+    BagError
+        A pattern meets nothing that moves.
+    """
+    asked = [("state", p) for p in states] + [("control", p) for p in controls]
+    met: dict[str, set[int]] = {"state": set(), "control": set()}
+    for role, pattern in asked:
+        topic, _, field = pattern.partition(":")
+        found = [
+            c
+            for s in sources
+            for c in s.candidates
+            if fnmatchcase(s.topic, topic) and (not field or fnmatchcase(_plain(c.path), _plain(field)))
+        ]
+        if not any(not c.reason for c in found):
+            why = f"; {found[0].path} is {found[0].reason}" if found else f"; topics there: {_topics(sources)}"
+            raise BagError(f"{where}: --{role}s {pattern} meets nothing that moves{why}")
+        met[role] |= {id(c) for c in found}
+    for source in sources:
+        for role, patterns in (("state", states), ("control", controls)):
+            mine = {id(c) for c in source.candidates} & met[role]
+            if mine:
+                source.role, source.reason = role, ""
+                for candidate in source.candidates:
+                    if id(candidate) not in mine and not candidate.reason:
+                        candidate.reason = f"not asked for by --{role}s"
+            elif patterns and source.role == role:
+                source.role = "apart"
+                source.reason = source.reason or f"not asked for by --{role}s"
+                for candidate in source.candidates:
+                    candidate.reason = candidate.reason or source.reason
+
+
+def _plain(path: str) -> str:
+    """A field path without what a pattern would take for a choice of letters."""
+    return path.replace("[", "(").replace("]", ")")
+
+
+def _topics(sources: Sequence[Source]) -> str:
+    return shortlist([s.topic for s in sources], 20)
 
 
 def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:

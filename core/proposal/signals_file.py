@@ -17,7 +17,7 @@ _LONGEST_LINE = 1 << 20  # letters
 
 def signals_file(
     bags: Sequence[Recording], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
-    doubt: str,
+    doubt: str, memories: Sequence[str] = (), members: Sequence[str] = (),
 ) -> str:  # fmt: skip
     """Write the text of the file.
 
@@ -33,6 +33,10 @@ def signals_file(
         Proposed controls.
     doubt : str
         A sentence about the states, or an empty text.
+    memories : sequence of str, optional
+        Lines to add to the states.
+    members : sequence of str, optional
+        Many alike, of which the states and controls are those of one; the file is for all of them.
 
     Returns
     -------
@@ -70,9 +74,14 @@ def signals_file(
     lines += ["", "# steady: median over the longest stretch in which nothing moves; scale: the largest such"]
     lines.append("# magnitude, or the range where that is small. Both in recorded units.")
     lines += [f"# Beware: {doubt}."] if doubt else []
+    if any(c.ignore for c in [*states, *controls]):
+        lines.append(
+            "# ignore: numbers that stand for no value, as they lie far from all others; they count as missing."
+        )
     lines.append("states:")
-    lines += [_entry(c) for c in states]
-    lines += [_entry(c, comment=c.reason, out=True) for s in sources for c in s.candidates if c.ready == "state"]
+    lines += [entry(c) for c in states]
+    lines += memories
+    lines += [entry(c, comment=c.reason, out=True) for s in sources for c in s.candidates if c.ready == "state"]
     if controls:
         lines += ["", "controls:"]
         if any(every[c.topic].role == "guess" for c in controls):
@@ -80,10 +89,10 @@ def signals_file(
         if any(c.delay for c in controls):
             lines.append("  # delay: number of samples by which the states follow later")
         for candidate in controls:
-            lines.append(_entry(candidate, *longest_hold(every[candidate.topic], clock)))
+            lines.append(entry(candidate, *longest_hold(every[candidate.topic], clock)))
         for candidate in (c for s in sources for c in s.candidates if c.ready == "control"):
             limit, _ = longest_hold(every[candidate.topic], clock)
-            lines.append(_entry(candidate, limit, candidate.reason, out=True))
+            lines.append(entry(candidate, limit, candidate.reason, out=True))
     else:
         lines += [
             "",
@@ -93,7 +102,49 @@ def signals_file(
     left_out = _left_out(sources, {id(c) for c in [*states, *controls]})
     if left_out:
         lines += ["", "# Not proposed, and why:", *left_out]
+    if members:
+        lines = for_members(lines, [*states, *controls], members)
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
+
+
+def for_members(lines: Sequence[str], of: Sequence[Candidate], members: Sequence[str]) -> list[str]:
+    """The lines of one member of many alike as templates for all of them.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Of the file.
+    of : sequence of Candidate
+        Its signals, all of one member.
+    members : sequence of str
+        All members.
+
+    Returns
+    -------
+    list of str
+        The lines, with `structure: own` and `steady: auto`.
+    """
+    one = of[0].element
+    listed = ", ".join(_quoted(m) for m in members)
+    found = []
+    for line in lines:
+        if line.startswith("states:"):
+            found += ["# Each member depends on its own states and controls.", "structure: own", ""]
+        if re.match(r"  - \{name: ", line) and f"[{one}]" in line:
+            line = line.replace(f"[{one}]", "[{}]")
+            line = re.sub(
+                r"^  - \{name: ([^,]+),", lambda m: f"  - {{for: [{listed}], name: {_place(m[1], one)},", line
+            )
+            line = re.sub(r"steady: (?!0[,}])[^,}]+", "steady: auto", line)
+        found.append(line)
+    return found
+
+
+def _place(name: str, member: str) -> str:
+    """Name of a signal with a place for the member."""
+    plain = name.strip('"')
+    word = re.sub(r"\W+", "_", member).strip("_")
+    return '"' + (plain.replace(word, "{}", 1) if word in plain else "{}_" + plain) + '"'
 
 
 def _far(offsets: Sequence[float]) -> bool:
@@ -110,8 +161,25 @@ def _quoted(text: str) -> str:
     )
 
 
-def _entry(candidate: Candidate, max_hold: float | None = None, comment: str = "", out: bool = False) -> str:
-    """Line of a signal; `out`: in a comment, ready to be taken in."""
+def entry(candidate: Candidate, max_hold: float | None = None, comment: str = "", out: bool = False) -> str:
+    """Line of a signal.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        The signal.
+    max_hold : float, optional
+        Greatest age, s.
+    comment : str, default ""
+        Behind it.
+    out : bool, default False
+        In a comment, ready to be taken in.
+
+    Returns
+    -------
+    str
+        One line.
+    """
     parts = [f"name: {_quoted(candidate.name)}", f"topic: {_quoted(candidate.topic)}"]
     parts.append('field: "' + re.sub(r'(["\\])', r"\\\1", candidate.path) + '"')
     parts += [f"steady: {_number(candidate.steady)}", f"scale: {_number(candidate.scale)}"]
@@ -121,12 +189,20 @@ def _entry(candidate: Candidate, max_hold: float | None = None, comment: str = "
         parts.append(f"max_hold: {_number(max_hold)}")
     if candidate.delay:
         parts.append(f"delay: {candidate.delay}")
+    if candidate.ignore:
+        parts.append(f"ignore: [{', '.join(_exact(v) for v in candidate.ignore)}]")
     return f"  {'# ' * out}- {{{', '.join(parts)}}}" + (f" # {comment}" if comment else "")
 
 
 def _number(value: float) -> str:
     """Six digits, as YAML reads a number (1e-05 would be a text)."""
     text = f"{value:.6g}"
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
+
+
+def _exact(value: float) -> str:
+    """Every digit, as YAML reads a number."""
+    text = repr(value)
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 

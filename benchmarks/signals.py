@@ -1,0 +1,163 @@
+#!/usr/bin/env python3
+"""What a signals file can say beyond fields: lags and rates, a constant step, many alike; on real recordings.
+
+    python benchmarks/signals.py [--data FOLDER]
+
+Each row is one state, before and after: entries in the signals file, mean width per step over the root mean square of
+the state's steps, and the share inside its bounds, the two last on what was left out of the fit (ten blocks per
+recording, with guard intervals).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from measure import table
+
+from uncertain_lti import SignalMap, Transient, fit, read_transients, validate
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A machine with two signals files: names, recordings, and what the second one adds to the first."""
+
+    machine: str
+    recordings: tuple[str, ...]
+    before: SignalMap
+    after: SignalMap
+    entries: tuple[int, int]
+
+
+def entries(data: dict[str, object]) -> int:
+    """Signals and rules that a person writes."""
+    lists = [data.get(key) for key in ("states", "controls", "structure")]
+    return sum(len(part) if isinstance(part, list) else part is not None for part in lists)
+
+
+def case(
+    machine: str, recordings: Sequence[str], file: Path | dict[str, object], *memories: str, **more: object
+) -> Case:
+    """The shipped file (or its content), and the same with memories of its states and controls."""
+    data = yaml.safe_load(file.read_text()) if isinstance(file, Path) else file
+    signals = {s["name"]: s for key in ("states", "controls") for s in data[key]}
+    added = []
+    for memory in memories:
+        kind, name, *samples = memory.replace("(", " ").replace(",", " ").replace(")", "").split()
+        field = f"{kind}({', '.join([signals[name]['field'], *samples])})"
+        hold = {"max_hold": signals[name]["max_hold"]} if "max_hold" in signals[name] else {}
+        added.append({"name": memory, "topic": signals[name]["topic"], "field": field, **hold})
+    after = {**data, "controls": [*data["controls"], *added], **more}
+    maps = [SignalMap.from_dict(d, source=machine) for d in (data, after)]
+    return Case(machine, tuple(recordings), maps[0], maps[1], (entries(data), entries(after)))
+
+
+def left_out(transients: Sequence[Transient]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean width over the root mean square step (n,), share inside (n,), and inside in all states at once."""
+    model = fit(transients)
+    parts = validate(transients, full=model, blocks=10).parts
+    judged = sum(part.judged for part in parts)
+    steps = [t.transitions() for t in transients]
+    rms = np.sqrt(np.mean(np.concatenate([s.x_next - s.x for s in steps]) ** 2, axis=0))
+    width = sum(part.judged * part.mean_width for part in parts) / judged
+    outside = sum((np.abs(part.utilisation) > 1.0).sum(axis=0) for part in parts) / judged
+    return width / rms, 1.0 - outside, 1.0 - sum(part.violated for part in parts) / judged
+
+
+def compared(data: Path, of: Case) -> list[list[str]]:
+    found = []
+    for signals in (of.before, of.after):
+        found.append(left_out(read_transients([data / name for name in of.recordings], signals)))
+    return [
+        [
+            f"{of.machine}: {signal.name}",
+            " → ".join(str(count) for count in of.entries),
+            " → ".join(f"{width[i]:.3g}" for width, _, _ in found),
+            " → ".join(f"{inside[i]:.2%}" for _, inside, _ in found),
+        ]
+        for i, signal in enumerate(of.before.states)
+    ]
+
+
+def go2(data: Path, folder: Path) -> list[list[str]]:
+    """Twelve files with a joint each, and one with all; entries of the twelve, and what one took without templates."""
+    recording = data / "go2" / "test_3.mcap"
+    text = (folder / "go2_joint.yaml").read_text()
+    alone = []
+    for joint in range(12):
+        signals = SignalMap.from_dict(yaml.safe_load(text.replace("[j0]", f"[j{joint}]")), source="go2")
+        alone.append(left_out(read_transients(recording, signals)))
+    whole = SignalMap.load(folder / "go2.yaml")
+    recorded = left_out(read_transients(recording, replace(whole, step="recorded")))
+    constant = left_out(read_transients(recording, whole))
+    rows = []
+    for i, name in enumerate(("angle", "rate")):
+        widths = [np.array([width[i] for width, _, _ in alone])]
+        shares = [np.array([inside[i] for _, inside, _ in alone])]
+        for width, inside, _ in (recorded, constant):
+            widths.append(width[12 * i : 12 * i + 12])
+            shares.append(inside[12 * i : 12 * i + 12])
+        rows.append(
+            [
+                f"Go2, twelve joints: {name} (median; recorded step, then constant)",
+                f"{12 * 3} in 12 files, or {36 + len(whole.structure)} → 4",
+                " → ".join(f"{np.median(width):.3g}" for width in widths),
+                " → ".join(f"{share.mean():.2%}" for share in shares),
+            ]
+        )
+        print(name, "width with a constant step over that with the recorded one:", np.round(widths[2] / widths[1], 2))
+    return rows
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
+    data = parser.parse_args().data
+    if not data.is_dir():
+        print(f"{data}: the recordings are not there; name their folder with --data", file=sys.stderr)
+        return 2
+    folder = ROOT / "config" / "signals"
+    vicon = yaml.safe_load((folder / "crazyflie_vicon.yaml").read_text())
+    pitch = vicon | {
+        "states": [{**vicon["states"][0], "name": "pitch", "field": "pitch(pose.orientation)"}],
+        "controls": [{**vicon["controls"][0], "name": "pitch_control", "field": "position.y"}],
+    }
+    depth = {
+        "additive": "noise",
+        "states": [{"name": "depth", "topic": "/coug2/depth_data", "field": "pose.pose.position.z"}],
+        "controls": [
+            {"name": f"fin_{k}", "topic": "/coug2/controls/command", "field": f"fin[{k}]", "scale": 10.0}
+            for k in (0, 1)
+        ],
+    }
+    hunter = [f"hunter_se/straight_{name}_run_0{k}.mcap" for name in ("even_t_0_2", "odd_t_0_5") for k in (1, 2)]
+    turbine = [f"micro_gas_turbine/ex_{k}.mcap" for k in (1, 20, 24)]
+    neato = ["neato/person_follower.mcap", "neato/draw_square.mcap"]
+    cases = [
+        case("Crazyflie", ["crazyflie/rollbag_0.mcap"], folder / "crazyflie_vicon.yaml", "lag(roll, 1)"),
+        case("Crazyflie", ["crazyflie/rollbag_0.mcap"], folder / "crazyflie_vicon.yaml", "rate(roll)"),
+        case("Crazyflie", ["crazyflie/yx3bag_0.mcap"], pitch, "rate(pitch)"),
+        case("Micro gas turbine", turbine, folder / "micro_gas_turbine.yaml", "lag(power, 1)"),
+        case("Hunter SE", hunter, folder / "hunter_se.yaml", "diff(throttle)", "lag(throttle, 1)", "rate(speed)"),
+        case("Neato", neato, folder / "neato.yaml", "rate(linear)", "rate(angular)"),
+        case("AUV", ["cougars_auv/SO_bag_0.mcap"], depth, "rate(depth)"),
+    ]
+    rows = go2(data, folder)
+    for one in cases:
+        try:
+            rows += compared(data, one)
+        except ValueError as error:
+            print(f"{one.machine}: {error}", file=sys.stderr)
+    table("What signals files can say", ("machine: state", "entries", "width / rms step", "inside, left out"), rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
