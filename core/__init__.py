@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from uncertain_lti.model.uncertain_lti import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor as EnvelopeMonitor
     from uncertain_lti.proposal.fitting import fit as fit
+    from uncertain_lti.proposal.tune import tune as tune
     from uncertain_lti.sampling.reading import read_transients as read_transients
     from uncertain_lti.sampling.transient import Transient as Transient
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
@@ -27,6 +28,7 @@ _HOME = {
     "UncertainLTI": "model.uncertain_lti",
     "fit": "proposal.fitting",
     "read_transients": "sampling.reading",
+    "tune": "proposal.tune",
     "validate": "validation.fitted_model",
 }
 

@@ -17,13 +17,14 @@ from typing import Any, NoReturn
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import check, completion, fit, info, init, layout, report, reproduce, ros, topics, validate
+from uncertain_lti.cli import check, completion, fit, info, init, layout, report, reproduce, ros, topics, tune, validate
 from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain
 
 COMMANDS: tuple[Command, ...] = (
     topics.COMMAND,
     init.COMMAND,
     fit.COMMAND,
+    tune.COMMAND,
     check.COMMAND,
     report.COMMAND,
     layout.COMMAND,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,8 @@ LONGEST_MEMORY = 2000
 """Samples before the onset that are judged, at most."""
 DECAYED = 3
 """Windows after which a moving average or a cumulative sum has forgotten what was before, for the most part."""
+OFF = 1.1
+"""Factor by which the nominal model's response to actuators and dynamics may be off, for the interval of a share."""
 MOST_TOGETHER = 2_000_000
 """Numbers that are judged at a time, about."""
 GROWS = 10.0
@@ -132,6 +134,8 @@ class Detectable:
         By kind and signal.
     refused : str
         Why there is none; "" otherwise.
+    units : array (cases,) of int
+        Number of what each case was left out with.
     """
 
     within: float
@@ -140,6 +144,7 @@ class Detectable:
     left_out: int
     faults: tuple[Seen, ...]
     refused: str = ""
+    units: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the model file.
@@ -380,7 +385,7 @@ def detectable(
         done[kind, name] if (kind, name) in done else _unknown(kind, name, refused[kind, name])
         for kind, _, name in pairs
     ]
-    return Detectable(within, confidence, count, left_out, tuple(found))
+    return Detectable(within, confidence, count, left_out, tuple(found), "", every.unit)
 
 
 class _Search:
@@ -432,6 +437,11 @@ class _Search:
         order, size, total = np.sort(thresholds), self._size(), len(thresholds)
         inside = thresholds <= min(size, self.largest)
         share, interval = quantile_share_interval(units, inside, confidence)
+        if KINDS[self.kind].of != "sensor":  # the nominal model's response may be off
+            interval = (
+                quantile_share_interval(units, thresholds <= size / OFF, confidence)[1][0],
+                quantile_share_interval(units, thresholds <= min(size * OFF, self.largest), confidence)[1][1],
+            )
         _, levels = quantile_share_interval(units, inside, confidence, share=SHARE)
         low, high = (float(order[min(max(math.ceil(v * total - 1e-9), 1), total) - 1]) for v in levels)
         delay = self._delay[np.isfinite(self._delay)]

@@ -1,0 +1,167 @@
+"""Command `uncertain-lti tune`: choose how to fit, and what raises the alarm, by the faults that are seen."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.cli.command import (
+    DONE,
+    GROUP,
+    SILENT,
+    Command,
+    add_force,
+    model_target,
+    print_json,
+    print_notes,
+    print_summary,
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti tune`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
+    parser.add_argument(
+        "bags",
+        metavar="BAG",
+        nargs="+",
+        help="recordings of the healthy machine; LABEL=BAG is one of a machine with the fault LABEL",
+    )
+    parser.add_argument(
+        "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
+    )
+    parser.add_argument(
+        "--false-alarms", required=True, type=float, metavar="PER_HOUR", help="false alarms per hour at most"
+    )
+    parser.add_argument(
+        "--within", type=float, metavar="S", help="time within which a fault shall be seen (default: as in validate)"
+    )
+    parser.add_argument(
+        "--budget", type=_time, default=math.inf, metavar="TIME", help="begin nothing new after 90s, 10m or 1h"
+    )
+    parser.add_argument("--group", metavar="KEY", help=GROUP)
+    parser.add_argument("--cache", metavar="FOLDER", help="keep what every way came to, and go on from there")
+    parser.add_argument("--output", metavar="MODEL", help="model file to write (*.model.json)")
+    parser.add_argument("--figure", metavar="FILE", help="draw detectable size against false alarms (PNG, SVG, PDF)")
+    add_force(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Try the ways, print them, and write the model that was chosen.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    FitError
+        A number is out of range, or the recordings cannot be judged.
+    UncertainLTIError
+        A recording or the signals file cannot be read.
+    """
+    from uncertain_lti import Transient, read_transients, tune
+    from uncertain_lti.base.files import sha256, target
+    from uncertain_lti.recordings.formats import group_recordings
+    from uncertain_lti.reports.tune_text import tune_text
+    from uncertain_lti.sampling.reading import read_as_fitted
+    from uncertain_lti.validation.groups import resolve_groups
+
+    output = None if options.output is None else model_target(options.output, options.force)
+    figure = None
+    if options.figure is not None:
+        suffix = os.path.splitext(options.figure)[1].lower()
+        if suffix not in _FIGURES:
+            raise FitError(f"{options.figure}: is no figure that can be drawn; name it *{', *'.join(_FIGURES)}")
+        figure = target(options.figure, holds=_FIGURES[suffix], kind="figure", example="tune.png")
+    healthy = [bag for bag in options.bags if _label(bag) is None]
+    if not healthy:
+        raise FitError("no recording of the healthy machine is named; give at least one without a label")
+    transients = read_transients(healthy, options.signals, options.progress.iterate("reading"), processes=None)
+    for transient in transients:
+        print_notes(options, transient.notes)
+    resolve_groups(transients, options.group)
+    signals = transients[0].signals
+    assert signals is not None
+    faulty: dict[str, list[Transient]] = {}
+    for bag in options.bags:
+        if (label := _label(bag)) is not None:
+            for recording in group_recordings([bag.partition("=")[2]], layout=signals.table):
+                run = read_as_fitted(recording, signals, options.progress.iterate("reading"))
+                faulty.setdefault(label, []).append(run)
+    with options.progress.stage("tuning") as step:
+        tuned = tune(
+            transients,
+            options.false_alarms,
+            within=options.within,
+            budget=options.budget,
+            groups=options.group,
+            faulty=faulty,
+            cache=options.cache,
+            progress=step,
+        )
+    data = tuned.to_dict()
+    if options.json:
+        print_json({"model": options.output, "tune": data})
+    else:
+        print_summary(options, tune_text(data))
+    if figure is not None:
+        from uncertain_lti.reports.tune_figure import tune_figure
+
+        tune_figure(data, figure)
+        print_summary(options, f"figure written to {figure}")
+    if output is not None:
+        files = dict.fromkeys(name for t in transients for name in t.sources)
+        sources = [{"file": name, "sha256": sha256(name)} for name in files]
+        facts = {**tuned.model.fit_summary, "sources": sources}
+        facts |= {"group": options.group} if options.group is not None else {}
+        tuned.model.replace(fit_summary=facts).save(output)
+        print_summary(options, f"model written to {output}")
+    return DONE
+
+
+_FIGURES = {".png": b"PNG", ".svg": b"svg", ".pdf": b"%PDF"}
+"""Kinds of figures, with what each file of the kind begins with."""
+
+
+def _label(text: str) -> str | None:
+    """The label of LABEL=BAG; None for a recording without one."""
+    label, given, path = text.partition("=")
+    return label if given and path and not os.path.exists(text) and os.sep not in label else None
+
+
+def _time(text: str) -> float:
+    """Seconds of 90, 90s, 10m or 1h."""
+    match = re.fullmatch(r"\s*([0-9.]+)\s*(s|m|min|h)?\s*", text)
+    try:
+        seconds = float(match[1]) * {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}[match[2] or "s"] if match else 0.0
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is no time; write 90s, 10m or 1h")
+    return seconds
+
+
+COMMAND = Command(
+    "tune",
+    "choose how to fit, and what raises the alarm, by the faults that are seen on left-out data",
+    add_arguments,
+    run,
+    quiet=SILENT,
+    verbose="say every way that is tried, and what took how long",
+)

@@ -1,0 +1,51 @@
+"""Figure of `tune`: the smallest detectable fault against false alarms."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+NONE = 0.4
+"""What no alarm is drawn as, alarms."""
+
+
+def tune_figure(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
+    """Draw every way as a point, and the plain and the chosen one as lines over the false alarms allowed.
+
+    Parameters
+    ----------
+    data : mapping
+        Of `Tuned.to_dict`.
+    path : path
+        Image file to write, of a kind that matplotlib knows.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7.0, 4.5), layout="constrained")
+    judged = [t for t in data["trials"] if "refused" not in t and t["size"] is not None]
+    hours = next((t["alarms"] / t["per_hour"] for t in judged if t["alarms"]), None)
+    if hours is None:
+        hours = next((p["alarms"] / p["per_hour"] for p in data["curve"] if p["alarms"]), 1.0)
+    rate = [max(t["alarms"], NONE) / hours for t in judged]
+    axes.plot(rate, [t["size"] for t in judged], ".", color="0.6", label="every way at the rate asked for")
+    chosen = data["trials"][data["chosen"]]
+    for way, colour in (("plain", "#0072b2"), ("chosen", "#d55e00")):
+        points = sorted((max(p["alarms"], NONE) / hours, p["size"]) for p in data["curve"] if p["way"] == way)
+        if points:
+            axes.plot(*zip(*points, strict=True), "o-", color=colour, label=way)
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel=f"false alarms per hour on what was left out (leftmost: none in {hours:.3g} h)",
+        ylabel="smallest detectable fault, relative to the plain fit",
+        title=f"{chosen['fit']}; alarm {chosen['alarm']}",
+    )
+    axes.title.set_fontsize("small")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,149 @@
+"""tune(): what it chooses detects smaller faults on left-out data than the plain fit, and it says so."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from engine_bag import SIGNALS, engine_bag
+from tanks import Tanks
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, tune
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.cli.main import main
+from uncertain_lti.proposal import tune as module
+from uncertain_lti.reports.tune_text import tune_text
+
+RATE = 100.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """Fewer cases, kinds of faults and windows than anybody would take: the suite has seconds for it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "CASES", 20)
+        patch.setattr(module, "KINDS", ("bias", "offset"))
+        patch.setattr(module, "STEPS", (25.0,))
+        yield
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return Tanks().transients(4, seed=3, steps=60, noise=1e-3)
+
+
+@pytest.fixture(scope="module")
+def faulty():
+    return {"leak": Tanks().transients(2, seed=8, steps=60, noise=1e-3, fault=0.5)}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def tuned(runs, faulty, folder):
+    return tune(runs, RATE, faulty=faulty, cache=folder)
+
+
+def test_it_detects_smaller_faults_than_the_plain_fit_and_names_the_reason(tuned, runs):
+    plain, chosen = tuned.trials[0], tuned.chosen
+    assert plain.setting.words == "plain fit: (10), no additive term"
+    assert chosen.setting.options["additive"] != "none"  # the levels are measured with noise
+    rows = tuned.to_dict()["trials"]
+    assert rows[tuned.to_dict()["chosen"]]["size"] < 0.8 and rows[0]["size"] == 1.0
+    ratio = chosen.sizes() - plain.sizes()
+    assert rows[tuned.to_dict()["chosen"]]["size"] == pytest.approx(math.exp(ratio[np.isfinite(ratio)].mean()))
+    for trial in tuned.trials:
+        assert trial.refused or trial.alarms <= RATE * trial.hours
+    assert f"{math.exp(ratio[np.isfinite(ratio)].mean()):.3g} times the size" in tuned.reason
+    model = tuned.model
+    assert model.alarm == chosen.rules and model.fit_summary["tune"]["reason"] == tuned.reason
+    assert not any(EnvelopeMonitor(model).check(run).alarm.any() for run in chosen.setting.prepared(runs))
+    assert model.validation["detectable"]["faults"] and "false_alarms" in model.validation
+
+
+def test_the_simplest_within_the_error_of_the_best_is_chosen(tuned):
+    good = [t for t in tuned.trials if not t.refused and t.seen_share == max(t.seen_share for t in tuned.trials)]
+    plain = tuned.trials[0]
+    best = min(good, key=lambda t: np.nanmean(t.sizes() - plain.sizes()))
+    assert tuned.chosen.unknowns <= best.unknowns
+    assert {t.family.kind for t in tuned.trials} >= {"containment", "energy", "mean", "chi2", "horizons"}
+    assert any(t.setting.constant for t in tuned.trials)
+
+
+def test_an_interrupted_search_goes_on_and_comes_to_the_same(tuned, runs, faulty, folder, monkeypatch):
+    made = []
+    real = module._Search._try
+
+    def counted(self, setting, family):
+        made.append(setting.words)
+        return real(self, setting, family)
+
+    monkeypatch.setattr(module._Search, "_try", counted)
+    entry = min(folder.iterdir())
+    entry.write_text("{damaged")
+    again = tune(runs, RATE, faulty=faulty, cache=folder)
+    assert len(made) == 1
+    assert json.dumps(again.to_dict()) == json.dumps(tuned.to_dict())
+    assert json.dumps(again.model.to_dict()) == json.dumps(tuned.model.to_dict())
+
+
+def test_the_budget_ends_it_and_what_was_not_tried_is_named(runs):
+    tuned = tune(runs, RATE, budget=1e-6)
+    assert len(tuned.trials) == 1 and tuned.chosen is tuned.trials[0]
+    assert "(11), noise; alarm 1 of 1" in tuned.not_tried and "no other way could be judged" in tuned.reason
+    text = tune_text(tuned.to_dict())
+    assert "the budget left no time for" in text and "record next" in text
+
+
+def test_labelled_recordings_count(tuned):
+    seen = tuned.chosen.seen["leak"]
+    assert len(seen) == 2 and sum(seen) >= max(sum(t.seen["leak"]) for t in tuned.trials if not t.refused) - 1
+    assert "of the recordings with a fault" in tuned.reason
+
+
+def test_what_to_record_is_named(runs):
+    still = [Transient(r.t_ns, r.x, np.column_stack([r.u, np.ones(len(r))])) for r in runs[:3]]
+    tuned = tune(still, 0.01, budget=1e-6)
+    text = "\n".join(tuned.record)
+    assert "3 recordings can hardly carry a choice: record 3 more recordings" in text
+    assert "u2 does not move" in text and "h without an alarm would" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"false_alarms": 0.0}, "positive number per hour"),
+        ({"false_alarms": 1.0, "within": -1.0}, "positive number of seconds"),
+        ({"false_alarms": 1.0, "budget": 0.0}, "budget is 0.0"),
+        ({"false_alarms": 1.0, "within": 1e4}, "the plain fit cannot be judged"),
+    ],
+)
+def test_what_cannot_be_tuned_is_refused(runs, options, words):
+    with pytest.raises(FitError, match=words):
+        tune(runs, **options)
+
+
+def test_the_command_writes_a_model_and_a_figure(tmp_path, capsys):
+    (tmp_path / "signals.yaml").write_text(SIGNALS)
+    for seed in (1, 2):
+        engine_bag(tmp_path / f"run{seed}.mcap", seed=seed)
+    engine_bag(tmp_path / "broken.mcap", seed=3, fault_at=100)
+    name, picture = str(tmp_path / "m.model.json"), tmp_path / "tune.png"
+    bags = [str(tmp_path / "run1.mcap"), str(tmp_path / "run2.mcap"), f"broken={tmp_path / 'broken.mcap'}"]
+    words = ["tune", *bags, "--signals", str(tmp_path / "signals.yaml"), "--false-alarms", "500", "--within", "0.5"]
+    assert main([*words, "--budget", "1s", "--output", name, "--figure", str(picture)]) == 0
+    said = capsys.readouterr().out
+    assert "chosen:" in said and "because" in said and "record next" in said and "broken" in said
+    assert picture.read_bytes()[1:4] == b"PNG"
+    model = UncertainLTI.load(name)
+    assert model.fit_summary["tune"]["trials"] and len(model.fit_summary["sources"]) == 2
+    assert main(["check", name, bags[0], "-q"]) == 0
+    capsys.readouterr()
+    assert main([*words[:-4], "--false-alarms", "0"]) == 2
+    assert main([*words, "--output", name]) == 2 and "--force" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*words, "--budget", "soon"])
+    assert "write 90s, 10m or 1h" in capsys.readouterr().err
