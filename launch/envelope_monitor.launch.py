@@ -1,46 +1,75 @@
-"""Start envelope_monitor with a model, a parameter file, in a namespace, on wall or simulated time."""
+"""Start envelope_monitor: its model, name and namespace, the prefix of its inputs, and what its end means."""
 
 from pathlib import Path
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import LifecycleNode
 
 PARAMETERS = Path(__file__).resolve().parents[1] / "config" / "envelope_monitor.yaml"
+ARGUMENTS = {
+    "model": ("", "Path of the model file; empty: that of the parameter file."),
+    "params_file": (str(PARAMETERS), "Parameter file."),
+    "name": ("envelope_monitor", "Name of the node."),
+    "namespace": ("", "Namespace of the node and its outputs."),
+    "topic_prefix": ("", "Prefix of the topics of the model; 'namespace' for the namespace of the node."),
+    "use_sim_time": ("false", "Follow /clock."),
+    "autostart": ("", "Configure and activate without being asked, true or false; empty: as the parameter file says."),
+    "required": ("false", "The launch ends when the node does, and the node ends if its model is wrong."),
+    "respawn": ("false", "Start the node again when it ends."),
+    "respawn_delay": ("2.0", "s before that."),
+    "log_level": ("info", "debug, info, warn, error or fatal."),
+    "prefix": ("", "Command in front of the node's, for example 'taskset -c 2' or 'chrt -f 50'."),
+}
+"""Name -> default and description."""
 
 
 def start(context):
-    """Make the node; an empty `model` leaves the one of the parameter file in place."""
-    file = LaunchConfiguration("params_file").perform(context)
-    if not Path(file).is_file():
-        raise FileNotFoundError(f"params_file:={file} is not a file; check the path")
-    simulated = LaunchConfiguration("use_sim_time").perform(context)
-    if simulated.lower() not in ("true", "false"):
-        raise ValueError(f"use_sim_time:={simulated} is neither true nor false")
-    parameters = [file, {"use_sim_time": simulated.lower() == "true"}]
-    model = LaunchConfiguration("model").perform(context)
-    if model:
-        parameters.append({"model": model})
+    """Make the node; arguments that are empty leave the values of the parameter file in place."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    if not Path(given["params_file"]).is_file():
+        raise FileNotFoundError(f"params_file:={given['params_file']} is not a file; check the path")
+    required, respawn = truth("required", given["required"]), truth("respawn", given["respawn"])
+    if required and respawn:
+        raise ValueError("required:=true ends the launch with the node, and respawn:=true starts it again; choose one")
+    values = {"use_sim_time": truth("use_sim_time", given["use_sim_time"])}
+    if given["model"]:
+        values["model"] = given["model"]
+    if given["autostart"]:
+        values["autostart"] = truth("autostart", given["autostart"])
+    if required:
+        values["required"] = True
+    if given["topic_prefix"]:
+        of_node = "/" + given["namespace"].strip("/")
+        values["topic_prefix"] = of_node if given["topic_prefix"] == "namespace" else given["topic_prefix"]
     node = LifecycleNode(
         package="uncertain_lti_ros",
         executable="envelope_monitor",
-        name="envelope_monitor",
-        namespace=LaunchConfiguration("namespace"),
-        parameters=parameters,
+        name=given["name"],
+        namespace=given["namespace"],
+        parameters=[given["params_file"], values],
+        arguments=["--ros-args", "--log-level", given["log_level"]],
+        prefix=given["prefix"] or None,
+        respawn=respawn,
+        respawn_delay=float(given["respawn_delay"]),
+        on_exit=Shutdown(reason="envelope_monitor is required, and has ended") if required else None,
         output="screen",
     )
     return [node]
 
 
+def truth(name, text):
+    """Read true or false."""
+    if text.lower() not in ("true", "false"):
+        raise ValueError(f"{name}:={text} is neither true nor false")
+    return text.lower() == "true"
+
+
 def generate_launch_description():
-    """Arguments: model, params_file, namespace, use_sim_time."""
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("model", default_value="", description="Path of the model file."),
-            DeclareLaunchArgument("params_file", default_value=str(PARAMETERS), description="Parameter file."),
-            DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node."),
-            DeclareLaunchArgument("use_sim_time", default_value="false", description="Follow /clock."),
-            OpaqueFunction(function=start),
-        ]
-    )
+    """Arguments: those of `ARGUMENTS`; `ros2 launch --show-args` lists them."""
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=start)])

@@ -15,6 +15,7 @@ from typing import Any
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from uncertain_lti.base.errors import UncertainLTIError
 
@@ -28,7 +29,7 @@ _FORMS = {
 }  # fmt: skip
 """How each ROS argument that takes a value reads."""
 _LOGGING = [f"--{how}able-{what}-logs" for how in ("en", "dis") for what in ("rosout", "stdout", "external-lib")]
-_TYPES = {str: "text", bool: "true or false", int: "a whole number", float: "a number with a point"}
+_TYPES = {str: "text", bool: "true or false", int: "a whole number", float: "a number"}
 _WIDTH = 100
 
 
@@ -117,6 +118,9 @@ def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
     """
     values = {}
     for parameter in parameters:
+        given = node._parameter_overrides.get(parameter.name)
+        if given is not None:
+            node._parameter_overrides[parameter.name] = whole_to_real(given, parameter.default)
         try:
             values[parameter.name] = node.declare_parameter(
                 parameter.name, parameter.default, parameter.descriptor()
@@ -127,12 +131,30 @@ def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
             remedy = f"for example -p {parameter.name}:={parameter.example}"
             if isinstance(parameter.default, str):
                 remedy = f"if it looks like something else, quote it twice: -p \"{parameter.name}:='{shown}'\""
-            elif isinstance(parameter.default, float) and type(given) is int:
-                remedy = f"write {float(given)}"
             raise ArgumentError(
                 f"parameter {parameter.name} is {shown}, and {parameter.wanted} is wanted; {remedy}"
             ) from None
     return values
+
+
+def whole_to_real(given: Parameter, default: object) -> Parameter:
+    """A parameter with its whole number as a real one, if a real one is meant; rclpy takes 2.0 there, and refuses 2.
+
+    Parameters
+    ----------
+    given : Parameter
+        As set by the user.
+    default : object
+        Its default; other types than a real number leave the parameter as it is.
+
+    Returns
+    -------
+    Parameter
+        Of the type of the default, if it was a whole number and a real one is meant.
+    """
+    if isinstance(default, float) and type(given.value) is int:
+        return Parameter(given.name, value=float(given.value))
+    return given
 
 
 def run_node(

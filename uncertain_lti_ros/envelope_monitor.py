@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial, wraps
 from pathlib import Path
+from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -26,10 +27,10 @@ from uncertain_lti.monitor.event_log import EventLog
 from uncertain_lti.monitor.failures import Failures
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session
 from uncertain_lti.monitor.snapshot import Entry
-from uncertain_lti_ros.arguments import declare, run_node
+from uncertain_lti_ros.arguments import BAD_USAGE, declare, run_node, whole_to_real
 from uncertain_lti_ros.diagnostics import Diagnostics, input_values
 from uncertain_lti_ros.messages import message_class
-from uncertain_lti_ros.parameters import PARAMETERS, RULE
+from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE
 from uncertain_lti_ros.polled_events import POLL
 from uncertain_lti_ros.process import living, spare_the_middleware
 from uncertain_lti_ros.publishers import Outputs
@@ -75,10 +76,26 @@ class EnvelopeMonitorNode(LifecycleNode):
     Public for tests and programs around it: `session` (None while not configured), `active` (verdicts are given),
     `reason` (why the last configure failed), `clock`, `settings`, `inputs` by topic, `outputs`, `snapshots` and
     `failures`.
+
+    Several may be in one process, on one executor. `start` configures and activates; the program does that if
+    `autostart` is true, others decide for themselves.
+
+    Parameters
+    ----------
+    name : str, optional
+        Of the node.
+    **options : Any
+        Of `rclpy.node.Node`: `namespace`, `parameter_overrides`, `context`, `cli_args`, `use_global_arguments` and
+        so on.
+
+    Raises
+    ------
+    ArgumentError
+        A parameter has a value that it cannot take.
     """
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
+    def __init__(self, name: str = NAME, **options: Any) -> None:
+        super().__init__(name, **options)
         declare(self, PARAMETERS)
         self.settings = Settings(self)
         self.session: Session | None = None
@@ -86,6 +103,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.reason = ""
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self.inputs: dict[str, MatchedSubscription] = {}
+        self._prefix = ""
         self._enable_problem = ""
         self._candidate: Session | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
@@ -103,6 +121,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         }  # fmt: skip
         for name, serve in services.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
+        self.add_pre_set_parameters_callback(lambda given: [whole_to_real(p, DEFAULTS.get(p.name)) for p in given])
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._on_have_set)
         tick = min(_TICK, self.settings.real("heartbeat") / 4, self.settings.real("diagnostics_period") / 2)
@@ -215,6 +234,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         path = str(self.settings.value("model"))
         try:
             self.settings.requested_qos()
+            self._prefix = self.settings.topic_prefix()
             self.session = self._make_session(path, self.settings.rule({}))
             self.snapshots.open()
         except Exception as error:
@@ -257,7 +277,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._simulated = self.clock.ros_time_is_active
         self.subscribe()
         self._event_log.begin(self.session, time.monotonic())
-        resolved = {topic: self.resolve_topic_name(topic) for topic in self.session.types}
+        resolved = {topic: self.resolve_topic_name(self._there(topic)) for topic in self.session.types}
         topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
         self.get_logger().info(f"active: listening to {', '.join(topics)}")
         self.active = True
@@ -377,9 +397,13 @@ class EnvelopeMonitorNode(LifecycleNode):
         for topic, type_name in types.items():
             if topic not in self.inputs:
                 self.inputs[topic] = MatchedSubscription(
-                    self, topic, type_name, message_class(type_name), partial(self._on_message, topic),
+                    self, self._there(topic), type_name, message_class(type_name), partial(self._on_message, topic),
                     self.settings.requested_qos(), raw=True,
                 )  # fmt: skip
+
+    def _there(self, topic: str) -> str:
+        """Where a topic of the model, or of the enable condition, is heard; before remapping."""
+        return f"{self._prefix}/{topic.removeprefix('/')}" if self._prefix else topic
 
     def _unsubscribe(self) -> None:
         self.active = False
@@ -475,7 +499,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         session = self.session
         if session is None or not self.active or not session.enable_topic or session.enable_type:
             return
-        infos = self.get_publishers_info_by_topic(session.enable_topic)
+        infos = self.get_publishers_info_by_topic(self._there(session.enable_topic))
         if infos:
             try:
                 session.found_enable_type(infos[0].topic_type)
@@ -628,7 +652,7 @@ def main(args: list[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 after a signal, 2 for arguments that the node cannot use.
+        Exit status: 0 after a signal, 2 for arguments that the node cannot use, and if it is required and cannot start.
     """
     return run_node(NAME, _SUMMARY, PARAMETERS, _run, args)
 
@@ -644,6 +668,10 @@ def _run(args: list[str]) -> int:
         )
         if node.get_parameter("autostart").value:
             node.start()
+            if not node.active and node.settings.value("required"):
+                node.get_logger().error("ends, as parameter required is true")
+                node.report()
+                return BAD_USAGE
         gc.collect()
         gc.freeze()  # what is here stays: the collector need not look at it again and again
         life.spin(node.note_failure)

@@ -13,6 +13,16 @@ PARAMETERS = (
     Declared("model", "", "Path of the model file. Setting it while running swaps the model, or is refused."),
     Declared("autostart", True, "Configure and activate without being asked.", fixed=True),
     Declared(
+        "required", False,
+        "End with status 2 if the node cannot start itself, as the model is wrong; otherwise it waits for a right one.",
+        fixed=True,
+    ),
+    Declared(
+        "topic_prefix", "",
+        "Prefix of the topics of the model and of `enable`, for example /robot1: /engine/state is heard on "
+        "/robot1/engine/state. Remapping comes after it.", fixed=True,
+    ),
+    Declared(
         "violations", 0,
         f"Alarm while this many of the last `window` verdicts are violations; 0: that of the model. {_RESTARTS}",
         low=0, high=10**6,
@@ -103,3 +113,5 @@ PARAMETERS = (
         fixed=True, low=0.1, high=1e5,
     ),
 )  # fmt: skip
+DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
+"""Name -> default, which gives the type."""

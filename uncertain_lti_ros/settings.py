@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
+from rclpy.validate_topic_name import validate_topic_name
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.monitor.session import Rule
@@ -121,6 +123,29 @@ class Settings:
                 raise ModelError(f"parameter qos.{name} is {text!r}; choose match, {' or '.join(known)}")
             chosen[name] = known.get(text)
         return RequestedQos(self.value("qos.depth"), **chosen)
+
+    def topic_prefix(self) -> str:
+        """What is put before every topic of the model.
+
+        Returns
+        -------
+        str
+            Without a slash at its end; empty for nothing.
+
+        Raises
+        ------
+        ModelError
+            It is no name of a topic.
+        """
+        prefix = str(self.value("topic_prefix")).rstrip("/")
+        try:
+            if prefix:
+                validate_topic_name(prefix)
+        except InvalidTopicNameException:
+            raise ModelError(
+                f"parameter topic_prefix is {prefix!r}; names consist of letters, digits, _ and /, as in /robot1"
+            ) from None
+        return prefix
 
     def check_snapshots(self, on_alarm: bool) -> None:
         """Refuse snapshots on an alarm without a folder for them.

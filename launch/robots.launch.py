@@ -1,0 +1,37 @@
+"""Start one envelope_monitor per robot: each in the namespace of its robot, with its inputs from there."""
+
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+
+ONE = Path(__file__).resolve().parent / "envelope_monitor.launch.py"
+
+
+def start(context):
+    """Include the launch file of one monitor for each robot."""
+    robots = [name.strip("/ ") for name in LaunchConfiguration("robots").perform(context).split(",")]
+    if not all(robots):
+        raise ValueError("robots:=NAME,NAME,... names the robots, for example robots:=robot1,robot2")
+    shared = {name: LaunchConfiguration(name).perform(context) for name in ("model", "required")}
+    return [
+        IncludeLaunchDescription(
+            PythonLaunchDescriptionSource(str(ONE)),
+            launch_arguments={**shared, "namespace": robot, "topic_prefix": "namespace"}.items(),
+        )
+        for robot in robots
+    ]
+
+
+def generate_launch_description():
+    """Arguments: model, robots, required."""
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("model", description="Path of the model file that all robots share."),
+            DeclareLaunchArgument("robots", default_value="robot1,robot2", description="Namespaces of the robots."),
+            DeclareLaunchArgument("required", default_value="false", description="As of envelope_monitor.launch.py."),
+            OpaqueFunction(function=start),
+        ]
+    )

@@ -1,0 +1,142 @@
+"""How monitors are put together: several in a process, inputs under a prefix, numbers as people write them, an end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.experimental import EventsExecutor
+from rclpy.parameter import Parameter
+from rclpy.serialization import deserialize_message
+from ros_processes import Diagnostics, World, open_world, until
+from sensor_msgs.msg import JointState
+from test_live import CONTROL, EPOCH_NS, STATE, by_hand, joint_state, saved, stamp_of, vector
+
+from uncertain_lti_ros.envelope_monitor import EnvelopeMonitorNode
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+def pair(k: int) -> tuple[Vector3Stamped, JointState]:
+    """Control and state of sample k, at the operating point."""
+    point = by_hand().operating_point
+    t_ns = EPOCH_NS + 10_000_000 * k
+    control = deserialize_message(vector(t_ns, *point.u_s), Vector3Stamped)
+    return control, deserialize_message(joint_state(t_ns, point.x_s), JointState)
+
+
+class Robots:
+    """Publishers of some robots, each under a prefix of its own."""
+
+    def __init__(self, world: World, prefixes: list[str]) -> None:
+        self.publishers = {
+            p: (world.publisher(Vector3Stamped, p + CONTROL), world.publisher(JointState, p + STATE)) for p in prefixes
+        }
+        self.sent = dict.fromkeys(prefixes, 0)
+
+    def send(self, prefix: str, samples: int) -> None:
+        World.subscribed(*self.publishers[prefix])
+        for _ in range(samples):
+            for publisher, message in zip(self.publishers[prefix], pair(self.sent[prefix]), strict=True):
+                publisher.publish(message)
+            self.sent[prefix] += 1
+            time.sleep(0.005)
+
+
+def test_two_monitors_in_one_process(world: World, tmp_path: Path) -> None:
+    path = str(saved(by_hand(), tmp_path))
+    options = {"context": world.node.context, "use_global_arguments": False}
+    nodes = [
+        EnvelopeMonitorNode(
+            name, namespace="/fleet",
+            parameter_overrides=[
+                Parameter("model", value=path), Parameter("topic_prefix", value=prefix), Parameter("margin", value=2),
+            ],
+            **options,
+        )
+        for name, prefix in (("left", "/robot1"), ("right", "/robot2/"))
+    ]  # fmt: skip
+    executor = EventsExecutor(context=world.node.context)
+    for node in nodes:
+        executor.add_node(node)
+        node.start()
+        assert node.active, node.reason
+    ends = threading.Event()
+
+    def spin() -> None:
+        while not ends.is_set():
+            executor.spin_once(timeout_sec=0.02)
+
+    thread = threading.Thread(target=spin)
+    thread.start()
+    try:
+        diagnostics = world.diagnostics()
+        flags = {name: world.listen(JointState, f"/fleet/{name}/flags").connected() for name in ("left", "right")}
+        robots = Robots(world, ["/robot1", "/robot2"])
+        robots.send("/robot1", 12)
+        robots.send("/robot2", 7)
+        assert len(flags["left"].count(12)) == 12 and len(flags["right"].count(7)) == 7
+        assert [stamp_of(m) for m in flags["left"].messages] == [EPOCH_NS + 10_000_000 * k for k in range(12)]
+        for name, verdicts in (("left", "11"), ("right", "6")):
+            monitor = f"fleet/{name}: monitor"
+            until(
+                lambda m=monitor, v=verdicts: (
+                    (status := diagnostics.latest(m)) and Diagnostics.values(status)["verdicts"] == v
+                ),
+                f"a report of {name}",
+            )
+        assert [node.session.monitor.rule.margin for node in nodes if node.session] == [2.0, 2.0]
+    finally:
+        ends.set()
+        thread.join()
+        for node in nodes:
+            node.finish()
+            node.destroy_node()
+
+
+def test_inputs_under_a_prefix_and_their_enable_condition(world: World, tmp_path: Path) -> None:
+    path = saved(by_hand(), tmp_path)
+    process = world.monitor(
+        path, "-r", "__ns:=/robot1", name="/robot1/envelope_monitor", topic_prefix="/robot1",
+        enable=f"{STATE} position[a] > -1e9", margin=2,
+    )  # fmt: skip
+    process.says(f"{STATE} (as /robot1{STATE})")
+    flags = world.listen(JointState, "/robot1/envelope_monitor/flags").connected()
+    robots = Robots(world, ["/robot1"])
+    robots.send("/robot1", 8)
+    flags.count(8)
+    status = world.status("/robot1/envelope_monitor")
+    assert status["verdicts"] == 7 and status["armed"] is True
+    assert status["received"] == {f"/robot1{CONTROL}": 8, f"/robot1{STATE}": 8}
+
+
+def test_a_prefix_that_is_no_name_is_refused(world: World, tmp_path: Path) -> None:
+    process = world.run_node("envelope_monitor", {"model": str(saved(by_hand(), tmp_path)), "topic_prefix": "/robot 1"})
+    process.says("parameter topic_prefix is '/robot 1'")
+
+
+def test_a_required_monitor_ends_if_its_model_is_wrong(world: World, tmp_path: Path) -> None:
+    (tmp_path / "wrong.model.json").write_text("{}")
+    process = world.run_node("envelope_monitor", {"model": str(tmp_path / "wrong.model.json"), "required": True})
+    assert process.wait() == 2
+    assert "not configured" in process.output and "Traceback" not in process.output
+
+
+def test_whole_numbers_are_taken_for_real_ones(world: World, tmp_path: Path) -> None:
+    world.monitor(saved(by_hand(), tmp_path), margin=2, heartbeat=1)
+    assert world.set(margin=3, grace=1) == (True, "")
+    accepted, reason = world.set(margin=-3)
+    assert not accepted and "margin" in reason
+    accepted, reason = world.set(violations=2.0)
+    assert not accepted, "a whole number stays one"
