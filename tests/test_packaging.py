@@ -189,8 +189,17 @@ def test_what_pip_installs_covers_what_is_imported(distribution):
     assert not missing
 
 
-def test_package_xml_covers_what_is_imported(package):
+def test_what_monitors_needs_no_package_of_pip(package):
+    """And nothing else that apt has but numpy and PyYAML: a robot is not to be filled with solvers."""
     keys = {element.text for element in package.iter("exec_depend")}
+    assert {key for key in keys if key.startswith("python3") or "mcap" in key} == {"python3-numpy", "python3-yaml"}
+    assert not [key for element in package if (key := element.text or "").endswith("-pip")]
+
+
+def test_package_xml_covers_what_is_imported(package):
+    fitting = ElementTree.parse(ROOT / "rosdep/package.xml").getroot()
+    assert fitting.findtext("version") == package.findtext("version")
+    keys = {element.text for root in (package, fitting) for element in root.iter("exec_depend")}
     outside = imported("core", "uncertain_lti_ros", "launch")
     optional = WITHOUT_ROSDEP_KEY | {
         "isal",
