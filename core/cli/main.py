@@ -17,7 +17,21 @@ from typing import Any, NoReturn
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import check, completion, fit, info, init, layout, report, reproduce, ros, topics, tune, validate
+from uncertain_lti.cli import (
+    check,
+    completion,
+    fit,
+    info,
+    init,
+    layout,
+    report,
+    reproduce,
+    ros,
+    signature,
+    topics,
+    tune,
+    validate,
+)
 from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain
 
 COMMANDS: tuple[Command, ...] = (
@@ -29,6 +43,7 @@ COMMANDS: tuple[Command, ...] = (
     report.COMMAND,
     layout.COMMAND,
     validate.COMMAND,
+    signature.COMMAND,
     info.COMMAND,
     reproduce.COMMAND,
     ros.PLAY,

@@ -23,6 +23,7 @@ from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
+from uncertain_lti.model.signature import Signature
 from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.signals.table_layout import TableLayout
@@ -60,7 +61,7 @@ def structure(model: Any) -> dict[str, Any]:
     newer = scheduled or model.domain.measure is not None or model.signals.table is not None or bool(model.horizons)
     newer = newer or not one_rule or model.residuals is not None
     newer |= s.step is not None or any(g.memory or g.valid is not None or g.ignore for g in model.signals)
-    newer = newer or model.repeats is not None
+    newer = newer or model.repeats is not None or bool(model.signatures)
     regimes: dict[str, Any] = {}
     if scheduled:
         regimes["schedule"] = model.schedule.to_list()
@@ -104,6 +105,7 @@ def structure(model: Any) -> dict[str, Any]:
         if one_rule
         else {"rules": [rule.to_dict() for rule in model.alarm]},
         **({} if model.repeats is None else {"frozen": model.repeats.to_dict()}),
+        **({"signatures": [signature.to_dict() for signature in model.signatures]} if model.signatures else {}),
         "fit": _plain({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
         "validation": _plain(model.validation),
     }
@@ -149,7 +151,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     scheduled = data["format"] != FORMATS[0] and "schedule" in data
     known = {"format", "states", "controls", "sampling", "domain", "alarm", "fit", "validation"}
     known |= {"schedule", "scheduling", "blocks"} if scheduled else set(ARRAYS)
-    known |= {"horizons", "residuals", "frozen"} if data["format"] != FORMATS[0] else set()
+    known |= {"horizons", "residuals", "frozen", "signatures"} if data["format"] != FORMATS[0] else set()
     for name in ("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)):
         if name not in data:
             raise ModelError(f"field '{name}' is missing; fit the model again")
@@ -218,6 +220,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         "domain": domain,
         "alarm": _alarm(data.get("alarm", {}), data["format"] != FORMATS[0]),
         "residuals": _residuals(data["residuals"]) if "residuals" in data else None,
+        "signatures": Signature.list_from(data.get("signatures", [])),
         "repeats": Repeats.from_dict(data["frozen"]) if data.get("frozen") is not None else None,
         "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in _object(data.get("fit", {}), "fit").items()},
         "validation": _object(data.get("validation", {}), "validation"),

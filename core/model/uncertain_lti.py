@@ -42,6 +42,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
+from uncertain_lti.model.signature import Signature, checked_signatures
 from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.signals.signal_map import Recalled, Signal, SignalMap
@@ -99,6 +100,8 @@ class UncertainLTI:
         Of the recordings of the fit; default unknown.
     repeats : Repeats, optional
         Exact repeats of healthy recordings; without them no state is called frozen.
+    signatures : sequence of Signature, optional
+        Patterns of known faults; default none.
     fit_summary : mapping, optional
         How the model was fitted; plain data that goes to the file as it is.
     validation : mapping, optional
@@ -130,6 +133,7 @@ class UncertainLTI:
         alarm: Sequence[Rule] | None = None,
         residuals: Residuals | None = None,
         repeats: Repeats | None = None,
+        signatures: Sequence[Signature] = (),
         fit_summary: Mapping[str, Any] | None = None,
         validation: Mapping[str, Any] | None = None,
     ) -> None:
@@ -188,6 +192,7 @@ class UncertainLTI:
         self.residuals = residuals
         self.alarm = self._alarm(alarm, alarm_rule)
         self.repeats = repeats
+        self.signatures = checked_signatures(signatures, n)
         if repeats is not None and len(repeats.longest_repeat_s) != n:
             raise ModelError(f"field 'frozen' has {len(repeats.longest_repeat_s)} numbers for {plural(n, 'state')}")
         self.fit_summary = dict(fit_summary or {})
@@ -912,11 +917,13 @@ class UncertainLTI:
             name: getattr(self, name)
             for name in (
                 *ARRAYS, "schedule", "block_data", "horizons", "signals", "sampling", "domain", "alarm", "residuals",
-                "repeats", "fit_summary", "validation",
+                "repeats", "signatures", "fit_summary", "validation",
             )
         }  # fmt: skip
         if self.repeats is not None and not {*ARRAYS, "schedule"}.isdisjoint(changes):
             arguments["repeats"] = Repeats(self.repeats.longest_repeat_s)  # how far another model moves is not known
+        if not {*ARRAYS, "schedule", "horizons"}.isdisjoint(changes):
+            arguments["signatures"] = ()  # they are of the utilisation by these bounds
         return UncertainLTI(**{**arguments, **changes})
 
     # --- other tools ---

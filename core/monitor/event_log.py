@@ -150,6 +150,8 @@ class EventLog:
         """
         self.turned(session, (), now)
         self._catch_up(now)
+        if session.monitor.alarm and self._named:
+            self._look_at_likeness(session, now)
         matter = self._matter("problems")
         new = [problem for problem in problems if problem not in (matter.logged or ())]
         if matter.becomes(tuple(problems) or None, now):
@@ -164,6 +166,12 @@ class EventLog:
             if topic != session.sampler.clock:
                 self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0))
         self._look_at_verdicts(session, now, timeout)
+
+    def _look_at_likeness(self, session: Session, now: float) -> None:
+        """Log what the alarm looks like, once there are verdicts enough, and when another fault is named."""
+        like = session.likeness()
+        if like is not None and like.words and self._matter("likeness").becomes((self._alarm_since, like.label), now):
+            self._log(OK, f"the alarm {like.words}")
 
     def _look_at_topic(self, session: Session, topic: str, now: float, timeout: float, publishers: int) -> None:
         heard = session.heard(topic)

@@ -16,6 +16,7 @@ from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Waiting
 from uncertain_lti.monitor.deployed import condition_words
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.monitor.frozen import frozen_words, repeat_words
+from uncertain_lti.monitor.likeness import Explainer, Likeness
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
 from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
@@ -356,6 +357,7 @@ class Session:
     def _follow(self, rule: Rule) -> None:
         monitor, condition, enable_type, reader = self._prepared(rule)
         self.monitor, self.rule = monitor, rule
+        self.explainer = Explainer(self.model)
         self.enable_type, self._reads_condition = enable_type, reader
         self.arming = Arming(condition, to_ns(rule.grace), self.arming.said_on(condition))
         self.enable_topic = condition.topic if condition else ""
@@ -631,6 +633,10 @@ class Session:
         if not verdict.judged:
             return
         self.last, self._judged = verdict, now
+        if verdict.alarm:
+            self.explainer.push(verdict.horizon_utilisation, verdict.lower, verdict.upper)
+        else:
+            self.explainer.quiet()
         self.verdicts += 1
         period.verdicts += 1
         period.outside += verdict.outside_domain
@@ -821,11 +827,23 @@ class Session:
             level = ERROR
             if self.monitor.alarm or not self.latched:
                 complaints.insert(0, f"alarm: {self.rule_text()}")
+            if (like := self.likeness()) is not None and like.words:
+                complaints.insert(1, like.words)
         else:
             level = WARN if complaints else OK
         well = f"{period.verdicts} verdicts" if period.verdicts else f"last verdict {without:.1f} s ago"
         message = "; ".join([*(complaints or [f"{well}, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
+
+    def likeness(self) -> Likeness | None:
+        """What the alarm that is on, or was on last, looks like.
+
+        Returns
+        -------
+        Likeness or None
+            None before any alarm.
+        """
+        return self.explainer.likeness()
 
     def frozen_text(self, moved: Moved) -> str:
         """What is said of a frozen state.

@@ -13,6 +13,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.monitor.frozen import repeat_words
+from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.reports.regimes import check_regimes, sample_blocks, unknown_in_words
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.status import Status
@@ -20,6 +21,8 @@ from uncertain_lti.sampling.transient import Transient
 
 UNVOUCHED = 0.2
 """Share of the verdicts outside the fitted domain from which on their quiet says nothing."""
+MOST_EXPLAINED = 100
+"""Patterns of alarms that are explained."""
 OUTCOMES = ("alarm", "unknown", "violations", "quiet")
 """What a check can come to, from what weighs most."""
 
@@ -32,7 +35,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     verdict). Of a scheduled model also `regimes`, what became of the verdicts in each, `unknown`, in words why a regime
     is unknown or a mode has no verdict, and of each sample its `regime`, a position in `regimes`. `frozen` and
     `repeats` have the exact repeats that raised the alarm, and others longer than any of the fit, each from its last
-    fresh sample.
+    fresh sample. `explained` says of alarms what they look like.
 
     Parameters
     ----------
@@ -91,6 +94,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "frozen": _repeats(model, verdicts, verdicts.frozen),
         "repeats": _repeats(model, verdicts, verdicts.repeating & ~_before(verdicts.frozen, verdicts.repeating)),
     }
+    data["explained"] = _explained(model, verdicts)
     share = data["outside_domain"] / judged if judged else 1.0
     unknown = share > UNVOUCHED
     data["outside_domain_share"] = share if judged else None
@@ -125,6 +129,35 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
             for k, status in enumerate(verdicts.statuses())
         ]
     return data
+
+
+def _explained(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
+    """What the alarms look like, those close to one another together; the first `MOST_EXPLAINED`."""
+    found: list[dict[str, Any]] = []
+    if not verdicts.alarm.any():
+        return found
+    table = verdicts.horizon_utilisation
+    for start, stop, explainer in over_recording(
+        model, verdicts.judged, verdicts.alarm, table, verdicts.lower, verdicts.upper
+    ):
+        like = explainer.likeness()
+        if like is None or like.verdicts < LEAST:
+            continue
+        found.append(
+            {
+                **_instant(verdicts.transient, start),
+                **_length(verdicts.transient.t_ns, (start, stop + 1)),
+                "label": like.label or None,
+                "matches": dict(like.matches),
+                "parts": [part._asdict() for part in like.parts],
+                "first": list(like.first),
+                "verdicts": like.verdicts,
+                "text": like.words,
+            }
+        )
+        if len(found) == MOST_EXPLAINED:
+            break
+    return found
 
 
 def _repeats(model: UncertainLTI, verdicts: Verdicts, which: NDArray[np.bool_]) -> list[dict[str, Any]]:

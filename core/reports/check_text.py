@@ -11,6 +11,8 @@ from uncertain_lti.reports.tables import number, table
 
 MOST_REPEATS = 5
 """Frozen repeats that the text lists."""
+MOST_LIKENESSES = 3
+"""Alarms whose likeness the text has."""
 
 
 def check_text(data: dict[str, Any]) -> str:
@@ -58,7 +60,7 @@ def check_text(data: dict[str, Any]) -> str:
             share = data["unknown_regime"] / data["verdicts"]
             lines.append(f"unknown regime: {share:.2%} of the verdicts, which nothing vouches for")
     lines += [f"  {text}" for text in data["unknown"]]
-    lines += repeats_text(data)
+    lines += [*repeats_text(data), *likeness_text(data)]
     if data["alarm"]:
         first = data["alarms"][0]
         lines.append(
@@ -93,6 +95,24 @@ def repeats_text(data: Mapping[str, Any]) -> list[str]:
             longest[repeat["state"]] = repeat
     lines += [f"warning: {r['text']}, as of a machine at rest: the model does not move it" for r in longest.values()]
     return lines
+
+
+def likeness_text(data: Mapping[str, Any]) -> list[str]:
+    """What `check_data` says of alarms: what they look like, and where they point to.
+
+    Parameters
+    ----------
+    data : mapping
+        Of `check_data`.
+
+    Returns
+    -------
+    list of str
+        Lines without a full stop; none if nothing can be said.
+    """
+    told = [like for like in data["explained"] if like["text"]]
+    lines = [f"the alarm from {like['t']:.4f} s {like['text']}" for like in told[:MOST_LIKENESSES]]
+    return lines + [f"  and {plural(len(told) - len(lines), 'more alarm')}; --json has all"] * (len(told) > len(lines))
 
 
 def _regime(regime: dict[str, Any]) -> list[str]:

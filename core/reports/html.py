@@ -25,7 +25,7 @@ from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.recordings.recording import Progress
 from uncertain_lti.reports import alt_texts, schedule_figures
 from uncertain_lti.reports import figures as plots
-from uncertain_lti.reports.check_text import repeats_text
+from uncertain_lti.reports.check_text import likeness_text, repeats_text
 from uncertain_lti.reports.detectable_text import SHOWN, condition_text, detectable_tables, detectable_words
 from uncertain_lti.reports.drawing import between_rows
 from uncertain_lti.reports.findings import APART
@@ -262,7 +262,7 @@ def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]
         f"{facts['violated']} of them violated.{_text(silent)} "
         f"Outside the fitted ranges: {facts['outside_domain']}.</p>"
     )
-    parts += [f"<p>{_text(text)}.</p>" for text in (*facts["unknown"], *repeats_text(facts))]
+    parts += [f"<p>{_text(text)}.</p>" for text in (*facts["unknown"], *repeats_text(facts), *likeness_text(facts))]
     parts += [f'<p class="soft">{_text(note)}</p>' for note in facts["notes"][:5]]
     worst = sorted(model.state_names, key=lambda name: -states[name]["violations"])[:_MOST_STATES]
     shown = [name for name in model.state_names if name in worst]

@@ -1,0 +1,108 @@
+"""Command `uncertain-lti signature`: learn what known faults look like from labelled recordings."""
+
+from __future__ import annotations
+
+import argparse
+
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.cli.command import (
+    DONE,
+    SILENT,
+    Command,
+    add_force,
+    load_model,
+    model_target,
+    print_json,
+    print_notes,
+    print_summary,
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti signature`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
+    parser.add_argument("model", metavar="MODEL", help="model file")
+    parser.add_argument(
+        "labelled",
+        metavar="LABEL=BAG",
+        nargs="+",
+        help="a fault, and a recording of it in which the alarm is raised; several recordings may have one label",
+    )
+    parser.add_argument("--output", required=True, metavar="MODEL", help="model file to write (*.model.json)")
+    parser.add_argument("--violations", type=int, help="alarm: number of violations (default: the model's)")
+    parser.add_argument(
+        "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"
+    )
+    parser.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_force(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Learn the signatures and write the model with them.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 0.
+
+    Raises
+    ------
+    ModelError
+        An argument is not LABEL=BAG, or a recording raises no alarm.
+    UncertainLTIError
+        The model or a recording cannot be read.
+    """
+    from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.recordings.formats import group_recordings
+    from uncertain_lti.reports.signature_text import signature_text
+    from uncertain_lti.sampling.reading import read_as_fitted
+    from uncertain_lti.validation.signatures import learn_signatures
+
+    output = model_target(options.output, options.force)
+    pairs = [text.partition("=") for text in options.labelled]
+    for text, (label, _, bag) in zip(options.labelled, pairs, strict=True):
+        if not (label.strip() and bag):
+            raise ModelError(f"{text!r} is not LABEL=BAG; write for example stuck_valve=run7.mcap")
+    model = load_model(options.model)
+    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
+    checked = []
+    for label, _, name in pairs:
+        for bag in group_recordings([name], layout=model.signals.table):
+            transient = read_as_fitted(bag, model.signals, options.progress.iterate("reading"))
+            print_notes(options, transient.notes)
+            checked.append((label, monitor.check(transient)))
+    learnt = learn_signatures(model, checked, options.force)
+    model.replace(signatures=learnt.signatures).save(output)
+    if options.json:
+        print_json(
+            {
+                "model": str(output),
+                "signatures": [
+                    {"label": s.label, "recordings": s.recordings, "verdicts": s.verdicts, "steps": list(s.steps)}
+                    for s in learnt.signatures
+                ],
+                "named": [{"recording": r, "label": label, "named": found} for r, label, found in learnt.named],
+                "alike": [{"labels": [a, b], "match": match} for a, b, match in learnt.alike],
+            }
+        )
+    else:
+        print_summary(options, signature_text(learnt))
+        print_summary(options, f"model written to {output}")
+    return DONE
+
+
+COMMAND = Command(
+    "signature", "learn what known faults look like from labelled recordings", add_arguments, run, quiet=SILENT
+)
+"""The command."""

@@ -1,0 +1,319 @@
+"""Likeness: which fault an alarm looks like, by the pattern of the utilisation over states and horizons.
+
+While the alarm is on, the products u uᵀ of the utilisations of all states are averaged, horizon by horizon: a pattern
+that keeps its direction while the manoeuvre changes its sign and size. It is compared with the signatures of
+labelled recordings, and, for one step, with what a single part of the machine would leave: a column of B times
+anything (an actuator that does not follow), a column of A (a bias of a sensor, which the other equations take for the
+state), or one row (a jump of one sensor, or changed dynamics of one state).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.model.signature import Signature, closeness
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+
+MATCH, AHEAD = 0.8, 0.05
+"""A signature is named from this match on, if it is so far ahead of every other."""
+EXPLAINS, CLOSE = 0.85, 0.05
+"""A part is named if it alone explains this share of the pattern, with those that explain nearly as much."""
+LEAST, MOST, APART = 5, 2000, 100
+"""Verdicts with an alarm that a name needs; of which a pattern is made; without one, after which it starts over."""
+_LIMIT = 10.0  # of a utilisation: one sample must not be all of a pattern
+
+
+class Part(NamedTuple):
+    """A part of the machine that would leave such a pattern.
+
+    Parameters
+    ----------
+    kind : str
+        `actuator`, `sensor` or `equation`.
+    name : str
+        Of the control or state.
+    share : float
+        Share of the pattern that it explains, 0 to 1.
+    """
+
+    kind: str
+    name: str
+    share: float
+
+
+class Likeness(NamedTuple):
+    """What a pattern looks like.
+
+    Parameters
+    ----------
+    label : str
+        Of the signature; empty if unknown.
+    matches : tuple of (str, float)
+        Every signature with its match, the best first.
+    parts : tuple of Part
+        Parts that explain it alone, the best first; empty for none.
+    first : tuple of str
+        States outside their bounds when the alarm began.
+    verdicts : int
+        Verdicts of the pattern.
+    """
+
+    label: str
+    matches: tuple[tuple[str, float], ...]
+    parts: tuple[Part, ...]
+    first: tuple[str, ...]
+    verdicts: int
+
+    @property
+    def words(self) -> str:
+        """In words, without a full stop; empty where there are too few verdicts, or nothing to say.
+
+        Parts are named if those that explain nearly as much are of one signal.
+        """
+        if self.verdicts < LEAST:
+            return ""
+        found = []
+        if self.matches:
+            near = ", ".join(f"{label} {match:.2f}" for label, match in self.matches[bool(self.label) :][:2])
+            if self.label:
+                return f"looks like {self.label} (match {self.matches[0][1]:.2f}{f', next {near}' * bool(near)})"
+            found.append(f"looks like no known fault (nearest {near})")
+        if len({part.name for part in self.parts}) == 1:
+            found.append("points to " + " or ".join(f"{p.kind} {p.name} ({p.share:.0%})" for p in self.parts))
+        return "; ".join(found)
+
+
+class Pattern:
+    """Mean of u uᵀ of each horizon over verdicts.
+
+    Parameters
+    ----------
+    steps : sequence of int (H,)
+        Horizons.
+    n : int
+        Number of states.
+    """
+
+    def __init__(self, steps: Sequence[int], n: int) -> None:
+        self.steps = tuple(steps)
+        self.verdicts = 0
+        self._sum, self._half = np.zeros((len(self.steps), n, n)), np.zeros(n)
+
+    def add(self, table: Array, half: Array) -> None:
+        """Take one verdict.
+
+        Parameters
+        ----------
+        table : array (H, n)
+            Utilisation; a row with NaN is left out.
+        half : array (n,)
+            Half-widths of one step, normalised; a common factor does not matter.
+        """
+        self.verdicts += 1
+        self._half += half
+        for total, row in zip(self._sum, np.clip(table, -_LIMIT, _LIMIT), strict=True):
+            if not np.isnan(row).any():
+                total += row[:, None] * row
+
+    def signature(self, label: str) -> Signature:
+        """The pattern as a signature of one recording.
+
+        Parameters
+        ----------
+        label : str
+            What it is called.
+
+        Returns
+        -------
+        Signature
+            Scaled.
+        """
+        return Signature(label, self.steps, scaled(self._sum), 1, self.verdicts)
+
+    def parts(self, model: UncertainLTI) -> tuple[Part, ...]:
+        """What single part of the machine explains the one-step pattern.
+
+        Parameters
+        ----------
+        model : UncertainLTI
+            Gives A and B; of a scheduled model, those of its block with most data.
+
+        Returns
+        -------
+        tuple of Part
+            The best first, with those that explain nearly as much; empty if none explains enough.
+        """
+        moment, half = self._sum[0], self._half / max(self.verdicts, 1)
+        whole = float(np.trace(moment))
+        if not (whole > 0.0 and (half > 0.0).all() and np.isfinite(half).all()):
+            return ()
+        block = max(range(len(model.blocks)), key=lambda r: model.block_data[r].transitions or 0)
+        A, B = model.blocks[block].A, model.blocks[block].B
+
+        def share(direction: Array) -> float:
+            d = direction / half
+            size = float(d @ d)
+            return float(d @ moment @ d) / (size * whole) if size > 0.0 else 0.0
+
+        found = [Part("actuator", name, share(B[:, j])) for j, name in enumerate(model.control_names)]
+        for i, name in enumerate(model.state_names):
+            found.append(Part("sensor", name, share(A[:, i])))
+            found.append(Part("equation", name, share(np.eye(model.n)[i])))
+        best = max(part.share for part in found)
+        return tuple(sorted((p for p in found if p.share >= max(EXPLAINS, best - CLOSE)), key=lambda p: -p.share))
+
+
+def scaled(moments: Array) -> Array:
+    """Matrices of Frobenius norm 1.
+
+    Parameters
+    ----------
+    moments : array (H, n, n)
+        Any size.
+
+    Returns
+    -------
+    array (H, n, n)
+        0 where it was 0.
+    """
+    size = np.sqrt(np.sum(moments**2, axis=(1, 2), keepdims=True))
+    return np.asarray(np.divide(moments, size, out=np.zeros_like(moments), where=size > 0))
+
+
+def likeness(model: UncertainLTI, pattern: Pattern, first: Sequence[str] = ()) -> Likeness:
+    """What a pattern looks like.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Has the signatures.
+    pattern : Pattern
+        Of an alarm.
+    first : sequence of str
+        States outside their bounds when it began.
+
+    Returns
+    -------
+    Likeness
+        Unknown stays unknown: no label below `MATCH`, or with another signature that matches nearly as well.
+    """
+    own = pattern.signature("-")
+    every = sorted(((closeness(own, s), s.label) for s in model.signatures), reverse=True)
+    label = ""
+    if every and every[0][0] >= MATCH and (len(every) == 1 or every[0][0] - every[1][0] >= AHEAD):
+        label = every[0][1] if pattern.verdicts >= LEAST else ""
+    matches = tuple((name, match) for match, name in every)
+    return Likeness(label, matches, pattern.parts(model), tuple(first), pattern.verdicts)
+
+
+class Explainer:
+    """The pattern of the alarm that is on, or was on last, one verdict after another.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        What judges.
+
+    Attributes
+    ----------
+    pattern : Pattern or None
+        None before any alarm.
+    """
+
+    def __init__(self, model: UncertainLTI) -> None:
+        self._model = model
+        self._steps = (1, *(horizon.steps for horizon in model.horizons))
+        self._per_width = 0.5 / model.operating_point.X
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every alarm."""
+        self.pattern: Pattern | None = None
+        self._first: tuple[str, ...] = ()
+        self._quiet = 0
+
+    def quiet(self) -> None:
+        """Take a verdict without an alarm."""
+        self._quiet += 1
+
+    def push(self, table: Array, lower: Array, upper: Array) -> bool:
+        """Take a verdict with an alarm.
+
+        Parameters
+        ----------
+        table : array (H, n)
+            Utilisation for one step and for each horizon.
+        lower, upper : array (n,)
+            Bounds of one step, recorded units.
+
+        Returns
+        -------
+        bool
+            Another pattern begins with it.
+        """
+        begins = self.pattern is None or self._quiet > APART
+        if begins:
+            self.pattern = Pattern(self._steps, self._model.n)
+            outside = np.any(np.abs(table) > 1.0, axis=0).tolist()
+            self._first = tuple(n for n, out in zip(self._model.state_names, outside, strict=True) if out)
+        self._quiet = 0
+        assert self.pattern is not None
+        if self.pattern.verdicts < MOST:
+            with np.errstate(over="ignore", invalid="ignore"):
+                self.pattern.add(table, (upper - lower) * self._per_width)
+        return begins
+
+    def likeness(self) -> Likeness | None:
+        """What the alarm looks like.
+
+        Returns
+        -------
+        Likeness or None
+            None before any alarm.
+        """
+        return None if self.pattern is None else likeness(self._model, self.pattern, self._first)
+
+
+def over_recording(
+    model: UncertainLTI,
+    judged: NDArray[np.bool_],
+    alarm: NDArray[np.bool_],
+    table: Array,
+    lower: Array,
+    upper: Array,
+) -> Iterable[tuple[int, int, Explainer]]:
+    """`Explainer` over the verdicts of a recording.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        What judged.
+    judged, alarm : array (N+1,) of bool
+        As in `Verdicts`.
+    table : array (N+1, H, n)
+        Utilisation.
+    lower, upper : array (N+1, n)
+        Bounds of one step, recorded units.
+
+    Yields
+    ------
+    int, int
+        First and last sample of each pattern.
+    Explainer
+        After the last.
+    """
+    explainer, begin, last, before = Explainer(model), -1, -1, 0
+    count = np.cumsum(judged)
+    for k in np.flatnonzero(judged & alarm).tolist():
+        if begin >= 0 and count[k] - before - 1 > APART:
+            yield begin, last, explainer
+            explainer, begin = Explainer(model), -1
+        explainer.push(table[k], lower[k], upper[k])
+        begin, last, before = (k if begin < 0 else begin), k, int(count[k])
+    if begin >= 0:
+        yield begin, last, explainer

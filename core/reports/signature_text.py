@@ -1,0 +1,35 @@
+"""What `signature` prints."""
+
+from __future__ import annotations
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.reports.tables import table
+from uncertain_lti.validation.signatures import Learnt
+
+
+def signature_text(learnt: Learnt) -> str:
+    """Summary for a person.
+
+    Parameters
+    ----------
+    learnt : Learnt
+        Of `learn_signatures`.
+
+    Returns
+    -------
+    str
+        A table, and what cannot be told apart.
+    """
+    rows = [[s.label, str(s.recordings), str(s.verdicts), ", ".join(map(str, s.steps))] for s in learnt.signatures]
+    lines = [table(("signature", "recordings", "verdicts", "steps"), rows)]
+    labels = [label for _, label, _ in learnt.named]
+    tried = [(label, found) for _, label, found in learnt.named if labels.count(label) > 1]
+    if tried:
+        right = sum(label == found for label, found in tried)
+        unknown = sum(not found for _, found in tried)
+        lines.append(
+            f"left out in turn, {right} of {plural(len(tried), 'recording')} named as labelled, "
+            f"{len(tried) - right - unknown} as another fault, {unknown} unknown"
+        )
+    lines += [f"'{a}' and '{b}' look alike (match {match:.2f}), so neither is named" for a, b, match in learnt.alike]
+    return "\n".join(lines)

@@ -1,0 +1,223 @@
+"""Which fault: patterns of labelled recordings are named again, unknown ones are not, and parts are pointed to."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_event_log import Rig
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.signature import Signature, closeness
+from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer
+from uncertain_lti.monitor.session import OK
+from uncertain_lti.reports.check_data import check_data
+from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.reports.signature_text import signature_text
+from uncertain_lti.validation.signatures import learn_signatures
+
+DT, ONSET = 0.02, 500
+A = np.array([[-2.0, 1.0, 0.0], [0.0, -3.0, 2.0], [1.5, 0.0, -4.0]])
+B = np.array([[1.0, 0.2], [0.0, 2.0], [0.5, -1.5]])
+FAULTS = ("p stuck", "q stuck", "b bias", "c law")
+
+
+def run(seed: int, fault: str = "", size: float = 1.0) -> Transient:
+    """A linear machine under steps of two controls, with noise; a fault begins at ONSET."""
+    rng = np.random.default_rng(seed)
+    count = 1000
+    u = np.repeat(rng.uniform(-1, 1, (count // 20 + 1, 2)), 20, axis=0)[:count]
+    x = np.zeros((count, 3))
+    for k in range(count - 1):
+        acting, a = u[k].copy(), A
+        if k >= ONSET and fault.endswith("stuck"):
+            j = "pq".index(fault[0])
+            acting[j] += size * (u[ONSET, j] - u[k, j])
+        if k >= ONSET and fault == "c law":
+            a = A.copy()
+            a[2] *= 1 - 0.5 * size
+        x[k + 1] = x[k] + DT * (a @ x[k] + B @ acting)
+    x = x + rng.uniform(-1e-3, 1e-3, x.shape)
+    if fault == "b bias":
+        x[ONSET:, 1] += 0.1 * size
+    return Transient(
+        DT * np.arange(count), x, u, state_names=("a", "b", "c"), control_names=("p", "q"), name=f"{fault} {seed}"
+    )
+
+
+@pytest.fixture(scope="module")
+def model() -> UncertainLTI:
+    return fit([run(seed) for seed in range(6)], additive="noise")
+
+
+@pytest.fixture(scope="module")
+def taught(model: UncertainLTI) -> UncertainLTI:
+    monitor = EnvelopeMonitor(model)
+    labelled = [(fault, monitor.check(run(100 + seed, fault))) for fault in FAULTS for seed in range(2)]
+    learnt = learn_signatures(model, labelled)
+    assert not learnt.alike and all(label == found for _, label, found in learnt.named)
+    assert "left out in turn, 8 of 8 recordings named as labelled" in signature_text(learnt)
+    return model.replace(signatures=learnt.signatures)
+
+
+def explained(model: UncertainLTI, transient: Transient) -> list[dict[str, Any]]:
+    return list(check_data(model, EnvelopeMonitor(model).check(transient))["explained"])
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("size", [0.5, 1.0, 2.0])
+def test_a_known_fault_is_named(taught: UncertainLTI, fault: str, size: float) -> None:
+    for seed in (200, 201, 202):
+        found = max(explained(taught, run(seed, fault, size)), key=lambda like: like["verdicts"])
+        assert found["label"] == fault and found["matches"][fault] >= MATCH and "points" not in found["text"]
+
+
+def test_an_unknown_fault_stays_unknown(taught: UncertainLTI) -> None:
+    for fault in FAULTS:
+        others = taught.replace(signatures=[s for s in taught.signatures if s.label != fault])
+        found = max(explained(others, run(200, fault)), key=lambda like: like["verdicts"])
+        assert found["label"] is None and "looks like no known fault" in found["text"]
+
+
+def test_no_alarm_has_no_name(taught: UncertainLTI) -> None:
+    for seed in range(300, 304):
+        data = check_data(taught, EnvelopeMonitor(taught, 2, 5).check(run(seed)))
+        assert not data["alarm"] and not data["explained"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "name"), [("p stuck", "actuator", "p"), ("q stuck", "actuator", "q"), ("b bias", "sensor", "b")]
+)
+def test_the_part_is_pointed_to_without_any_signature(model: UncertainLTI, fault: str, kind: str, name: str) -> None:
+    for seed in (200, 201):
+        found = max(explained(model, run(seed, fault)), key=lambda like: like["verdicts"])
+        assert (kind, name) in {(part["kind"], part["name"]) for part in found["parts"]}
+        assert found["label"] is None and not found["matches"]
+        text = check_text(check_data(model, EnvelopeMonitor(model).check(run(seed, fault))))
+        assert "points to" in text and f"{kind} {name}" in text
+
+
+def test_a_changed_law_points_to_its_row(model: UncertainLTI) -> None:
+    found = max(explained(model, run(200, "c law")), key=lambda like: like["verdicts"])
+    assert ("equation", "c") in {(part["kind"], part["name"]) for part in found["parts"]} and "c" in found["first"]
+
+
+def test_live_says_what_check_says(taught: UncertainLTI) -> None:
+    from test_frozen import steps_of
+
+    transient = run(200, "p stuck")
+    monitor, explainer = EnvelopeMonitor(taught), Explainer(taught)
+    for step in steps_of(transient):
+        verdict = monitor.judge(step)
+        if verdict.judged:
+            if verdict.alarm:
+                explainer.push(verdict.horizon_utilisation, verdict.lower, verdict.upper)
+            else:
+                explainer.quiet()
+    live, offline = explainer.likeness(), explained(taught, transient)[-1]
+    assert live is not None
+    assert (live.words, dict(live.matches)) == (offline["text"], offline["matches"])
+
+
+def test_too_few_verdicts_name_nothing(taught: UncertainLTI) -> None:
+    explainer = Explainer(taught)
+    assert explainer.likeness() is None
+    for _ in range(LEAST - 1):
+        explainer.push(np.array([[3.0, 0.0, np.inf]]), -np.ones(3), np.ones(3))
+    like = explainer.likeness()
+    assert like is not None and not like.label and not like.words
+
+
+def test_the_session_says_so(taught: UncertainLTI) -> None:
+    rig = Rig()
+    assert rig.model.n == 2
+    ones = np.zeros((1, 2, 2))
+    ones[0, 1, 1] = 1.0
+    rig.session.model = rig.model = rig.model.replace(signatures=[Signature("b broken", [1], ones)])
+    rig.session.explainer = Explainer(rig.model)
+    rig.send(20)
+    rig.lines.clear()
+    for _ in range(30):
+        rig.send(1)
+        rig.x[1] += 3.0 * rig.model.centre_and_half(rig.x, rig.u, DT)[1][1]
+    said = [line for line in rig.lines if "looks like" in line]
+    assert len(said) == 1 and "the alarm looks like b broken (match " in said[0]
+    monitor, *_ = rig.session.report(rig.now, 10.0)
+    assert monitor.level != OK and "looks like b broken" in monitor.message
+
+
+def test_the_file_holds_signatures(taught: UncertainLTI, tmp_path: Path) -> None:
+    taught.save(tmp_path / "m.model.json")
+    again = UncertainLTI.load(tmp_path / "m.model.json")
+    assert again.to_dict() == taught.to_dict() and len(again.signatures) == 4
+    assert taught.replace(v=2 * taught.v).signatures == (), "they are of the utilisation by other bounds"
+    data = json.loads((tmp_path / "m.model.json").read_text())
+    assert data["format"] == "uncertain-lti/2"
+    for change, named in (
+        ({"label": ""}, "label"),
+        ({"steps": [2, 1]}, "steps"),
+        ({"steps": [True]}, "whole numbers"),
+        ({"moments": [[[1.0]]]}, "states"),
+        ({"recordings": 0}, "whole numbers"),
+        ({"more": 1}, "must have"),
+    ):
+        with pytest.raises(ModelError, match=named):
+            UncertainLTI.from_dict({**data, "signatures": [{**data["signatures"][0], **change}]})
+    with pytest.raises(ModelError, match="different labels"):
+        UncertainLTI.from_dict({**data, "signatures": [data["signatures"][0]] * 2})
+
+
+def test_signatures_without_a_common_horizon_are_not_alike() -> None:
+    ones = np.ones((1, 2, 2)) / 2
+    assert closeness(Signature("a", [1], ones), Signature("b", [5], ones)) == 0.0
+    assert closeness(Signature("a", [1], ones), Signature("b", [1], 3 * ones)) == pytest.approx(1.0)
+
+
+def test_a_recording_without_an_alarm_has_no_signature(model: UncertainLTI) -> None:
+    with pytest.raises(ModelError, match="no alarm was raised"):
+        learn_signatures(model, [("x", EnvelopeMonitor(model, 5, 5).check(run(1)))])
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from uncertain_lti.cli.main import main
+
+    bags = Path(__file__).resolve().parents[1] / "bags"
+    model, taught = str(tmp_path / "m.model.json"), str(tmp_path / "s.model.json")
+    noise = [str(p) for p in sorted(bags.glob("turbofan_*_noise.mcap"))]
+    signals = str(bags.parent / "config" / "signals" / "turbofan.yaml")
+    assert (
+        main(
+            [
+                "fit",
+                *noise,
+                "--signals",
+                signals,
+                "--output",
+                model,
+                "--no-suggest",
+                "--criterion",
+                "lp",
+                "--additive",
+                "noise",
+            ]
+        )
+        == 0
+    )
+    rule = ["--violations", "2", "--window", "5"]
+    labelled = [f"{kind}={bags / f'turbofan_{kind}.mcap'}" for kind in ("fan_damage", "fuel_stuck", "nozzle_stuck")]
+    assert main(["signature", model, *labelled, "--output", taught, *rule]) == 0
+    assert "fan_damage" in capsys.readouterr().out
+    for text in labelled:
+        label, _, bag = text.partition("=")
+        assert main(["check", taught, bag, *rule]) == 1
+        assert f"looks like {label} (match " in capsys.readouterr().out
+    assert main(["signature", taught, labelled[0], "--output", str(tmp_path / "t.model.json"), *rule]) == 2
+    assert "another label" in capsys.readouterr().err
+    assert main(["signature", model, "fan_damage", "--output", str(tmp_path / "t.model.json")]) == 2
+    assert "LABEL=BAG" in capsys.readouterr().err
+    assert main(["signature", model, f"x={noise[0]}", "--output", str(tmp_path / "t.model.json")]) == 2
+    assert "no alarm was raised" in capsys.readouterr().err
