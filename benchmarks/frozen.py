@@ -1,0 +1,153 @@
+"""Frozen inputs: how soon a held state of real recordings is reported, and what healthy recordings raise.
+
+    ./run python benchmarks/frozen.py                    # the table of docs/real_machines.md (Markdown)
+    ./run python benchmarks/frozen.py --data FOLDER
+
+Each machine is fitted to some recordings, or every other second of one, and 200 instants of the others, drawn at
+random, hold one state from there on. Instants count at which the machine moves: within one second the true value
+leaves the held one by more than the half-width of its bounds. The recordings are public and not part of this
+repository. Without them the exit status is 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from measure import table
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti.sampling.reading import read_as_fitted
+from uncertain_lti.validation.blocks import cut
+
+ROOT = Path(__file__).resolve().parents[1]
+INSTANTS, WITHIN, SECONDS = 200, 1.0, 2.0
+FILES: tuple[tuple[str, str, Sequence[str], Sequence[str]], ...] = (
+    ("Neato, 5 Hz", "neato", ["neato/person_follower.mcap"], ["neato/draw_square.mcap"]),
+    ("Neato, 5 Hz, the other way round", "neato", ["neato/draw_square.mcap"], ["neato/person_follower.mcap"]),
+    (
+        "Hunter SE (simulated), 27 Hz", "hunter_se", ["hunter_se/straight_odd_t_0_5_run_01.mcap"],
+        ["hunter_se/straight_odd_t_0_5_run_02.mcap", "hunter_se/straight_even_t_0_2_run_01.mcap"],
+    ),
+    (
+        "Crazyflie, Vicon, 100 Hz", "crazyflie_vicon", ["crazyflie/rollbag_0.mcap"],
+        ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"],
+    ),
+    (
+        "Crazyflie, estimate, 10 Hz", "crazyflie_estimate", ["crazyflie/rollbag_0.mcap"],
+        ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"],
+    ),
+    (
+        "micro gas turbine, 1 Hz", "micro_gas_turbine", ["micro_gas_turbine/ex_1.mcap", "micro_gas_turbine/ex_20.mcap"],
+        ["micro_gas_turbine/ex_24.mcap"],
+    ),
+)  # fmt: skip
+
+
+def of_files(
+    data: Path, signals: str, fitted: Sequence[str], checked: Sequence[str]
+) -> tuple[list[Transient], list[Transient]]:
+    """Recordings that are fitted, and others."""
+    first = read_transients([data / name for name in fitted], ROOT / "config" / "signals" / f"{signals}.yaml")
+    assert first[0].signals is not None
+    return first, [read_as_fitted(data / name, first[0].signals) for name in checked]
+
+
+def of_joint(data: Path, joint: int) -> tuple[list[Transient], list[Transient], list[Transient]]:
+    """One joint of the quadruped: every other second is fitted; any instant of the run is held."""
+    text = (ROOT / "config" / "signals" / "go2_joint.yaml").read_text().replace("[j0]", f"[j{joint}]")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "signals.yaml"
+        path.write_text(text)
+        (whole,) = read_transients(data / "go2" / "test_3.mcap", path)
+    seconds = [cut(whole, start, start + 500) for start in range(0, 6500, 500)]
+    return seconds[::2], seconds[1::2], [cut(whole, 0, 6500)]
+
+
+def held(transient: Transient, state: int, begin: int) -> Transient:
+    """Two seconds in which the state keeps the value of this sample, and some samples before."""
+    last = max(int(np.searchsorted(transient.t_ns, transient.t_ns[begin] + round(SECONDS * 1e9))), begin + 12)
+    part = slice(max(0, begin - 5), min(last, len(transient)))
+    x = transient.x[part].copy()
+    x[begin - part.start + 1 :, state] = x[begin - part.start, state]
+    return Transient(transient.t_ns[part], x, transient.u[part], signals=transient.signals, max_gap=transient.max_gap)
+
+
+def moves(model: UncertainLTI, transient: Transient, state: int, begin: int) -> bool:
+    """Whether the true value leaves the held one within a second by more than the half-width."""
+    end = int(np.searchsorted(transient.t_ns, transient.t_ns[begin] + round(WITHIN * 1e9), side="right"))
+    point = model.operating_point
+    x, u = point.normalise_x(transient.x[begin:end]), point.normalise_u(transient.u[begin:end])
+    if len(x) < 2 or not np.isfinite(x[0, state]):
+        return False
+    _, half = model.centre_and_half(x, u, model.sampling.dt_median or 0.0)
+    return bool(np.nanmax(np.abs(x[:, state] - x[0, state])) > np.nanmedian(half[:, state]))
+
+
+def measure(
+    name: str, fitted: Sequence[Transient], others: Sequence[Transient], sources: Sequence[Transient] = ()
+) -> list[list[str]]:
+    """One row per state; what is held is taken from the sources, where given, else from the others."""
+    sources = sources or others
+    model = fit(fitted)
+    monitor = EnvelopeMonitor(model)
+    healthy = [monitor.check(t) for t in others]
+    hours = sum(float(np.diff(t.t_ns).sum()) for t in others) * 1e-9 / 3600
+    rows = []
+    assert model.repeats is not None
+    for state, signal in enumerate(model.signals.states):
+        rng = np.random.default_rng(state)
+        delays: list[float] = []
+        for _ in range(50 * INSTANTS):
+            transient = sources[rng.integers(len(sources))]
+            usable = np.flatnonzero(transient.usable)
+            begin = int(rng.choice(usable)) if len(usable) else 0
+            if not len(usable) or not moves(model, transient, state, begin):
+                continue
+            part = held(transient, state, begin)
+            start = min(begin, 5)
+            told = np.flatnonzero(monitor.check(part).frozen[:, state])
+            delays.append(float(part.t[told[0]] - part.t[start]) if len(told) else math.inf)
+            if len(delays) == INSTANTS:
+                break
+        false = sum(int((np.diff(np.concatenate([[0], v.frozen[:, state].astype(int)])) == 1).sum()) for v in healthy)
+        at = np.sort(delays) if delays else np.array([math.nan])
+        rows.append(
+            [
+                f"{name}: {signal.name}",
+                f"{model.repeats.longest_repeat_s[state]:.3g}",
+                str(len(delays)),
+                f"{np.mean(at <= WITHIN):.0%}" if delays else "-",
+                f"{at[len(at) // 2]:.2g}" if delays else "-",
+                f"{at[min(len(at) - 1, math.ceil(0.9 * len(at)) - 1)]:.2g}" if delays else "-",
+                f"{false} in {hours:.2g} h",
+            ]
+        )
+    return rows
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
+    data = parser.parse_args().data
+    if not data.is_dir():
+        print(f"{data}: the recordings are not there; name their folder with --data", file=sys.stderr)
+        return 2
+    rows = []
+    for joint in range(12):
+        rows += measure(f"Go2, 500 Hz, joint {joint}", *of_joint(data, joint))
+    for title, signals, fitted, checked in FILES:
+        rows += measure(title, *of_files(data, signals, fitted, checked))
+    header = ("machine: state", "longest repeat, s", "held", "within 1 s", "median, s", "90 %, s", "false, healthy")
+    table("Held states", header, rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
