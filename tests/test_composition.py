@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -19,7 +21,11 @@ from ros_processes import Diagnostics, World, open_world, until
 from sensor_msgs.msg import JointState
 from test_live import CONTROL, EPOCH_NS, STATE, by_hand, joint_state, saved, stamp_of, vector
 
-from uncertain_lti_ros.envelope_monitor import EnvelopeMonitorNode
+from uncertain_lti_ros.arguments import BAD_USAGE
+from uncertain_lti_ros.envelope_monitor import NAME, EnvelopeMonitorNode
+from uncertain_lti_ros.parameters import DEFAULTS
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
@@ -140,3 +146,16 @@ def test_whole_numbers_are_taken_for_real_ones(world: World, tmp_path: Path) -> 
     assert not accepted and "margin" in reason
     accepted, reason = world.set(violations=2.0)
     assert not accepted, "a whole number stays one"
+
+
+def test_the_files_for_operation_name_what_there_is() -> None:
+    """The unit gives parameters that the node has; the analyzers match the names of its statuses."""
+    unit = (ROOT / "config/envelope_monitor.service").read_text()
+    given = re.findall(r"-p (\w+):=", unit)
+    assert given and set(given) <= set(DEFAULTS) and f"uncertain_lti_ros {NAME} " in unit
+    assert f"RestartPreventExitStatus={BAD_USAGE}" in unit
+    file = yaml.safe_load((ROOT / "config/diagnostic_aggregator.yaml").read_text())
+    analyzers = file["/**"]["ros__parameters"]["analyzers"]["envelope"]["analyzers"]
+    assert analyzers["monitor"]["expected"] == [f"{NAME}: monitor"]
+    assert analyzers["states"]["startswith"] == [f"{NAME}: "]
+    assert analyzers["monitor"]["timeout"] > DEFAULTS["diagnostics_period"]
