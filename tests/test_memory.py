@@ -13,6 +13,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, f
 from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.proposal.memories import Remembered, memory_candidates, remember, suggest_memories
+from uncertain_lti.reports.model_text import dynamics_text
 from uncertain_lti.sampling.recall import recall, recalled, with_memories
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status
@@ -235,3 +236,11 @@ def test_the_noise_of_a_rate_decides_no_steady_state(tmp_path: Path) -> None:
     (x,), controls = more.signals.states, more.signals.controls
     assert x == plain.signals.states[0] and x.steady == pytest.approx(5.0, abs=0.01)
     assert [(s.steady, s.scale) for s in controls] == [(0.0, x.scale), (x.steady, x.scale)]
+
+
+def test_what_remembers_is_named_beside_the_eigenvalues() -> None:
+    signals = SignalMap((Signal("y", "", "y"),), (Signal("y_before", "", "lag(y, 1)"),))
+    model = remembering({"A": [[6.0]], "B": [[-8.0]]}, signals)
+    assert dynamics_text(model)[-1] == "A alone is not the dynamics, as y_before remembers: spectral radius 0.8944"
+    forgetful = remembering({"A": [[6.0]], "B": [[-8.0]]}, SignalMap(signals.states, (Signal("u", "", "u"),)))
+    assert len(dynamics_text(forgetful)) == 1

@@ -185,4 +185,11 @@ def dynamics_text(model: UncertainLTI) -> list[str]:
     list of str
         Lines.
     """
-    return regimes_text(model) or [f"eigenvalues of A [1/s]: {eigenvalues_text(model)}"]
+    lines = regimes_text(model) or [f"eigenvalues of A [1/s]: {eigenvalues_text(model)}"]
+    remembered = [r for r in model.signals.recalled if r.of < model.n]
+    if remembered and model.sampling.dt_median is not None:
+        names = ", ".join(model.signals[r.position].name for r in remembered)
+        lines.append(
+            f"A alone is not the dynamics, as {names} remembers: spectral radius {model.spectral_radius():.4g}"
+        )
+    return lines
