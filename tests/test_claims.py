@@ -79,7 +79,14 @@ def test_every_claim_has_a_command_and_every_benchmark_a_claim():
     for row in rows():
         assert "`" in row[1] or row[1] == "the same" or set(row[0]) == {"-"}, row
     named = " ".join(COMMANDS)
-    shared = {"measure.py", "peers.py", "regime_peers.py", "recorded.py"}  # parts of the others
+    shared = {
+        "measure.py",
+        "peers.py",
+        "regime_peers.py",
+        "recorded.py",
+        "detectors.py",
+        "detection_peers.py",
+    }  # parts of the others
     assert all(
         f"benchmarks/{path.name}" in named for path in (ROOT / "benchmarks").glob("*.py") if path.name not in shared
     )

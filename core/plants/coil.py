@@ -50,6 +50,10 @@ def coil_runs(
     volts: float = 40.0,
     magnitude: bool = False,
     act: Callable[[Array], Array] | None = None,
+    *,
+    onset: int = 0,
+    more_resistance: float = 1.0,
+    more_inductance: float = 1.0,
 ) -> list[Transient]:
     """Runs from rest: V_C (V) and I_L (A) under V_IN (V), held between samples; integrated by Runge-Kutta, no noise.
 
@@ -65,6 +69,12 @@ def coil_runs(
         `I_L_magnitude`, |I_L|, is there as a further scheduling signal.
     act : callable, optional
         The voltages that the source really gives, for the commanded ones (samples, seeds), which V_IN tells of.
+    onset : int, default 0
+        Sample from which the two factors below hold.
+    more_resistance : float, default 1.0
+        Factor on R.
+    more_inductance : float, default 1.0
+        Factor on the inductance at every current.
 
     Returns
     -------
@@ -82,11 +92,12 @@ def coil_runs(
     given = u if act is None else act(u)
 
     def rate(x: Array, v: Array) -> Array:
-        return np.stack([x[1] / C, (v - x[0] - R * x[1]) / inductance(x[1])])
+        return np.stack([x[1] / C, (v - x[0] - r_factor * R * x[1]) / (l_factor * inductance(x[1]))])
 
     x = np.zeros((samples, 2, len(seeds)))
     for k in range(samples - 1):
         at = x[k]
+        r_factor, l_factor = (more_resistance, more_inductance) if k >= onset else (1.0, 1.0)
         for _ in range(SUBSTEPS):
             a = rate(at, given[k])
             b = rate(at + 0.5 * h * a, given[k])

@@ -1,0 +1,103 @@
+"""The benchmark of detection: scores are those of the monitor's alarm, thresholds let through what they are to."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy", reason="scipy, which the benchmark needs, is not installed")
+
+from detection import Case, Faulty, Kind, Recorded, evaluate, from_whole_degrees, our_rules, profile, threshold_of
+from detectors import Kalman, LeastSquares, Runs, Statistic, cusum, of_window, residual_detectors
+from tanks import Tanks
+
+from uncertain_lti import EnvelopeMonitor, OperatingPoint, fit
+from uncertain_lti.model.alarm_rule import AlarmRule
+
+POINT = OperatingPoint(np.zeros(3), np.zeros(1), np.ones(3), np.ones(1))
+KINDS = (
+    Kind("containment"), Kind("containment", 1.0), Kind("energy", 1.0), Kind("mean", 1.0), Kind("ewma", 1.0),
+    Kind("cusum", 1.0, 1, 0.05), Kind("chi2", 1.0), Kind("containment", 0.0, 5), Kind("energy", 1.0, 5),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    plant = Tanks()
+
+    def recorded(count: int, seed: int, fault: float = 0.0) -> list[Recorded]:
+        return Recorded.of(plant.transients(count, seed, noise=1e-3, fault=fault), POINT)
+
+    faulty = {"outlet × 10%": Faulty(recorded(4, 4, 0.1)[0], 51)}
+    return Case("tanks", recorded(6, 1), recorded(20, 2), recorded(20, 3), faulty, 2, "per 100 recordings")
+
+
+def test_a_rule_raises_the_alarm_where_its_score_exceeds_its_threshold(case):
+    transients = [t for runs in case.fitted for t in runs.transients]
+    model = fit(transients, additive="both", horizons=[5], widths="growing", operating_point=POINT)
+    ours = our_rules(model, case.fitted, KINDS)
+    runs = case.faulty["outlet × 10%"].runs
+    for kind, (name, score) in zip(KINDS, ours.scores("ours").items(), strict=True):
+        scores = score(runs)
+        assert name == f"ours, {kind.name}"
+        threshold = float(np.quantile(scores[np.isfinite(scores)], 0.7))
+        rule = kind.rule(threshold, ours.step)
+        rules = [rule] if isinstance(rule, AlarmRule) and rule.horizon == 1 else [AlarmRule(margin=1e9), rule]
+        monitor = EnvelopeMonitor(model, rules=rules)
+        for t, row in zip(runs.transients, scores, strict=True):
+            raised = monitor.check(t).alarm
+            assert raised.any(), kind
+            assert np.array_equal(raised, row > threshold), kind
+
+
+def test_a_threshold_lets_as_many_recordings_through_as_it_may(case):
+    law = LeastSquares.of(case.fitted)
+    for score in residual_detectors(law, case.fitted, [Statistic("3 sigma"), Statistic("CUSUM", 0.5)]).values():
+        threshold = threshold_of(case, score, case.allowed)
+        assert sum(int((score(runs).max(axis=1) > threshold).sum()) for runs in case.learn) == case.allowed
+        outcome = evaluate(case, score)
+        assert outcome.alarmed == sum(int((score(runs).max(axis=1) > threshold).sum()) for runs in case.healthy)
+        mean, low, high = outcome.rate
+        assert low <= mean <= high and mean == pytest.approx(100 * outcome.alarmed / 20)
+        (faulty,) = case.faulty.values()
+        for t, row, delay in zip(
+            faulty.runs.transients, score(faulty.runs), outcome.delays["outlet × 10%"], strict=True
+        ):
+            after = np.flatnonzero(row[faulty.first :] > threshold)
+            assert delay == (
+                pytest.approx(t.t[faulty.first + after[0]] - t.t[faulty.first - 1]) if len(after) else np.inf
+            )
+
+
+def test_the_peers_are_what_their_names_say():
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((2, 50, 3))
+    for r in range(2):
+        up, down = np.zeros(3), np.zeros(3)
+        for k in range(50):
+            up, down = np.maximum(0, up + values[r, k] - 0.5), np.maximum(0, down - values[r, k] - 0.5)
+            assert cusum(values, 0.5)[r, k] == max(*up, *down)
+    largest = of_window(values[..., 0], 3, 5)
+    for k in range(4, 50):
+        assert largest[1, k] == np.sort(values[1, k - 4 : k + 1, 0])[-3]
+
+
+def test_least_squares_and_the_filter_find_a_linear_plant():
+    rng = np.random.default_rng(1)
+    A, B, dt = np.array([[-1.0, 0.3], [0.0, -2.0]]), np.array([[1.0], [0.5]]), 0.1
+    x, u = np.zeros((3, 400, 2)), rng.standard_normal((3, 400, 1))
+    for k in range(399):
+        x[:, k + 1] = x[:, k] + dt * (x[:, k] @ A.T + u[:, k] @ B.T) + 1e-3 * rng.standard_normal((3, 2))
+    read = x + 0.05 * rng.standard_normal(x.shape)
+    steps = np.full((3, 399), dt)
+    exact = LeastSquares.of([Runs(x, u, steps)])
+    assert exact.theta.T == pytest.approx(np.column_stack([A, B, np.zeros(2)]), abs=0.02)
+    noisy = [Runs(read, u, steps)]
+    filtered = Kalman.likeliest(noisy, exact)(noisy[0])
+    assert (filtered.std(axis=(0, 1)) < 0.85 * exact(noisy[0]).std(axis=(0, 1))).all()  # it averages the sensors' noise
+
+
+def test_levers_start_from_whole_angles_and_differ_by_seed():
+    for seed in range(12):
+        moves = profile(seed)
+        assert moves[0][0] == 0.0 and all(60.0 <= angle <= 68.0 for _, angle in moves)
+    assert profile(1) != profile(7)
+    assert from_whole_degrees(((0.0, 63.4), (1.0, 63.4), (2.0, 66.1))) == ((0.0, 63.0), (1.0, 63.0), (2.0, 66.1))
