@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,17 +10,29 @@ import pytest
 from scipy.optimize import linprog
 
 from uncertain_lti import EnvelopeMonitor, Transient
-from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.horizons import fit_horizons
 from uncertain_lti.identification.problem import assemble
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.reports.check_data import check_data
+from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.reports.figures import save
+from uncertain_lti.reports.horizon_figure import horizon_figure
+from uncertain_lti.reports.model_text import model_text
 
 STEPS = (2, 5, 11)
 
 
-def runs(seed: int = 0, count: int = 3, length: int = 160, noise: float = 1e-3, modes: bool = False) -> list[Transient]:
+def runs(
+    seed: int = 0,
+    count: int = 3,
+    length: int = 160,
+    noise: float = 1e-3,
+    modes: bool = False,
+    bend: float = 3.0,
+) -> list[Transient]:
     """A damped, driven pair of states whose stiffness depends on the first."""
     rng = np.random.default_rng(seed)
     found = []
@@ -27,7 +40,7 @@ def runs(seed: int = 0, count: int = 3, length: int = 160, noise: float = 1e-3, 
         u = rng.choice([-1.0, 0.0, 1.0], size=length // 20 + 1).repeat(20)[:length, None]
         x = np.zeros((length, 2))
         for k in range(length - 1):
-            rate = np.array([x[k, 1], -(4.0 + 3.0 * x[k, 0]) * x[k, 0] - 1.5 * x[k, 1] + 2.0 * u[k, 0]])
+            rate = np.array([x[k, 1], -(4.0 + bend * x[k, 0]) * x[k, 0] - 1.5 * x[k, 1] + 2.0 * u[k, 0]])
             x[k + 1] = x[k] + 0.02 * rate
         x += rng.uniform(-noise, noise, x.shape)
         t = np.arange(length) * 20_000_000
@@ -159,6 +172,44 @@ def test_horizons_without_windows_or_numbers_are_dropped_by_name() -> None:
     problem = assemble(runs(), model.operating_point, None, "noise")
     found, _, messages = fit_horizons(away, problem, [2, 140])
     assert [h.steps for h in found] == [2] and "'x1' beyond all numbers" in messages[0]
+
+
+def test_check_and_figure_say_which_horizon_was_left(tmp_path: Path) -> None:
+    transients = runs(count=2)
+    model = fit(transients, "lp", additive="noise", horizons=STEPS, widths="constant")
+    x = transients[0].x.copy()
+    x[100:, 0] += 1e-3 * np.arange(60)  # a drift that one step hardly shows
+    spoilt = Transient(transients[0].t_ns, x, transients[0].u)
+    verdicts = EnvelopeMonitor(model).check(spoilt)
+    data = check_data(model, verdicts)
+    assert [h["steps"] for h in data["horizons"]] == list(STEPS)
+    for j, found in enumerate(data["horizons"], 1):
+        outside = np.abs(verdicts.horizon_utilisation[:, j]) > 1.0
+        assert found["windows"] == len(spoilt) - found["steps"] and found["outside"] == outside.any(axis=1).sum()
+        for i, state in enumerate(found["states"].values()):
+            assert state["outside"] == outside[:, i].sum()
+            assert (state["first"] is None) == (not state["outside"])
+    assert data["horizons"][-1]["outside"] > 0
+    sample = data["verdict_per_sample"][120]["horizon_utilisation"]
+    assert sample == verdicts.horizon_utilisation[120].tolist() and len(sample) == 1 + len(STEPS)
+    last = data["horizons"][-1]
+    first = min(s["first"]["t"] for s in last["states"].values() if s["first"])
+    assert f"{first:.4f} s" in check_text(data) and "windows" in check_text(data)
+    again = UncertainLTI.from_dict(model.to_dict())
+    assert "mean width after steps" in model_text(again)
+    figure = horizon_figure(model, verdicts)
+    maps = [axis for axis in figure.axes if axis.get_title("left")]
+    assert [axis.get_title("left") for axis in maps] == list(model.state_names)
+    assert [text.get_text() for text in maps[0].get_yticklabels()] == [
+        "1 (0.02 s)",
+        "2 (0.04 s)",
+        "5 (0.1 s)",
+        "11 (0.22 s)",
+    ]
+    save(figure, tmp_path / "f.png", 50)
+    save(horizon_figure(model, verdicts, ["x2"], (0.5, 1.0)), tmp_path / "f.png", 50)
+    with pytest.raises(ModelError, match="no state 'other'"):
+        horizon_figure(model, verdicts, ["other"])
 
 
 @pytest.mark.parametrize("bad", [[1], [2.5], [True], [0, 4]])

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import Message, Topic, float64, write
 
-from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, fit, read_transients, validate
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, fit, validate
 from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.proposal.memories import Remembered, memory_candidates, remember, suggest_memories
-from uncertain_lti.reports.model_text import dynamics_text
 from uncertain_lti.sampling.recall import recall, recalled, with_memories
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status
@@ -218,29 +215,3 @@ def test_what_a_transient_recalls_follows_what_was_done_to_its_states() -> None:
 def test_a_memory_of_nothing_or_under_a_taken_name_is_refused(memories: dict[str, object], words: str) -> None:
     with pytest.raises(TransientError, match=words):
         with_memories(oscillating(1), memories)  # type: ignore[arg-type]
-
-
-def test_the_noise_of_a_rate_decides_no_steady_state(tmp_path: Path) -> None:
-    """As without it: a rate of noise is never still."""
-    rng = np.random.default_rng(2)
-    levels = np.repeat([0.0, 5.0, 2.0, 9.0], [100, 400, 60, 80])
-    values = levels + 0.01 * rng.normal(size=len(levels))
-    stamps = 10**18 + 10**7 * np.arange(len(levels))
-    path = write([Topic("/a")], [Message("/a", int(t), float64(v)) for t, v in zip(stamps, values, strict=True)])
-    bag = path.save(tmp_path / "run.mcap")
-    state = {"name": "x", "topic": "/a", "field": "data", "steady": "auto", "scale": "auto"}
-    rate = {**state, "name": "rate", "field": "rate(data)"}
-    lag = {"name": "lag", "topic": "/a", "field": "lag(data, 1)"}
-    (plain,) = read_transients(bag, SignalMap.from_dict({"states": [state]}))
-    (more,) = read_transients(bag, SignalMap.from_dict({"states": [state, rate, lag]}))
-    (x,), controls = more.signals.states, more.signals.controls
-    assert x == plain.signals.states[0] and x.steady == pytest.approx(5.0, abs=0.01)
-    assert [(s.steady, s.scale) for s in controls] == [(0.0, x.scale), (x.steady, x.scale)]
-
-
-def test_what_remembers_is_named_beside_the_eigenvalues() -> None:
-    signals = SignalMap((Signal("y", "", "y"),), (Signal("y_before", "", "lag(y, 1)"),))
-    model = remembering({"A": [[6.0]], "B": [[-8.0]]}, signals)
-    assert dynamics_text(model)[-1] == "A alone is not the dynamics, as y_before remembers: spectral radius 0.8944"
-    forgetful = remembering({"A": [[6.0]], "B": [[-8.0]]}, SignalMap(signals.states, (Signal("u", "", "u"),)))
-    assert len(dynamics_text(forgetful)) == 1

@@ -272,6 +272,8 @@ def horizons_asked_for(
     signals = transients[0].signals if transients else None
     if horizons is None:
         rule = None if signals is None else signals.horizons
+    elif isinstance(horizons, Sequence) and not horizons:
+        rule = None  # even where the signals file asks for some
     else:
         try:
             rule = HorizonRule.of(dict(horizons) if isinstance(horizons, Mapping) else horizons)

@@ -14,7 +14,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
-from uncertain_lti.proposal.scheduling import EXCESS, FOLDS, PAYS, SLACK, fold_of
+from uncertain_lti.proposal.scheduling import EXCESS, FOLDS, PAYS, SLACK, WORSE, fold_of, jackknife
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.horizon_rule import HorizonRule
 from uncertain_lti.validation.left_out import validate
@@ -122,6 +122,13 @@ class HorizonChoice:
         }
 
 
+def _admissible(candidate: HorizonCandidate, base: HorizonCandidate) -> bool:
+    """Whether its coverage does not speak against it."""
+    share = base.outside.sum() / max(base.judged.sum(), 1.0)
+    more, error = jackknife(candidate.outside - share * candidate.judged, candidate.judged)
+    return candidate.excess(base) <= ALLOWED or more < min(error, WORSE)
+
+
 def lengths_of(rule: HorizonRule, transients: Sequence[Transient]) -> list[int]:
     """Numbers of steps that a rule asks for, or that are to be tried.
 
@@ -178,10 +185,11 @@ def choose_horizons(
     """Which horizons, and which half-widths, hold on what is left out of the fit.
 
     Each recording, group, or block of a single recording is left out in turn and judged. Of one horizon, half-widths
-    that grow are taken if no more than ALLOWED of the left-out windows are outside beyond 1 + SLACK times those of
-    constant ones, and they are narrower by PAYS; else constant ones. A horizon that was not asked for by its length
-    stays if the same holds of its windows and the transitions of one step, and if its half-width per step is at most
-    PAYS of that of the horizon before it: then it sees slower changes.
+    that grow are taken if they are narrower by PAYS and no more of the left-out windows are outside than with constant
+    ones: than 1 + SLACK times as many and ALLOWED, or than the standard error of the difference and WORSE; else
+    constant ones. A horizon that was not asked for by its length stays if the same holds of its windows and the
+    transitions of one step, and if its half-width per step is at most PAYS of that of the horizon before it: then it
+    sees slower changes.
 
     Parameters
     ----------
@@ -261,14 +269,14 @@ def _decided(
         constant, growing = kinds.get("constant"), kinds.get("growing")
         best = constant or growing
         assert best is not None
-        if constant is not None and growing is not None and growing.excess(constant) <= ALLOWED:
+        if constant is not None and growing is not None and _admissible(growing, constant):
             if growing.log_width <= constant.log_width + math.log(PAYS):
                 best = growing
         why = "asked for" if asked else ""
         if not asked:
             if not best.judged.sum():
                 why = "no left-out part is so long"
-            elif best.excess(base) > ALLOWED:
+            elif not _admissible(best, base):
                 why = f"{best.share:.1%} of the left-out windows are outside, {base.share:.1%} of the single steps"
             elif not best.per_step <= PAYS * reached:
                 why = "sees no slower changes than the horizon before it"
@@ -278,7 +286,7 @@ def _decided(
         for one in (constant, growing):
             if one is None:
                 continue
-            other = f"{best.widths} half-widths hold better" if constant and growing else ""
+            other = "growing ones are narrower" if best is growing else "constant ones hold as well"
             rows.append(
                 {
                     "steps": steps,

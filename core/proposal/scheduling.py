@@ -120,7 +120,7 @@ class Candidate:
         float
             Standard error over what was left out.
         """
-        return _jackknife(self.outside - base.outside, self.judged)
+        return jackknife(self.outside - base.outside, self.judged)
 
     def excess(self, base: Candidate) -> float:
         """Share outside beyond what may be, summed over the left-out parts in which there is any.
@@ -141,7 +141,7 @@ class Candidate:
     @property
     def width(self) -> tuple[float, float]:
         """Logarithm of the mean width relative to one knot, with its standard error."""
-        return _jackknife(self.log_width * self.judged, self.judged)
+        return jackknife(self.log_width * self.judged, self.judged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,8 +440,23 @@ def _judged(count: int, model: UncertainLTI, left: Validation, base: Validation)
     )
 
 
-def _jackknife(sums: Array, counts: Array) -> tuple[float, float]:
-    """Σ sums / Σ counts, with its standard error over the units."""
+def jackknife(sums: Array, counts: Array) -> tuple[float, float]:
+    """Σ sums / Σ counts, with its standard error over the units.
+
+    Parameters
+    ----------
+    sums : array (units,)
+        Of what was left out at a time.
+    counts : array (units,)
+        Likewise.
+
+    Returns
+    -------
+    float
+        NaN if nothing is counted.
+    float
+        Standard error; infinite of a single unit.
+    """
     total = counts.sum()
     value = float(sums.sum() / total) if total else math.nan
     rest = total - counts

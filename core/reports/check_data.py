@@ -32,10 +32,12 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
 
     Counts, the first and the longest violation of each state, the spans in which the alarm was raised, widths and
     coverage; with samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no
-    verdict). Of a scheduled model also `regimes`, what became of the verdicts in each, `unknown`, in words why a regime
-    is unknown or a mode has no verdict, and of each sample its `regime`, a position in `regimes`. `frozen` and
-    `repeats` have the exact repeats that raised the alarm, and others longer than any of the fit, each from its last
-    fresh sample. `explained` says of alarms what they look like.
+    verdict). Of a model with horizons also `horizons`, the windows of each with those outside and the first per state,
+    and of each sample its `horizon_utilisation`, a row per number of steps. Of a scheduled model also `regimes`, what
+    became of the verdicts in each, `unknown`, in words why a regime is unknown or a mode has no verdict, and of each
+    sample its `regime`, a position in `regimes`. `frozen` and `repeats` have the exact repeats that raised the alarm,
+    and others longer than any of the fit, each from its last fresh sample. `explained` says of alarms what they look
+    like.
 
     Parameters
     ----------
@@ -89,6 +91,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "unknown": unknown_in_words(model, verdicts),
         "regimes": check_regimes(model, verdicts),
         "states": states,
+        "horizons": _horizons(model, verdicts),
         "alarm": bool(alarms),
         "alarms": [{**_instant(transient, start), **_length(t, (start, stop))} for start, stop in alarms],
         "frozen": _repeats(model, verdicts, verdicts.frozen),
@@ -108,7 +111,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         else "; ".join(["no verdict was possible, so nothing is known", *data["unknown"]])
     )
     if samples:
-        block = sample_blocks(model, verdicts)
+        block, table = sample_blocks(model, verdicts), verdicts.horizon_utilisation
         data["verdict_per_sample"] = [
             {
                 "t_ns": int(t[k]),
@@ -118,6 +121,9 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
                 "upper": _list(verdicts.upper[k]),
                 "state": _list(transient.x[k]),
                 "utilisation": _list(verdicts.utilisation[k]),
+            }
+            | ({"horizon_utilisation": [_list(row) for row in table[k]]} if model.horizons else {})
+            | {
                 "outside_domain": bool(verdicts.outside_domain[k]),
                 "alarm": bool(verdicts.alarm[k]),
             }
@@ -191,6 +197,34 @@ def _before(frozen: NDArray[np.bool_], longer: NDArray[np.bool_]) -> NDArray[np.
     for i in range(longer.shape[1]):
         for start, stop in _runs(longer[:, i]):
             found[start:stop, i] = stop < len(frozen) and frozen[stop, i]
+    return found
+
+
+def _horizons(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
+    """What became of the windows of each horizon; nothing without horizons."""
+    found = []
+    for j, horizon in enumerate(model.horizons, 1):
+        table = verdicts.horizon_utilisation[:, j]
+        there = ~np.isnan(table).all(axis=1)
+        with np.errstate(invalid="ignore"):
+            left = np.abs(table) > 1.0
+        first = [np.flatnonzero(left[:, i]) for i in range(model.n)]
+        count = int(there.sum())
+        found.append(
+            {
+                "steps": horizon.steps,
+                "windows": count,
+                "outside": int(left.any(axis=1).sum()),
+                "inside": None if not count else 1.0 - int(left.any(axis=1).sum()) / count,
+                "states": {
+                    name: {
+                        "outside": len(rows),
+                        "first": _instant(verdicts.transient, int(rows[0])) if len(rows) else None,
+                    }
+                    for name, rows in zip(model.state_names, first, strict=True)
+                },
+            }
+        )
     return found
 
 

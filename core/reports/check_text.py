@@ -48,6 +48,8 @@ def check_text(data: dict[str, Any]) -> str:
         head + (f"; no verdict or not used: {', '.join(data['no_verdict'])}" if data["no_verdict"] else ""),
         table(("state", "violations", "inside", "mean width", "largest", "first", "longest"), rows),
     ]
+    if over := data.get("horizons"):
+        lines.append(table(("steps", "windows", "inside", "first outside", "state"), [_horizon(h) for h in over]))
     visited = [r for r in data["regimes"] if r["verdicts"]]
     if len(visited) > 1 or len(data["regimes"]) > len(visited) > 0:
         header = ("regime", "verdicts", "inside", "unknown", *(f"{name}: mean width" for name in data["states"]))
@@ -113,6 +115,19 @@ def likeness_text(data: Mapping[str, Any]) -> list[str]:
     told = [like for like in data["explained"] if like["text"]]
     lines = [f"the alarm from {like['t']:.4f} s {like['text']}" for like in told[:MOST_LIKENESSES]]
     return lines + [f"  and {plural(len(told) - len(lines), 'more alarm')}; --json has all"] * (len(told) > len(lines))
+
+
+def _horizon(horizon: dict[str, Any]) -> list[str]:
+    """Cells of one horizon."""
+    left = [(state["first"]["t"], name) for name, state in horizon["states"].items() if state["first"] is not None]
+    when, name = min(left, default=(None, "-"))
+    return [
+        str(horizon["steps"]),
+        str(horizon["windows"]),
+        "-" if horizon["inside"] is None else f"{horizon['inside']:.3%}",
+        "-" if when is None else f"{when:.4f} s",
+        name,
+    ]
 
 
 def _regime(regime: dict[str, Any]) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from uncertain_lti.base.english import plural
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.reports.model_text import dynamics_text
+from uncertain_lti.reports.model_text import dynamics_text, horizon_widths_text
 from uncertain_lti.reports.reliance import TOO_FEW_INSIDE
 from uncertain_lti.reports.tables import number, table
 from uncertain_lti.sampling.reading import unused
@@ -78,11 +78,7 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
         table(("one-step envelope", "mean width", "largest", "rms step", "range", "width/range"), rows),
         *dynamics_text(model),
     ]
-    if over := facts.get("horizons"):
-        rows = [
-            [f"{h['steps']}", f"{h['seconds']:.3g}", h["widths"], *map(number, h["mean_width_recorded"])] for h in over
-        ]
-        lines.append(table(("mean width after steps", "s", "half-widths", *model.state_names), rows))
+    lines += horizon_widths_text(model)
     if "discarded" in facts:
         gone, before = facts["discarded"], facts["with_discarded"]["mean_width_recorded"]
         lines.append(

@@ -29,6 +29,7 @@ from uncertain_lti.reports.check_text import likeness_text, repeats_text
 from uncertain_lti.reports.detectable_text import SHOWN, condition_text, detectable_tables, detectable_words
 from uncertain_lti.reports.drawing import between_rows
 from uncertain_lti.reports.findings import APART
+from uncertain_lti.reports.horizon_figure import horizon_figure
 from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, WEIGHTS, YES
 from uncertain_lti.reports.tables import beyond, number, shortened
 from uncertain_lti.reports.width_budget import width_budget
@@ -294,6 +295,14 @@ def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]
             alt_texts.utilisation_text(facts, model.state_names),
         )
     )
+    if model.horizons:
+        parts.append(
+            _figure(
+                horizon_figure(model, verdicts),
+                "Utilisation over horizons: after how many steps a state lies outside its envelope",
+                "A map of the utilisation of each state over time, with one row for each number of steps.",
+            )
+        )
     return "\n".join(parts)
 
 

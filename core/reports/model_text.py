@@ -60,6 +60,7 @@ def model_text(model: UncertainLTI) -> str:
             )
         ]
         lines.append(table(("one-step envelope", "mean width", "largest"), widths))
+    lines += horizon_widths_text(model)
     alarm = model.alarm_rule
     lines.append(
         f"alarm: {alarm.violations} of the last {plural(alarm.window, 'verdict')} violated; margin "
@@ -68,6 +69,25 @@ def model_text(model: UncertainLTI) -> str:
     if (faults := detectable_data(model.validation)) is not None:
         lines += [condition_text(faults), *(f"  {text}" for text in detectable_words(faults))]
     return "\n".join(lines + [f"note: {message}" for message in facts.get("messages", [])])
+
+
+def horizon_widths_text(model: UncertainLTI) -> list[str]:
+    """Widths of the envelopes over several steps.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Of `fit`, or from a file.
+
+    Returns
+    -------
+    list of str
+        A table in recorded units; nothing without horizons.
+    """
+    if not (over := model.fit_summary.get("horizons")):
+        return []
+    rows = [[str(h["steps"]), number(h["seconds"]), h["widths"], *map(number, h["mean_width_recorded"])] for h in over]
+    return [table(("mean width after steps", "s", "half-widths", *model.state_names), rows)]
 
 
 MOST_PRINTED = 12
@@ -185,11 +205,4 @@ def dynamics_text(model: UncertainLTI) -> list[str]:
     list of str
         Lines.
     """
-    lines = regimes_text(model) or [f"eigenvalues of A [1/s]: {eigenvalues_text(model)}"]
-    remembered = [r for r in model.signals.recalled if r.of < model.n]
-    if remembered and model.sampling.dt_median is not None:
-        names = ", ".join(model.signals[r.position].name for r in remembered)
-        lines.append(
-            f"A alone is not the dynamics, as {names} remembers: spectral radius {model.spectral_radius():.4g}"
-        )
-    return lines
+    return regimes_text(model) or [f"eigenvalues of A [1/s]: {eigenvalues_text(model)}"]

@@ -485,17 +485,8 @@ def _resolve_operating_point(signals: SignalMap, transients: Sequence[Transient]
     for t in transients:
         rows = np.hstack([t.x, t.u, t.s])[:-1]  # the last row has no control yet
         recordings += np.split(rows, np.flatnonzero(np.diff(t.segment[:-1])) + 1)  # nobody knows what was in a gap
-    of = {r.position: r for r in signals.recalled}  # noise in a rate is no movement of the machine
-    plain = [i for i in range(len(signals)) if i not in of]
-    steady, scale, words = resolve_auto([signals[i] for i in plain], [r[:, plain] for r in recordings])
-    filled = list(signals)
-    for i, a, b in zip(plain, steady, scale, strict=True):
-        filled[i] = replace(signals[i], steady=a, scale=b)
-    for i, recalled in of.items():
-        own, base = signals[i], filled[recalled.of]
-        if own.steady == "auto":
-            own = replace(own, steady=base.steady if recalled.memory.kind == "lag" else 0.0)
-        filled[i] = replace(own, scale=base.scale) if own.scale == "auto" else own
+    steady, scale, words = resolve_auto(signals.signals, recordings)
+    filled = [replace(s, steady=a, scale=b) for s, a, b in zip(signals.signals, steady, scale, strict=True)]
     return signals.replace_signals(filled), words
 
 

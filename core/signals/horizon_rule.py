@@ -49,9 +49,11 @@ class HorizonRule:
         for h in self.steps:
             if isinstance(h, bool) or not isinstance(h, int) or h < 2:
                 raise SignalError(f"horizons: steps has {reprlib.repr(h)}; write whole numbers of at least 2")
-        for value in (*self.seconds, *(() if self.longest is None else (self.longest,))):
-            if not (isinstance(value, (int, float)) and 0.0 < value < float("inf")):
-                raise SignalError(f"horizons: {reprlib.repr(value)} is no length of a horizon; write seconds above 0")
+        lengths = [("seconds", value) for value in self.seconds]
+        lengths += [] if self.longest is None else [("longest", self.longest)]
+        for key, value in lengths:
+            if isinstance(value, bool) or not (isinstance(value, (int, float)) and 0.0 < value < float("inf")):
+                raise SignalError(f"horizons: {key} has {reprlib.repr(value)}; write seconds above 0")
 
     @property
     def leaves_out(self) -> bool:

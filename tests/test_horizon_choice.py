@@ -1,0 +1,123 @@
+"""Horizons chosen by what is left out: what is asked for, what is tried, and what stays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test_horizon_fit import runs
+
+from uncertain_lti import SignalMap, fit
+from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.proposal.horizons import MOST, choose_horizons, lengths_of
+from uncertain_lti.reports.fit_text import horizons_text
+from uncertain_lti.signals.horizon_rule import HorizonRule
+from uncertain_lti.validation.left_out import validate
+
+RUNS = runs(count=4, length=200, noise=1e-2, bend=0.0)
+
+
+def test_lengths_are_geometric_up_to_the_longest() -> None:
+    assert lengths_of(HorizonRule(longest=0.8), RUNS) == [2, 5, 10, 20, 40]
+    assert lengths_of(HorizonRule(longest=60.0), RUNS)[-1] == MOST
+    assert lengths_of(HorizonRule(), RUNS) == [2, 5, 10, 20]  # a tenth of the median recording
+    assert lengths_of(HorizonRule(seconds=(0.5, 0.1)), RUNS) == [5, 25]
+    assert lengths_of(HorizonRule(steps=(90, 3)), RUNS) == [3, 90]  # listed one by one they may be longer
+    for rule in (HorizonRule(longest=0.02), HorizonRule(seconds=(0.01,))):
+        with pytest.raises(FitError, match=r"median step is 0.02 s"):
+            lengths_of(rule, RUNS)
+
+
+@pytest.mark.parametrize(
+    ("data", "rule"),
+    [
+        ("auto", HorizonRule()),
+        ([5, 20], HorizonRule(steps=(5, 20))),
+        ({"longest": 1.0, "widths": "constant"}, HorizonRule(1.0, widths="constant")),
+        ({"seconds": [0.1]}, HorizonRule(seconds=(0.1,))),
+        ({"longest": "auto"}, HorizonRule()),
+    ],
+)
+def test_a_rule_is_read_from_arguments_and_signals_files(data: Any, rule: HorizonRule) -> None:
+    assert HorizonRule.of(data) == rule
+    states = [{"name": "x", "topic": "/a", "field": "data"}]
+    assert SignalMap.from_dict({"states": states, "horizons": data}).horizons == rule
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (3, "write auto"),
+        ({"longest": -1.0}, "longest"),
+        ({"longest": 1.0, "steps": [3]}, "longest and steps are given"),
+        ({"steps": 3}, "list of numbers"),
+        ({"steps": [1]}, "at least 2"),
+        ({"widths": "wide"}, "auto, growing or constant"),
+        ({"odd": 1}, "odd"),
+    ],
+)
+def test_what_is_no_rule_is_refused_in_one_sentence(data: Any, words: str) -> None:
+    with pytest.raises(SignalError, match=words):
+        HorizonRule.of(data, "a.yaml: horizons")
+    with pytest.raises(FitError, match=words):
+        fit(RUNS, horizons=data)
+
+
+def test_what_holds_on_left_out_data_stays_with_a_table_that_says_why() -> None:
+    model = fit(RUNS, "lp", additive="noise", horizons={"longest": 0.4})
+    choice = model.fit_summary["horizon_choice"]
+    assert choice["units"] == len(RUNS) and choice["left_out"] == "recording"
+    rows = {(row["steps"], row["widths"]): row for row in choice["candidates"]}
+    assert set(rows) == {(h, w) for h in (2, 5, 10, 20) for w in ("constant", "growing")}
+    taken = [row for row in choice["candidates"] if row["taken"]]
+    assert [(h.steps, h.widths) for h in model.horizons] == [(row["steps"], row["widths"]) for row in taken] != []
+    assert taken[-1]["per_step"] < 0.8 and all(row["why"] for row in choice["candidates"])
+    for row in taken:  # constant half-widths, unless growing ones are narrower
+        other = rows[row["steps"], "constant" if row["widths"] == "growing" else "growing"]
+        assert row["widths"] == "constant" or row["width"] < other["width"]
+    text = horizons_text(choice)
+    assert "leaving out one recording of 4" in text and text.count("(chosen)") == len(taken)
+    assert any(message.startswith("horizons of ") for message in model.fit_summary["messages"])
+
+
+def test_left_out_parts_have_the_utilisations_of_the_model_fitted_without_them() -> None:
+    model = fit(RUNS, additive="noise", horizons={"steps": [4, 9]}, widths="constant")
+    assert "horizon_choice" not in model.fit_summary and [h.widths for h in model.horizons] == ["constant"] * 2
+    left = validate(RUNS, full=model, additive="noise")
+    for part, run in zip(left.parts, RUNS, strict=True):
+        assert part.longer.shape == (part.judged, 2, 2)
+        assert (~np.isnan(part.longer[:, 0, 0])).sum() == len(run) - 4
+        assert (part.longer_width > 0).all()
+
+
+def test_horizons_that_lose_are_refused() -> None:
+    """Every recording has a bias of its own in the rate: what is left out drifts off, and longer horizons show it."""
+    rng = np.random.default_rng(5)
+    odd = []
+    for number, run in enumerate(RUNS):
+        x = run.x + 0.4 * (-1) ** number * run.t[:, None] + rng.normal(0.0, 3e-3, run.x.shape)
+        odd.append(type(run)(run.t_ns, x, run.u))
+    choice = choose_horizons(odd, HorizonRule(longest=1.2), [2, 60], additive="noise", criterion="lp")
+    assert 60 not in choice.chosen
+    assert any("left-out windows are outside" in row["why"] for row in choice.rows if row["steps"] == 60)
+
+
+def test_an_empty_list_means_one_step_whatever_the_signals_file_asks_for() -> None:
+    states = [{"name": f"x{i}", "topic": "/a", "field": f"x{i}"} for i in (1, 2)]
+    controls = [{"name": "u1", "topic": "/a", "field": "u1"}]
+    signals = SignalMap.from_dict(
+        {"states": states, "controls": controls, "horizons": {"steps": [4], "widths": "growing"}}
+    )
+    asks = [type(run)(run.t_ns, run.x, run.u, signals=signals) for run in RUNS[:2]]
+    assert fit(asks, additive="noise").steps == (4,)
+    assert fit(asks, additive="noise", horizons=[]).steps == ()
+
+
+def test_widths_without_horizons_and_weights_with_a_choice_are_refused() -> None:
+    with pytest.raises(FitError, match="no horizons are asked for"):
+        fit(RUNS, widths="constant")
+    with pytest.raises(FitError, match="transient_weights are for all"):
+        fit(RUNS, horizons="auto", transient_weights=[1.0, 2.0, 1.0, 1.0])
+    with pytest.raises(FitError, match="groups are given"):
+        fit(RUNS, horizons=[3], widths="growing", groups=["a", "a", "b", "b"])
