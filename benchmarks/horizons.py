@@ -1,0 +1,159 @@
+"""What envelopes over several steps see that one step does not: widths, coverage and delays on the simulated turbofan.
+
+./run python benchmarks/horizons.py turbofan      # manoeuvres and faults that were not fitted
+./run python benchmarks/horizons.py live          # CPU time of a verdict with horizons, against one step
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measure import table
+from regimes import FAULTY_MOVES, LONG, ONSET, SHORT_RUN, moved
+from turbofan_fleet import simulate_fleet
+
+from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
+from uncertain_lti.identification import fit
+from uncertain_lti.model.horizon import Horizon
+from uncertain_lti.model.terms import ARRAYS, SHAPES
+from uncertain_lti.plants.turbofan_faults import Fault
+from uncertain_lti.plants.turbofan_runs import DT, lever_moves, turbofan_signals
+from uncertain_lti.validation.blocks import cut
+
+ROOT = Path(__file__).resolve().parents[1]
+SHIPPED = ("pulses_up_large", "pulses_down_large", "levels")
+HORIZONS = (10, 20, 40)
+FAULTS = ("compressor_wear", "sensor_drift", "nozzle_stuck", "fan_damage")
+HEALTHY = {
+    "steps": [lever_moves(33.0, seed, jumps=1.0, hold=(0.8, 3.0)) for seed in (601, 602, 603)],
+    "ramps": [lever_moves(33.0, seed, jumps=0.0, rate=(0.5, 8.0), hold=(0.5, 3.0)) for seed in (604, 605, 606)],
+}
+
+
+def turbofan() -> None:
+    """Fitted to the two large pulse runs and the levels, or to eight lever profiles more; noise 1e-4.
+
+    Of every horizon: mean half-widths, share of the windows of six healthy runs of other manoeuvres inside, and of each
+    fault, on three more, the delay to the first window outside and the share outside from then on.
+    """
+    more = [moved(lever_moves(58.0, seed), LONG, 300 + seed) for seed in range(1, 9)]
+    healthy = [moved(m, SHORT_RUN, 700 + i) for i, m in enumerate([*HEALTHY["steps"], *HEALTHY["ramps"]])]
+    faulty = [moved(m, SHORT_RUN, 800 + i, fault) for fault in FAULTS for i, m in enumerate(FAULTY_MOVES)]
+    runs = iter(
+        [
+            *read_transients([ROOT / f"bags/turbofan_{name}_noise.mcap" for name in SHIPPED], turbofan_signals()),
+            *simulate_fleet(more),
+            *simulate_fleet([*healthy, *faulty]),
+        ]
+    )
+    sets = {"3 runs": [next(runs) for _ in SHIPPED]}
+    sets["11 runs"] = [*sets["3 runs"], *(next(runs) for _ in more)]
+    clean = [next(runs) for _ in healthy]
+    broken = {fault: [next(runs) for _ in FAULTY_MOVES] for fault in FAULTS}
+    rows = []
+    for name, fitted in sets.items():
+        for knots in (1, 3, 5):
+            for widths in ("growing", "constant"):
+                schedule: Any = {} if knots == 1 else {"fan_speed": knots}
+                model = fit(fitted, "qp", additive="noise", schedule=schedule, horizons=HORIZONS, widths=widths)  # type: ignore[arg-type]
+                rows += judged(model, [name, str(knots), widths], clean, broken)
+                print(f"{name}, {knots} knots, {widths}", file=sys.stderr, flush=True)
+    header = ["fitted to", "knots", "half-widths", "steps", "N1 N2 P3 P5 T5, 1e-4", "healthy inside"]
+    table(
+        f"Faults from {ONSET:g} s on: delay to the first window outside in three runs, s; share outside from then on",
+        [*header, *(f.replace("_", " ") for f in FAULTS)],
+        rows,
+    )
+
+
+def judged(model: UncertainLTI, first: list[str], clean: list[Any], broken: dict[str, list[Any]]) -> list[list[str]]:
+    """Rows of the table, one per horizon."""
+    monitor = EnvelopeMonitor(model)
+
+    def outside(transient: Any) -> Any:
+        table_of = monitor.check(transient).horizon_utilisation
+        return (np.abs(table_of) > 1.0).any(axis=2), ~np.isnan(table_of).all(axis=2)
+
+    healthy = [outside(t) for t in clean]
+    faulty = {fault: [outside(t) for t in runs] for fault, runs in broken.items()}
+    widths = [model.fit_summary["mean_width"], *(h["mean_width"] for h in model.fit_summary["horizons"])]
+    rows = []
+    for j, h in enumerate((1, *model.steps)):
+        shares = [1.0 - out[:, j].sum() / there[:, j].sum() for out, there in healthy]
+        cells = []
+        for fault, found in faulty.items():
+            onset = Fault(fault, ONSET).first_sample(DT)
+            delays, later = [], []
+            for out, _ in found:
+                after = out[onset:, j]
+                delays.append(f"{(int(np.argmax(after)) + 1) * DT:.2g}" if after.any() else "never")
+                later.append(100 * after.mean())
+            cells.append(f"{', '.join(delays)}; {min(later):.0f}-{max(later):.0f} %")
+        half = " ".join(f"{5e3 * w:.0f}" if w >= 2e-3 else f"{5e3 * w:.1f}" for w in widths[j])
+        rows.append([*first, str(h), half, f"{100 * min(shares):.1f}-{100 * max(shares):.1f} %", *cells])
+    return rows
+
+
+def bags() -> None:
+    """Fitted to the three shipped noisy recordings, constant half-widths; the shipped recordings of faults."""
+    fitted = read_transients([ROOT / f"bags/turbofan_{name}_noise.mcap" for name in SHIPPED], turbofan_signals())
+    broken = {fault: read_transients(ROOT / f"bags/turbofan_{fault}.mcap", turbofan_signals()) for fault in FAULTS}
+    rows = []
+    for criterion, knots in (("lp", 1), ("qp", 1), ("qp", 3)):
+        schedule: Any = {} if knots == 1 else {"fan_speed": knots}
+        options: Any = {"additive": "noise", "schedule": schedule, "horizons": HORIZONS, "widths": "constant"}
+        model = fit(fitted, criterion, **options)  # type: ignore[arg-type]
+        before = [cut(t, 0, round(ONSET / DT)) for ts in broken.values() for t in ts]
+        rows += judged(model, [criterion, str(knots)], before, broken)
+    header = ["criterion", "knots", "steps", "N1 N2 P3 P5 T5, 1e-4", "inside before"]
+    table(
+        f"Shipped recordings, faults from {ONSET:g} s on: delay to the first window outside, s; share outside after it",
+        [*header, *(f.replace("_", " ") for f in FAULTS)],
+        rows,
+    )
+
+
+def live() -> None:
+    """One verdict after another: with horizons of 10, 20 and 40 steps, and without."""
+    rows = []
+    rng = np.random.default_rng(0)
+    for n, m in ((5, 4), (50, 10)):
+        arrays = {name: 0.01 * np.abs(rng.normal(size=SHAPES[name].shape(n, m))) for name in ARRAYS}
+        plain = UncertainLTI(**arrays)
+        model = plain.replace(horizons=[Horizon(h, **arrays) for h in HORIZONS])
+        before, after = rng.normal(size=n + m).tolist(), rng.normal(size=n).tolist()
+        times = []
+        for one in (plain, model):
+            judge = one.judge_of(1.0, np.ones(n, dtype=bool))
+            runs, best = one.runs_of(judge), np.inf
+            for _ in range(5):
+                began = time.process_time()
+                for _ in range(2000):
+                    judge.judge(before, after, 0.002)
+                    if runs is not None:
+                        runs.push(before, after, 0.002)
+                best = min(best, time.process_time() - began)
+            times.append(best / 2000)
+        rows.append([str(n), str(m), *(f"{1e6 * t:.2f} µs" for t in times)])
+    table("CPU time of a verdict", ["n", "m", "one step", f"with horizons of {HORIZONS} steps"], rows)
+
+
+CLAIMS = {"turbofan": turbofan, "bags": bags, "live": live}
+
+
+def main() -> None:
+    """Run the claims that are named."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("claims", nargs="+", choices=[*CLAIMS, "all"])
+    options = parser.parse_args()
+    for claim in CLAIMS if "all" in options.claims else options.claims:
+        CLAIMS[claim]()
+
+
+if __name__ == "__main__":
+    main()
