@@ -36,6 +36,8 @@ from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.part import Part, by_unit, rising
 from uncertain_lti.validation.result import Validation
 
+PLAIN = "plain fit: "
+"""What the words of the plain fit begin with."""
 KINDS = ("bias", "drift", "noise", "offset")
 """Kinds of injected faults by which ways are compared."""
 CASES = 40
@@ -439,7 +441,7 @@ def _schedules(transients: Sequence[Transient], best: Setting) -> Iterator[list[
         yield [
             replace(
                 best,
-                words=f"{best.words}, {count} knots on {name}",
+                words=f"{best.words.removeprefix(PLAIN)}, {count} knots on {name}",
                 options={**best.options, "schedule": {name: count}},
             )
             for count in KNOTS
@@ -451,7 +453,7 @@ def _memories(transients: Sequence[Transient], best: Setting) -> Iterator[Settin
     additive = str(best.options.get("additive", "noise"))
     for memories in memory_candidates(transients, additive):
         names = ", ".join(one.name for one in memories)
-        yield replace(best, words=f"{best.words}, with {names}", memories=memories)
+        yield replace(best, words=f"{best.words.removeprefix(PLAIN)}, with {names}", memories=memories)
 
 
 def _horizons(transients: Sequence[Transient], best: Setting, within: float) -> Iterator[Setting]:
@@ -461,7 +463,7 @@ def _horizons(transients: Sequence[Transient], best: Setting, within: float) -> 
     for steps in sorted({max(2, longest // 4), longest}):
         if longest >= 2:
             options = {**best.options, "horizons": [steps], "widths": "constant"}
-            yield replace(best, words=f"{best.words}, and over {steps} steps", options=options)
+            yield replace(best, words=f"{best.words.removeprefix(PLAIN)}, and over {steps} steps", options=options)
 
 
 class _Search:
@@ -489,7 +491,7 @@ class _Search:
         self._left: tuple[Setting | None, Validation | None, str] = (None, None, "")
         asked = transients[0].signals.additive if transients[0].signals is not None else None
         additive = asked or "none"
-        plain = Setting(f"plain fit: (10), {_ADDITIVE[additive]}", {"criterion": "qp", "additive": additive})
+        plain = Setting(f"{PLAIN}(10), {_ADDITIVE[additive]}", {"criterion": "qp", "additive": additive})
         left = self._validated(plain)
         self.within = typical_within(left.parts) if within is None and left is not None else within
         step = float(np.median(np.concatenate([t.dt for t in transients])))
