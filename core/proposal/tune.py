@@ -671,8 +671,8 @@ class _Search:
         needed = rate_interval(np.zeros(max(units, 2)), 1.0, self.confidence, one_sided=True)[1] / self.rate
         if chosen.upper > self.rate:
             yield (
-                f"{chosen.alarms} false alarms in {hours:.3g} h left out show at most {chosen.upper:.3g} per hour with "
-                f"{self.confidence:.0%} confidence, not {self.rate:g}: {needed:.3g} h without an alarm would"
+                f"{plural(chosen.alarms, 'false alarm')} in {hours:.3g} h left out: at most {chosen.upper:.3g} per hour "
+                f"with {self.confidence:.0%} confidence, not {self.rate:g}; {needed:.3g} h without an alarm would show that"
             )
         model, domain = left.model, left.model.domain
         for j, name in enumerate(model.control_names[: self.transients[0].u.shape[1]]):
