@@ -670,9 +670,10 @@ class _Search:
             yield f"{plural(units, left.what)} can hardly carry a choice: record {what} of the same kind of operation"
         needed = rate_interval(np.zeros(max(units, 2)), 1.0, self.confidence, one_sided=True)[1] / self.rate
         if chosen.upper > self.rate:
+            counted = plural(chosen.alarms, "false alarm")
             yield (
-                f"{plural(chosen.alarms, 'false alarm')} in {hours:.3g} h left out: at most {chosen.upper:.3g} per hour "
-                f"with {self.confidence:.0%} confidence, not {self.rate:g}; {needed:.3g} h without an alarm would show that"
+                f"{counted} in {hours:.3g} h left out: at most {chosen.upper:.3g} per hour with {self.confidence:.0%} "
+                f"confidence, not {self.rate:g}; {needed:.3g} h without an alarm would show that"
             )
         model, domain = left.model, left.model.domain
         for j, name in enumerate(model.control_names[: self.transients[0].u.shape[1]]):
