@@ -99,7 +99,12 @@ setup(
     python_requires=">=3.11",
     packages=[*CORE, NAME],
     package_dir=CORE,
-    package_data={"uncertain_lti": ["py.typed"], "uncertain_lti.plants": ["*.json"], NAME: ["*.xml"]},
+    package_data={
+        "uncertain_lti": ["py.typed"],
+        "uncertain_lti.plants": ["*.json"],
+        "uncertain_lti.reports": ["assets/*"],
+        NAME: ["*.xml"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -24,6 +24,7 @@ from uncertain_lti.cli import (
     info,
     init,
     layout,
+    plot,
     report,
     reproduce,
     ros,
@@ -41,6 +42,7 @@ COMMANDS: tuple[Command, ...] = (
     tune.COMMAND,
     check.COMMAND,
     report.COMMAND,
+    plot.COMMAND,
     layout.COMMAND,
     validate.COMMAND,
     signature.COMMAND,
@@ -93,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 sys.stdout.flush()  # what cannot be written is found while it can still be said
     except BrokenPipeError:  # `| head` has read enough
         _drop_output()
-        return NOT_READ if command in ("check", "report") else DONE
+        return NOT_READ if command in ("check", "report", "plot") else DONE
     except OSError as error:
         _drop_output()
         return _refuse(

@@ -91,6 +91,34 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
     return sources
 
 
+def moving_numbers(bag: Recording, progress: Iterate | None) -> tuple[list[tuple[str, str, Array, Array]], list[str]]:
+    """Every number of a recording that moves.
+
+    Parameters
+    ----------
+    bag : Recording
+        The recording.
+    progress : callable or None
+        As for `read_transients`.
+
+    Returns
+    -------
+    list of (str, str, array (messages,), array (messages,))
+        Topic, path, time of arrival in s after the first message of them all, and values.
+    list of str
+        What is left out, with the reason.
+    """
+    sources = read_sources([bag], progress)
+    chosen = [(s, c) for s in sources if not s.reason for c in s.candidates if not c.reason]
+    start = min((int(s.arrival[0][0]) for s, _ in chosen), default=0)
+    found = [
+        (s.topic, c.path, np.asarray((s.arrival[0] - start) * 1e-9, dtype=np.float64), c.values[0]) for s, c in chosen
+    ]
+    left = [f"{s.topic}: {s.reason}" for s in sources if s.reason]
+    left += [f"{s.topic} {c.path}: {c.reason}" for s in sources if not s.reason for c in s.candidates if c.reason]
+    return found, left
+
+
 def _of_table(fact: TopicFacts, rows: int) -> list[Source]:
     """The columns of a table, those that are commands by their names apart from the others."""
     by_role: dict[str, list[str]] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +117,52 @@ class DrawnColumns:
         return cls(
             centre, starts, stop, True, any_of[0], any_of[1], after, np.column_stack([cells[filled], cells[filled + 1]])
         )
+
+    @classmethod
+    def detailed(
+        cls, t: Array, segment: NDArray[np.int32], judged: Mask, alarm: Mask, near: Mask, most: int
+    ) -> DrawnColumns:
+        """Every sample if there are few; else stretches of samples, and every sample around some instants.
+
+        Parameters
+        ----------
+        t : array (samples,)
+            Times, s, of a `TimeAxis`.
+        segment : array (samples,) of int
+            Changes where two samples are not joined.
+        judged, alarm : array (samples,) of bool
+            Whether a sample has a verdict, and an alarm.
+        near : array (samples,) of bool
+            Instants that are worth every sample around them.
+        most : int
+            Stretches at most, more or less: one more begins at each change of the segment.
+
+        Returns
+        -------
+        DrawnColumns
+            In order of time.
+        """
+        count = len(t)
+        broken = np.zeros(count, dtype=bool)
+        broken[1:] = np.diff(segment) != 0
+        chosen = np.ones(count, dtype=bool)
+        if count > most:
+            chosen = broken | (np.arange(count) % math.ceil(2 * count / most) == 0)
+            onsets = np.flatnonzero(near & ~np.concatenate([[False], near[:-1]]))
+            onsets = onsets[:: math.ceil(len(onsets) / max(most // 20, 1)) or 1]
+            reach = min(most // (4 * max(len(onsets), 1)), 2000)
+            change = np.zeros(count + 1, dtype=np.int64)
+            np.add.at(change, np.maximum(onsets - reach, 0), 1)
+            np.add.at(change, np.minimum(onsets + reach + 1, count), -1)
+            inside = np.cumsum(change)[:count] > 0
+            chosen |= inside | np.concatenate([[False], inside[:-1]])
+            chosen[:1] = True
+        starts = np.flatnonzero(chosen)
+        last = np.append(starts[1:], count)[: len(starts)] - 1
+        any_of = [np.logical_or.reduceat(a, starts) if count else a for a in (judged, alarm)]
+        edges = np.column_stack([t[np.maximum(starts - 1, 0)], t[last]])
+        binned = len(starts) < count
+        return cls((t[starts] + t[last]) / 2, starts, count, binned, any_of[0], any_of[1], broken[starts], edges)
 
     def least(self, values: Array) -> Array:
         """Least value of each.

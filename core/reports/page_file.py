@@ -1,4 +1,4 @@
-"""The file of the page that `report` writes."""
+"""The files that `report` and `plot` write: where a page or an image may go, and how a page is written."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from pathlib import Path
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, whole_file
 from uncertain_lti.recordings.recording import Recording
+
+IMAGES = {".png": b"\x89PNG", ".svg": b"<svg", ".pdf": b"%PDF"}
+"""Endings of images, and what their files hold near the beginning."""
 
 
 def page_target(output: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Recording]) -> Path | None:
@@ -35,11 +38,42 @@ def page_target(output: str | os.PathLike[str] | None, model_file: str, bags: Se
     """
     if output is None:
         return None
+    return _target(Path(output), model_file, bags, holds=b"<html", kind="page", example="report.html")
+
+
+def image_target(output: str | os.PathLike[str], model_file: str, bags: Sequence[Recording]) -> Path:
+    """Where an image goes; an older one of the same format gives way, a recording or the model never.
+
+    Parameters
+    ----------
+    output : path
+        What the user named, with one of the endings `IMAGES`.
+    model_file : str
+        The model, which is never replaced; empty for none.
+    bags : sequence of Recording
+        The recordings, which are never replaced.
+
+    Returns
+    -------
+    Path
+        The path.
+
+    Raises
+    ------
+    BagError
+        The place is one of them, or its folder is not there.
+    """
     path = Path(output)
-    for other in (Path(model_file), *(part for bag in bags for part in bag.parts)):
+    return _target(path, model_file, bags, holds=IMAGES[path.suffix], kind="image", example="plot.png")
+
+
+def _target(path: Path, model_file: str, bags: Sequence[Recording], *, holds: bytes, kind: str, example: str) -> Path:
+    for other in (*([Path(model_file)] if model_file else []), *(part for bag in bags for part in bag.parts)):
         if path.exists() and other.exists() and path.samefile(other):
-            raise BagError(f"{path}: is what the report is about; choose another name")
-    return target(path, holds=b"<html", kind="page", example="report.html")
+            raise BagError(
+                f"{path}: is what the {'report' if kind == 'page' else 'plot'} is about; choose another name"
+            )
+    return target(path, holds=holds, kind=kind, example=example)
 
 
 def write_page(path: str | os.PathLike[str], page: str) -> None:

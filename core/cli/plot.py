@@ -1,0 +1,198 @@
+"""Command `uncertain-lti plot`: draw a model, recordings, or recordings checked against a model."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from uncertain_lti.base.errors import BagError, ModelError
+from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, print_json, print_notes, print_summary
+from uncertain_lti.cli.deployed import add_rule_arguments, check_recording, deployed_monitor
+
+if TYPE_CHECKING:
+    from uncertain_lti import UncertainLTI
+    from uncertain_lti.recordings.recording import Recording
+    from uncertain_lti.reports.interactive import PlottedRecording
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti plot`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
+    parser.add_argument(
+        "what",
+        metavar="WHAT",
+        nargs="+",
+        help="a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
+        "(states between their bounds)",
+    )
+    parser.add_argument("--signals", metavar="FILE", help="signals file: draw its signals, not every number that moves")
+    parser.add_argument(
+        "--output",
+        metavar="FILE",
+        help="page (.html, with zoom and hover) or image (.png, .svg, .pdf) to write (default: plot.html, of a model "
+        "alone plot.png)",
+    )
+    add_rule_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print the path, and whether the alarm was raised, as JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the plot.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+
+    Returns
+    -------
+    int
+        Exit status: 1 if recordings were checked and the alarm was raised, else 0.
+
+    Raises
+    ------
+    BagError
+        A recording cannot be read or drawn, or the plot cannot be written.
+    ModelError
+        The model cannot be read, or the options do not go with it.
+    """
+    from uncertain_lti.recordings.formats import group_recordings
+
+    named = _names_model(options.what[0])
+    model = load_model(options.what[0]) if named else None
+    paths = options.what[1:] if named else options.what
+    if model is not None and options.signals:
+        raise ModelError(f"--signals {options.signals}: the model has its signals; leave the option out")
+    bags = group_recordings(paths, layout=None if model is None else model.signals.table) if paths else []
+    output = _target(options.output or ("plot.html" if bags else "plot.png"), options.what[0] if named else "", bags)
+    alarm = False
+    if model is not None and not bags:
+        _image(_model_figure(model), output)
+    elif model is not None:
+        alarm = _plot_check(options, model, bags, output)
+    else:
+        if output.suffix != ".html":
+            raise BagError(f"{output}: recordings without a model are drawn as a page; end the name in .html")
+        _write(f"Recorded: {_listed(bags)}", _plot_bags(options, bags), output)
+    print_summary(options, f"plot written to {output}")
+    if options.json:
+        print_json({"plot": str(output), "recordings": [str(bag.path) for bag in bags], "alarm": alarm})
+    return ALARM if alarm else DONE
+
+
+def _names_model(path: str) -> bool:
+    """Whether the first word names a model: the published one, or a file that begins as JSON does."""
+    if not os.path.exists(path):
+        return path == "leibov2006" or path.endswith(".json")
+    if not os.path.isfile(path):
+        return False
+    with open(path, "rb") as stream:
+        return stream.read(100).lstrip()[:1] == b"{"
+
+
+def _target(output: str, model_file: str, bags: list[Recording]) -> Path:
+    from uncertain_lti.reports.page_file import IMAGES, image_target, page_target
+
+    kind = os.path.splitext(output)[1]
+    if kind == ".html":
+        if not bags:
+            raise ModelError(f"{output}: a model alone is drawn as an image; end the name in .png, .svg or .pdf")
+        path = page_target(output, model_file, bags)
+        assert path is not None
+        return path
+    if kind not in IMAGES:
+        raise BagError(f"{output}: a plot is a page or an image; end the name in .html, .png, .svg or .pdf")
+    return image_target(output, model_file, bags)
+
+
+def _model_figure(model: UncertainLTI) -> Any:
+    from uncertain_lti.reports.figures import matrices_figure
+
+    return matrices_figure(model)
+
+
+def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Recording], output: Path) -> bool:
+    """Plot recordings that are checked; whether the alarm was raised."""
+    from uncertain_lti.reports.interactive import plotted_check
+
+    page = output.suffix == ".html"
+    if not page and len(bags) > 1:
+        raise BagError(f"{output}: an image shows one recording; name one, or end the name in .html")
+    deployed = deployed_monitor(options, model)
+    plotted, alarm = [], False
+    for bag in bags:
+        verdicts, _ = check_recording(deployed, bag, options.progress.iterate("reading"))
+        print_notes(options, verdicts.transient.notes)
+        alarm |= bool(verdicts.alarm.any())
+        if page:
+            plotted.append(plotted_check(model, verdicts, len(bags)))
+        else:
+            from uncertain_lti.reports.figures import envelope_figure
+
+            _image(envelope_figure(model, verdicts), output)
+    if page:
+        name = os.path.basename(options.what[0])
+        _write(f"{name}: {_listed(bags)}", plotted, output)
+    return alarm
+
+
+def _plot_bags(options: argparse.Namespace, bags: list[Recording]) -> list[PlottedRecording]:
+    from uncertain_lti.reports.interactive import plotted_fields, plotted_transient
+
+    if options.signals:
+        from uncertain_lti import read_transients
+
+        runs = read_transients(
+            [bag.path for bag in bags], options.signals, progress=options.progress.iterate("reading")
+        )
+        for transient in runs:
+            print_notes(options, transient.notes)
+        return [plotted_transient(transient, len(runs)) for transient in runs]
+    from uncertain_lti.proposal.reading import moving_numbers
+
+    plotted = []
+    for bag in bags:
+        fields, left = moving_numbers(bag, options.progress.iterate("reading"))
+        print_notes(options, bag.warnings)
+        if not fields:
+            raise BagError(f"{bag.path}: no number in it moves; `uncertain-lti topics {bag.path}` lists what it holds")
+        note = "Every number that moves, over the time of arrival."
+        if left:
+            note += f" Left out: {'; '.join(left[:8])}" + (f"; and {len(left) - 8} more" if len(left) > 8 else "") + "."
+        plotted.append(plotted_fields(str(bag.path), fields, note, len(bags)))
+    return plotted
+
+
+def _listed(bags: list[Recording]) -> str:
+    names = [os.path.basename(bag.path) or str(bag.path) for bag in bags]
+    return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+
+
+def _image(figure: Any, output: Path) -> None:
+    from uncertain_lti.reports.figures import save
+
+    save(figure, output, 200)
+
+
+def _write(title: str, plotted: list[PlottedRecording], output: Path) -> None:
+    from uncertain_lti.reports.interactive import interactive_page
+    from uncertain_lti.reports.page_file import write_page
+
+    write_page(output, interactive_page(title, plotted))
+
+
+COMMAND = Command(
+    "plot",
+    "draw a model, recordings, or recordings between the bounds of a model",
+    add_arguments,
+    run,
+    quiet=SILENT,
+    verbose="say what took how long",
+)
