@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, validate
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients, validate
+from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.html_table import MOST
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.reports import figures
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 control = pytest.importorskip("control", reason="python-control is not installed")
@@ -223,7 +224,7 @@ def test_results_print_on_one_line_and_as_a_table():
     validation = validate(runs, additive="noise")
     for thing in (model, runs[0], verdicts, validation, EnvelopeMonitor(model), validation.parts[0]):
         assert "\n" not in repr(thing) and len(repr(thing)) < 300, repr(thing)
-    for thing in (model, runs[0], verdicts, validation):
+    for thing in (model, runs[0], verdicts, validation, model.signals):
         rows = Reader(thing._repr_html_()).rows
         assert len({len(row) for row in rows}) == 1 and len(rows) > 2
         assert any("<x0>" in cell for row in rows for cell in row), "names are escaped, and come back"
@@ -243,6 +244,60 @@ def test_tables_of_large_and_of_empty_things():
     verdicts = EnvelopeMonitor(UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]])).check(still)
     assert "none possible" in repr(verdicts)
     Reader(verdicts._repr_html_())
+
+
+def test_what_a_recording_left_out_is_not_the_number_of_its_samples():
+    whole = Transient([0.0, 0.1, 0.2], np.ones((3, 1)), np.ones((3, 1)), counters={"samples": 3})
+    assert "not used" not in whole._repr_html_() and "left out" not in whole._repr_html_()
+    twice = Transient([0.0, 0.1, 0.1, 0.2], np.ones((4, 1)), np.ones((4, 1)), counters={"samples": 4})
+    assert "not used, or without a verdict: 1 equal stamp<" in twice._repr_html_()
+
+
+def test_a_notebook_shows_a_figure_without_being_told_how():
+    from uncertain_lti.reports.figures import matrices_figure
+
+    figure = matrices_figure(fit(run(seed=0), additive="noise"))
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+def test_a_run_goes_to_pandas_and_back():
+    first = run(seed=3)
+    late = Transient(first.t_ns + 1_700_000_000_123_456_789, first.x, first.u, state_names=first.state_names)
+    for absolute, start in ((True, late.t_ns[0]), (False, 0)):
+        frame = late.to_dataframe(absolute)
+        states, controls = list(late.state_names), list(late.control_names)
+        again = Transient.from_dataframe(frame, states=states, controls=controls)
+        assert np.array_equal(again.t_ns, late.t_ns - late.t_ns[0] + start)
+        assert np.array_equal(again.x, late.x) and np.array_equal(again.u, late.u)
+
+
+@pytest.mark.parametrize(
+    ("call", "why"),
+    [
+        (lambda m, r: fit("runs/*.mcap"), "transient 0 is of type str; read recordings with read_transients"),
+        (lambda m, r: fit([r, m]), "transient 1 is of type UncertainLTI"),
+        (lambda m, r: fit(None), "the recording is None"),
+        (lambda m, r: validate([m]), "transient 0 is of type UncertainLTI"),
+        (lambda m, r: EnvelopeMonitor("m.json"), "model is of type str; read a file with UncertainLTI.load"),
+        (lambda m, r: EnvelopeMonitor(m).check([r]), "the recording is of type list"),
+        (lambda m, r: read_transients(3, "s.yaml"), "paths is of type int"),
+        (lambda m, r: read_transients([r], "s.yaml"), "a recording is of type Transient"),
+        (lambda m, r: read_transients(["b.mcap"], m), "signals is of type UncertainLTI"),
+        (lambda m, r: UncertainLTI.load(None), "the model file is None"),
+        (lambda m, r: m.save(3), "the model file is of type int"),
+        (lambda m, r: m.free_run(r.x), "the recording is of type ndarray"),
+        (lambda m, r: Transient.from_dataframe(r.x, states=["a"], controls=[]), "give a pandas DataFrame"),
+        (lambda m, r: SignalMap("speed"), "states is of type str; give a list of signals"),
+        (lambda m, r: SignalMap(["speed"]), "one of states is of type str; give a Signal"),
+        (lambda m, r: figures.envelope_figure(m, r), "verdicts is of type Transient"),
+        (lambda m, r: figures.utilisation_figure(r, m), "model is of type Transient"),
+        (lambda m, r: figures.matrices_figure(r), "model is of type Transient"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_with_a_sentence(call, why):
+    recording = run(seed=0)
+    with pytest.raises(UncertainLTIError, match=why):
+        call(UncertainLTI(-np.eye(3), np.zeros((3, 1)), np.eye(3), np.zeros((3, 1))), recording)
 
 
 # --- scheduled models -------------------------------------------------------------------------------------------

@@ -207,6 +207,27 @@ def test_discrepancies_are_those_of_a_plain_loop(seed: int, size: tuple[int, int
     np.testing.assert_allclose(got[1], largest, rtol=1e-9)
 
 
+def test_a_free_run_follows_the_controls_and_begins_again_after_gaps() -> None:
+    rng = np.random.default_rng(1)
+    model = random_model(rng, 2, 1)
+    t = np.arange(30) * 0.1
+    t[20:] += 5.0
+    x, u = rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
+    x[10] = np.nan
+    recording = Transient(t, x, u, max_gap=1.0)
+    free = model.free_run(recording)
+    assert np.array_equal(free.t_ns, recording.t_ns) and np.array_equal(free.u, recording.u)
+    assert np.isnan(free.x[10]).all() and np.isfinite(np.delete(free.x, 10, axis=0)).all()
+    for first, stop in ((0, 10), (11, 20), (20, 30)):
+        assert np.allclose(free.x[first], x[first])
+        for k in range(first, stop - 1):
+            now, dt = model.operating_point.normalise_x(free.x[k]), recording.dt[k]
+            after = now + dt * (model.A @ now + model.B @ model.operating_point.normalise_u(u[k]) + model.c)
+            assert np.allclose(free.x[k + 1], model.operating_point.recorded_x(after))
+    with pytest.raises(ModelError, match="it has 3 states, 1 controls"):
+        model.free_run(Transient(t, np.zeros((30, 3)), u))
+
+
 def test_a_transient_of_the_nominal_model_has_no_discrepancy() -> None:
     model = leibov2006()
     rng = np.random.default_rng(0)

@@ -11,7 +11,9 @@ MOST = 12
 
 
 def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]], below: Sequence[str] = ()) -> str:
-    """A plain table; every text is escaped. The first column is aligned to the left, the others to the right.
+    """A plain table, which scrolls where it is wide; every text is escaped.
+
+    The first column is aligned to the left, the others to the right.
 
     Parameters
     ----------
@@ -29,20 +31,20 @@ def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]
     str
         HTML; every text in it is escaped.
     """
-    head = "".join(f"<th style='text-align:{_side(i)}'>{escape(cell)}</th>" for i, cell in enumerate(header))
+    head = "".join(f"<th style='{_style(i)}'>{escape(cell)}</th>" for i, cell in enumerate(header))
     body = "".join(
-        "<tr>" + "".join(f"<td style='text-align:{_side(i)}'>{escape(c)}</td>" for i, c in enumerate(row)) + "</tr>"
+        "<tr>" + "".join(f"<td style='{_style(i)}'>{escape(c)}</td>" for i, c in enumerate(row)) + "</tr>"
         for row in rows
     )
     notes = "".join(f"<div>{escape(text)}</div>" for text in below)
     return (
-        f"<div><table><caption style='text-align:left'><b>{escape(caption)}</b></caption>"
-        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{notes}</div>"
+        f"<div><div style='overflow-x:auto'><table><caption style='text-align:left'><b>{escape(caption)}</b></caption>"
+        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{notes}</div>"
     )
 
 
-def _side(column: int) -> str:
-    return "right" if column else "left"
+def _style(column: int) -> str:
+    return f"text-align:{'right' if column else 'left'};white-space:nowrap"
 
 
 def number_text(value: float | None) -> str:

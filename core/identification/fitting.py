@@ -32,7 +32,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.repeats import repeats_of
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -110,9 +110,7 @@ def fit(
     FitError
         The transients do not match, there are too few transitions, or no envelope exists (names the sample).
     """
-    if isinstance(transients, Transient):
-        transients = [transients]
-    transients = list(transients)
+    transients = listed_transients(transients)
     if criterion not in ("qp", "lp"):
         raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
     if method not in ("working-set", "cvxpy"):

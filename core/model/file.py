@@ -14,7 +14,7 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
@@ -290,6 +290,7 @@ def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
     ModelError
         It holds what JSON cannot, or the file cannot be written.
     """
+    refuse_other(path, (str, os.PathLike), "the model file", "give its path", ModelError)
     try:
         text = _layout(data).encode()
     except (TypeError, ValueError, RecursionError) as error:
@@ -319,6 +320,7 @@ def read(path: str | os.PathLike[str]) -> Any:
     ModelError
         The file is missing, too large, or is not JSON.
     """
+    refuse_other(path, (str, os.PathLike), "the model file", "give its path", ModelError)
     if (kind := kind_of(path)) and kind != "a model file":
         cure = {
             "a folder": "name the file in it",

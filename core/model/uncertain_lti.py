@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import ModelError, SignalError
+from uncertain_lti.base.errors import ModelError, SignalError, refuse_other
 from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
 from uncertain_lti.model.alarm_rule import (
     JOINT,
@@ -791,6 +791,50 @@ class UncertainLTI:
         value = value / dt[before] if memory.kind == "rate" else value
         z[k, recalled.position] = (value - steady[recalled.position]) / scale[recalled.position]
 
+    def free_run(self, transient: Transient) -> Transient:
+        """Free run of the nominal model over a recording: its controls, and nothing of its states but the first.
+
+        The run begins again from the recorded sample at the start of every segment, and after every sample that is not
+        finite. `simulate` does the same for arrays of normalised quantities.
+
+        Parameters
+        ----------
+        transient : Transient
+            In recorded units.
+
+        Returns
+        -------
+        Transient
+            With the states of the run, in recorded units; NaN where there is no run.
+
+        Raises
+        ------
+        ModelError
+            The transient has other numbers of signals than the model.
+        """
+        point = self.operating_point
+        x = point.recorded_x(self._free_run(transient))
+        return transient.replace(x=x, name=f"{transient.name}, free run of the model")
+
+    def _free_run(self, transient: Transient) -> Array:
+        """Normalised states (N+1, n) of the run over each usable stretch; NaN elsewhere."""
+        refuse_other(transient, Transient, "the recording", "give a Transient", ModelError)
+        given = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
+        if given != (self.n, self.m, self.q):
+            raise ModelError(
+                f"{transient.name}: it has {given[0]} states, {given[1]} controls and {given[2]} further scheduling "
+                f"signals, and the model has {self.n}, {self.m} and {self.q}; read it with the signals of the model"
+            )
+        x = self.operating_point.normalise_x(transient.x)
+        u = self.operating_point.normalise_u(transient.u)
+        s = self.operating_point.normalise_s(transient.s)
+        usable, dt = transient.usable, transient.dt
+        run = np.full(x.shape, np.nan)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
+        for start, stop in edges.reshape(-1, 2):
+            run[start : stop + 1] = self.simulate(x[start], u[start:stop], dt[start:stop], s[start:stop])
+        return run
+
     def discrepancy(self, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
         """Discrepancies (4) and (5) between the free-running nominal model and a recorded transient.
 
@@ -816,15 +860,8 @@ class UncertainLTI:
         ModelError
             W has another shape.
         """
-        x = self.operating_point.normalise_x(transient.x)
-        u = self.operating_point.normalise_u(transient.u)
-        s = self.operating_point.normalise_s(transient.s)
-        usable, dt = transient.usable, transient.dt
-        error = np.full((len(usable), self.n), np.nan)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
-        for start, stop in edges.reshape(-1, 2):
-            free = self.simulate(x[start], u[start:stop], dt[start:stop], s[start:stop])
-            error[start:stop] = free[1:] - x[start + 1 : stop + 1]
+        error = (self._free_run(transient) - self.operating_point.normalise_x(transient.x))[1:]
+        usable = transient.usable
         weights = np.ones(self.n) if W is None else np.asarray(W, dtype=np.float64)
         if weights.shape not in ((self.n,), (len(usable), self.n), (len(usable), self.n, self.n)):
             raise ModelError(

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural, times
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
@@ -483,6 +483,7 @@ class EnvelopeMonitor:
         masked: Sequence[str] = (),
         rules: Sequence[Rule] | None = None,
     ) -> None:
+        refuse_other(model, UncertainLTI, "model", "read a file with UncertainLTI.load first", ModelError)
         if rules is not None:
             model = model.replace(alarm=rules)
         self.model = model
@@ -682,6 +683,8 @@ class EnvelopeMonitor:
         ModelError
             The transient has other numbers of states or controls than the model.
         """
+        instead = "read a recording with read_transients first, and give one after the other"
+        refuse_other(transient, Transient, "the recording", instead, ModelError)
         model, point = self.model, self.model.operating_point
         if transient.x.shape[1] != model.n or transient.u.shape[1] != model.m:
             raise ModelError(

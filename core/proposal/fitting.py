@@ -23,7 +23,7 @@ from uncertain_lti.proposal.horizons import choose_horizons, lengths_of
 from uncertain_lti.proposal.memories import suggest_memories
 from uncertain_lti.proposal.scheduling import choose_knots, knots_of
 from uncertain_lti.proposal.suggestion import suggest_schedule
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.horizon_rule import HorizonRule, WidthChoice
 
@@ -125,7 +125,7 @@ def fit(
         The transients do not match, there are too few transitions, or no envelope exists (names the sample); groups
         are given and nothing is left out.
     """
-    transients = [transients] if isinstance(transients, Transient) else list(transients)
+    transients = listed_transients(transients)
     options: dict[str, Any] = {
         "criterion": criterion,
         "weights": weights,

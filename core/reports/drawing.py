@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
+import warnings
+from types import MethodType
 from typing import Any
 
 import numpy as np
@@ -43,7 +46,18 @@ def new_figure(width: float, height: float) -> Any:
 
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
+    # Where a notebook is not told to draw with matplotlib, it asks an object itself.
+    figure._repr_png_ = MethodType(_png, figure)  # type: ignore[attr-defined]
     return figure
+
+
+def _png(figure: Any) -> bytes:
+    """The figure as a notebook shows it."""
+    stream = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names may be in any script
+        figure.savefig(stream, format="png", dpi=110)
+    return stream.getvalue()
 
 
 def between_rows(figure: Any, image: NDArray[np.uint8]) -> list[int]:

@@ -16,6 +16,30 @@ PIXELS = 1200
 """Stretches of time that a longer recording is drawn in."""
 
 
+def forward(t: Array) -> tuple[Array, int]:
+    """Times that never go back: after a step back the next pass follows the one before.
+
+    Parameters
+    ----------
+    t : array (samples,)
+        Times, s.
+
+    Returns
+    -------
+    array (samples,)
+        The same, or counted from 0 where there is a step back, s.
+    int
+        Steps back.
+    """
+    steps = np.diff(t)
+    loops = int((steps < 0).sum())
+    if not loops:
+        return t, 0
+    ahead = steps[steps > 0]
+    steps[steps < 0] = float(np.median(ahead)) if len(ahead) else 1.0
+    return np.concatenate([[0.0], np.cumsum(steps)]), loops
+
+
 class TimeAxis:
     """Time axis of a recording: s since the first sample; the passes of a looped one follow each other.
 
@@ -26,14 +50,7 @@ class TimeAxis:
     """
 
     def __init__(self, transient: Transient) -> None:
-        t = transient.t
-        steps = np.diff(t)
-        self.loops = int((steps < 0).sum())
-        if self.loops:
-            forward = steps[steps > 0]
-            steps[steps < 0] = float(np.median(forward)) if len(forward) else 1.0
-            t = np.concatenate([[0.0], np.cumsum(steps)])
-        self.t: Array = t
+        self.t, self.loops = forward(transient.t)
 
     @property
     def label(self) -> str:

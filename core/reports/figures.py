@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Integers
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
@@ -40,7 +40,7 @@ from uncertain_lti.reports.drawing import (
 from uncertain_lti.reports.figure_columns import PIXELS, DrawnColumns, TimeAxis
 from uncertain_lti.reports.schedule_figures import elements_figure
 from uncertain_lti.reports.width_budget import width_budget
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, listed_transients
 
 _FEW = 8  # states that get a panel of full size each, and columns whose numbers fit into a heat map
 
@@ -80,7 +80,7 @@ def envelope_figure(
     ModelError
         A name is not a state of the model.
     """
-    chosen = _chosen(model, states)
+    chosen = _chosen(model, verdicts, states)
     axis_time = TimeAxis(verdicts.transient)
     drawn = DrawnColumns.of(verdicts, axis_time.t, span)
     figure, axes = _panels(len(chosen))
@@ -142,7 +142,7 @@ def utilisation_figure(
     ModelError
         A name is not a state of the model.
     """
-    chosen = _chosen(model, states)
+    chosen = _chosen(model, verdicts, states)
     axis_time = TimeAxis(verdicts.transient)
     drawn = DrawnColumns.of(verdicts, axis_time.t, span, always=len(chosen) > _FEW)
     if len(chosen) > _FEW:
@@ -195,6 +195,7 @@ def matrices_figure(model: UncertainLTI) -> Any:
     """
     from matplotlib.colors import LogNorm, SymLogNorm
 
+    refuse_other(model, UncertainLTI, "model", "give a model", ModelError)
     if model.schedule is not None:
         return elements_figure(model)
     nominal, half, columns = elements(model)
@@ -243,7 +244,7 @@ def matrices_figure(model: UncertainLTI) -> Any:
     return figure
 
 
-def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
+def budget_figure(model: UncertainLTI, transients: Transient | Sequence[Transient]) -> Any:
     """Which element contributes how much of the mean one-step width, per state, over the transitions of recordings.
 
     The width of state i is 2 (Δt (ΔA |x| + ΔB |u| + Δc) + v) X_i, eqs. (6)(7) with additive terms: each column is one
@@ -253,7 +254,7 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
     ----------
     model : UncertainLTI
         The model.
-    transients : sequence of Transient
+    transients : Transient or sequence of Transient
         In recorded units, with the model's signals.
 
     Returns
@@ -266,7 +267,7 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
     ModelError
         No recording has a usable transition.
     """
-    shares, width, names = width_budget(model, transients)
+    shares, width, names = width_budget(model, listed_transients(transients))
     columns = [short(name) for name in names]
     rows = []
     for i, name in enumerate(model.state_names):
@@ -303,14 +304,14 @@ def budget_figure(model: UncertainLTI, transients: Sequence[Transient]) -> Any:
     return figure
 
 
-def coverage_figure(model: UncertainLTI, checked: Sequence[Verdicts]) -> Any:
+def coverage_figure(model: UncertainLTI, checked: Verdicts | Sequence[Verdicts]) -> Any:
     """Share of the verdicts outside the bounds, per recording: of any state, and state by state.
 
     Parameters
     ----------
     model : UncertainLTI
         The model checked with.
-    checked : sequence of Verdicts
+    checked : Verdicts or sequence of Verdicts
         One per recording, of `EnvelopeMonitor.check`.
 
     Returns
@@ -318,6 +319,7 @@ def coverage_figure(model: UncertainLTI, checked: Sequence[Verdicts]) -> Any:
     matplotlib.figure.Figure
         Not written yet; see `save`.
     """
+    checked = [checked] if isinstance(checked, Verdicts) else list(checked)
     names = [short(os.path.basename(v.transient.name) or v.transient.name, 40) for v in checked]
     outside, of_any, judged = _outside(checked, model.n)
     rows = [f"{name}  ({_count(n)})" for name, n in zip(names, judged, strict=True)]
@@ -436,7 +438,11 @@ def _outside(checked: Sequence[Verdicts], n: int) -> tuple[Array, Array, Integer
     return outside, of_any, judged
 
 
-def _chosen(model: UncertainLTI, states: Sequence[str] | None) -> list[int]:
+def _chosen(model: UncertainLTI, verdicts: Verdicts, states: Sequence[str] | None) -> list[int]:
+    refuse_other(model, UncertainLTI, "model", "give the model that the recording was checked with", ModelError)
+    refuse_other(
+        verdicts, Verdicts, "verdicts", "give what EnvelopeMonitor(model).check(transient) returned", ModelError
+    )
     names = list(model.state_names if states is None else states)
     for name in names:
         if name not in model.state_names:

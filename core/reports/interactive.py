@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
-from uncertain_lti.reports.figure_columns import DrawnColumns, TimeAxis
+from uncertain_lti.reports.figure_columns import DrawnColumns, TimeAxis, forward
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal
 
@@ -209,7 +209,8 @@ def plotted_fields(
     """
     times: list[Array] = []
     panels = []
-    for topic, path, t, values in fields:
+    for topic, path, recorded, values in fields:
+        t, _ = forward(recorded)
         none = np.zeros(len(t), dtype=bool)
         zero = np.zeros(len(t), dtype=np.int32)
         drawn = DrawnColumns.detailed(t, zero, none, none, none, _stretches(recordings, 3 * len(fields)))

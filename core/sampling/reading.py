@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.english import meant, shortlist
-from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.sampling.counters import INVALID, LATE, TOO_OLD
@@ -219,8 +219,12 @@ def read_transients(
     SignalError
         The map does not fit the recordings.
     """
+    refuse_other(paths, (Iterable, os.PathLike), "paths", "give files or folders", BagError)
     of = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
+    for path in of:
+        refuse_other(path, (str, os.PathLike), "a recording", "give the path of a file or a folder", BagError)
     if not isinstance(signals, SignalMap):
+        refuse_other(signals, (str, os.PathLike), "signals", "give a SignalMap or a signals file", SignalError)
         signals = load_signals(signals, of)
     bags = group_recordings(of, indexed=True, layout=signals.table)
     if not bags:

@@ -6,7 +6,7 @@ import csv
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import TransientError
+from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LONGEST_S
 from uncertain_lti.sampling.counters import Counters
@@ -303,9 +303,36 @@ class Transient:
             rms = float(np.sqrt(np.nanmean(np.diff(values) ** 2))) if len(finite) > 1 else math.nan
             cells = [name_with_unit(name, unit), kind, number_text(low), number_text(high), number_text(rms)]
             rows.append([*cells, str(len(values) - len(finite))])
-        counts = [f"{count} {reason}" for reason, count in sorted(self.counters.items()) if count]
+        counts = [
+            f"{count} {reason}" for reason, count in sorted(self.counters.items()) if count and reason != "samples"
+        ]
         header = ("signal", "", "least", "greatest", "rms step", "missing")
-        return html_table(repr(self), header, rows, [f"left out: {', '.join(counts)}"] if counts else [])
+        return html_table(
+            repr(self), header, rows, [f"not used, or without a verdict: {', '.join(counts)}"] if counts else []
+        )
+
+    def to_dataframe(self, absolute: bool = False) -> Any:
+        """As a pandas DataFrame, of which `from_dataframe` makes the run again.
+
+        Parameters
+        ----------
+        absolute : bool, default False
+            Index with instants (UTC, to the nanosecond) in place of seconds since the first sample.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row per sample; a column per state, control and further scheduling signal, in recorded units.
+        """
+        import pandas
+
+        index = (
+            pandas.DatetimeIndex(self.t_ns.view("M8[ns]"), tz="UTC", name="time")
+            if absolute
+            else pandas.Index(self.t, name="time [s]")
+        )
+        columns = [*self.state_names, *self.control_names, *self.scheduling_names]
+        return pandas.DataFrame(np.hstack([self.x, self.u, self.s]), index=index, columns=columns)
 
     @classmethod
     def from_dataframe(
@@ -337,6 +364,8 @@ class Transient:
             A column is missing or not numeric.
         """
         name = options.setdefault("name", "data frame")
+        if not hasattr(frame, "iloc"):
+            raise TransientError(f"{name}: frame is of type {type(frame).__name__}; give a pandas DataFrame")
         states, controls = _listed(states, "states", name), _listed(controls, "controls", name)
         columns = [str(c) for c in frame.columns]
 
@@ -422,6 +451,34 @@ class Transient:
         z = np.column_stack(chosen)
         split = 1 + len(states)
         return cls(z[:, 0], z[:, 1:split], z[:, split:], state_names=states, control_names=controls, **options)
+
+
+def listed_transients(given: Transient | Iterable[Transient]) -> list[Transient]:
+    """One run or several as a list.
+
+    Parameters
+    ----------
+    given : Transient or iterable of Transient
+        The runs.
+
+    Returns
+    -------
+    list of Transient
+        The runs.
+
+    Raises
+    ------
+    TransientError
+        It is something else, or something else is among them.
+    """
+    instead = "read recordings with read_transients first, or make one with Transient(t, x, u)"
+    if isinstance(given, Transient):
+        return [given]
+    refuse_other(given, Iterable, "the recording", instead, TransientError)
+    transients = list(given)
+    for k, transient in enumerate(transients):
+        refuse_other(transient, Transient, f"transient {k}", instead, TransientError)
+    return transients
 
 
 def _listed(names: Sequence[str], what: str, name: str) -> list[str]:

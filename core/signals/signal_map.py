@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
-from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.errors import SignalError, refuse_other
+from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.signals.additive import CHOICES, CHOICES_TEXT, Additive
 from uncertain_lti.signals.field_path import FieldPath
@@ -231,6 +232,12 @@ class SignalMap:
     source: str = "signals"
 
     def __post_init__(self) -> None:
+        for kind in ("states", "controls", "scheduling"):
+            signals = getattr(self, kind)
+            refuse_other(signals, (tuple, list), f"{self.source}: {kind}", "give a list of signals", SignalError)
+            for signal in signals:
+                refuse_other(signal, Signal, f"{self.source}: one of {kind}", "give a Signal", SignalError)
+            object.__setattr__(self, kind, tuple(signals))
         self._place_memories()
         if not self.states:
             raise SignalError(f"{self.source}: 'states' is empty; list at least one state")
@@ -479,6 +486,31 @@ class SignalMap:
             A new map.
         """
         return self.replace_signals([replace(s, type=types.get(s.topic, s.type)) for s in self.signals])
+
+    def _repr_html_(self) -> str:
+        """Where each signal is read, and its operating point; below, how samples are cut."""
+        groups = (("state", self.states), ("control", self.controls), ("scheduling", self.scheduling))
+        rows = [
+            [
+                name_with_unit(signal.name, signal.unit),
+                kind,
+                signal.topic,
+                signal.field,
+                signal.steady if signal.steady == "auto" else number_text(signal.steady),
+                signal.scale if signal.scale == "auto" else number_text(signal.scale),
+                "" if signal.max_hold is None else f"{number_text(signal.max_hold)} s",
+                str(signal.delay or ""),
+            ]
+            for kind, group in groups
+            for signal in group
+        ]
+        header = ("signal", "", "topic", "field", "steady", "scale", "max_hold", "delay")
+        below = [
+            f"{name}: {value}"
+            for name in ("clock", "max_gap", "min_step", "max_skew", "step", "additive")
+            if (value := getattr(self, name)) not in (None, 0.0, "recorded")
+        ]
+        return html_table(f"signals ({self.source})", header, rows, below)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SignalMap:

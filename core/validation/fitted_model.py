@@ -11,7 +11,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.validation import left_out
 from uncertain_lti.validation.blocks import BLOCKS
 from uncertain_lti.validation.groups import resolve_groups
@@ -54,7 +54,7 @@ def validate(
     if isinstance(subject, UncertainLTI):
         if transients is None:
             raise FitError("a model alone says nothing; give the recordings it was fitted to: validate(model, runs)")
-        runs = [transients] if isinstance(transients, Transient) else list(transients)
+        runs = listed_transients(transients)
         if further := sorted(set(options) - {"blocks", "gap", "groups", "confidence", "progress"}):
             raise FitError(
                 f"{', '.join(further)}: a model is validated with its own settings; leave this out, or give the "

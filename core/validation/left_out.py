@@ -16,7 +16,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.validation.blocks import BLOCKS, block_spans, cut, guard_interval, remaining_spans
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.part import Part, judge
@@ -78,7 +78,7 @@ def validate(
     FitError
         There is too little to leave out, an option is out of range, or a left-out fit fails (names the part).
     """
-    transients = [transients] if isinstance(transients, Transient) else list(transients)
+    transients = listed_transients(transients)
     if not 0.5 <= confidence < 1.0:
         raise FitError(f"confidence is {confidence:g}; it must be at least 0.5 and below 1")
     if blocks is not None and blocks < 2:
