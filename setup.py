@@ -3,6 +3,7 @@
 import runpy
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 from zlib import crc32
 
 from setuptools import Extension, find_packages, setup
@@ -11,6 +12,7 @@ NAME = "uncertain_lti_ros"
 CORE = {"uncertain_lti": "core"}
 CORE |= {f"uncertain_lti.{name}": f"core/{name.replace('.', '/')}" for name in find_packages("core")}
 ROOT = Path(__file__).resolve().parent
+PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
 
 
 def share(folder: str) -> list[tuple[str, list[str]]]:
@@ -93,8 +95,9 @@ setup(
     name=NAME,
     version="0.1.0",
     description="Linear models with bounded uncertainty, fitted to recordings and watched live in ROS 2",
-    maintainer="uncertain-lti maintainers",
-    maintainer_email="maintainers@uncertain-lti.example",
+    maintainer=PACKAGE.findtext("maintainer"),
+    maintainer_email=PACKAGE.find("maintainer").get("email"),
+    url=PACKAGE.findtext("url"),
     license="Apache-2.0",
     python_requires=">=3.11",
     packages=[*CORE, NAME],

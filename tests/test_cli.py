@@ -337,6 +337,14 @@ def test_of_several_recordings_one_that_lacks_a_topic_keeps_none_from_being_chec
     assert data["outcome"] == "unknown" and len(data["recordings"]) == 1
     assert [r["recording"] for r in data["not_checked"]] == [str(other)]
     assert "1 of 3" not in refused(capsys, ["check", model, str(other)])
+    page = tmp_path / "page.html"
+    for command in ("report", "plot"):
+        assert main([command, model, str(other), run, "--output", str(page)]) == 2
+        assert "1 of 2 recordings not checked" in capsys.readouterr().err and page.exists()
+        page.unlink()
+        shutil.copy(other, tmp_path / "third.mcap")
+        assert main([command, model, str(other), str(tmp_path / "third.mcap"), "--output", str(page)]) == 2
+        assert "2 of 2 recordings not checked" in capsys.readouterr().err and not page.exists()
 
 
 def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
@@ -356,6 +364,7 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
         (["fit", "a.mcap", "--signls", "s.yaml", "--output", "m"], "there is no --signls (is --signals meant?)"),
         (["check", "m", "a.mcap", "--jsn"], "unrecognized arguments: --jsn (is --json meant?)"),
         (["chek", "m"], "(is check meant?)"),
+        (["fti", "m"], "(is fit meant?)"),
     ],
 )
 def test_a_near_miss_names_one_option(words, said, capsys):

@@ -144,7 +144,8 @@ def test_the_command_draws_models_recordings_and_checks(engine, tmp_path, capsys
         assert (tmp_path / name).read_bytes().startswith(head)
     page = tmp_path / "p.html"
     assert main(["plot", model, bad, run, "--output", str(page), "--json"]) == 1
-    assert json.loads(capsys.readouterr().out) == {"plot": str(page), "recordings": [bad, run], "alarm": True}
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"plot": str(page), "recordings": [bad, run], "alarm": True, "exit_status": 1}
     first, second = data_of(page.read_text())
     assert first["name"] == "bad.mcap" and first["alarms"] and not second["alarms"]
     assert main(["plot", model, bad, "--violations", "9", "--window", "9", "--output", str(page), "-q"]) == 0

@@ -155,6 +155,8 @@ def test_package_xml_is_what_colcon_accepts(package, distribution):
     address = r"[-a-zA-Z0-9_%+]+(\.[-a-zA-Z0-9_%+]+)*@[-a-zA-Z0-9%]+(\.[-a-zA-Z0-9%]+)*\.[a-zA-Z]{2,}"
     assert re.fullmatch(address, package.find("maintainer").get("email"))
     assert package.find("maintainer").get("email") == distribution.get_maintainer_email()
+    assert package.findtext("maintainer") == distribution.get_maintainer()
+    assert package.findtext("url[@type='repository']") == distribution.get_url()
 
 
 def test_every_executable_has_its_function(distribution):
@@ -170,7 +172,10 @@ def test_every_package_and_file_of_the_source_is_installed(distribution):
             made = path.suffix == ".so"  # by an installation that is edited in place
             if path.is_dir() or made or "__pycache__" in path.parts or path.name.startswith("."):
                 continue
-            home = str(path.parent.relative_to(ROOT))
+            folder = (
+                path.parent if path.suffix == ".py" else next(f for f in path.parents if (f / "__init__.py").exists())
+            )
+            home = str(folder.relative_to(ROOT))
             assert home in homes, f"{home} holds {path.name} and is no package"
             patterns = distribution.package_data.get(homes[home], [])
             assert path.suffix == ".py" or any(path.match(pattern) for pattern in patterns), path

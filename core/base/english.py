@@ -105,7 +105,7 @@ def meant(word: object, known: Iterable[str], most: int = 3) -> str:
         ` (is X meant?)` with the names near to the word, or an empty text.
     """
     names = {name.lower(): name for name in sorted(known)}
-    near = difflib.get_close_matches(str(word).lower(), names, n=most, cutoff=0.7)
+    near = difflib.get_close_matches(str(word).lower(), names, n=most, cutoff=0.65 if most == 1 else 0.7)
     return f" (is {' or '.join(names[n] for n in near)} meant?)" if near else ""
 
 

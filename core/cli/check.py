@@ -6,20 +6,18 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cli.command import (
     ALARM,
     BAD_INPUT,
     DONE,
     SILENT,
     Command,
-    complain,
     load_model,
     print_json,
     print_notes,
     print_summary,
 )
-from uncertain_lti.cli.deployed import add_rule_arguments, check_recording, deployed_monitor
+from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, complain_of_unchecked, deployed_monitor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,15 +76,12 @@ def run(options: argparse.Namespace) -> int:
     results = []
     refused: list[dict[str, str]] = []
     for bag, copy in zip(bags, copies, strict=True):
-        try:
-            reading = options.progress.iterate("reading")
-            verdicts, decisions = check_recording(deployed, bag, reading)
-        except (BagError, SignalError) as error:
-            if len(bags) == 1:
-                raise
-            refused.append({"recording": str(bag.path), "error": str(error)})
-            complain("check", str(error))
+        reading = options.progress.iterate("reading")
+        found = check_or_complain("check", deployed, bag, len(bags) > 1, reading)
+        if isinstance(found, str):
+            refused.append({"recording": str(bag.path), "error": found})
             continue
+        verdicts, decisions = found
         print_notes(options, verdicts.transient.notes)
         data = check_data(model, verdicts, samples=options.json)
         results.append(data)
@@ -101,8 +96,7 @@ def run(options: argparse.Namespace) -> int:
                 f"{plural(made.messages, 'message')} and the verdicts below {made.topics} written to {made.path}",
             )
     status = ALARM if any(r["alarm"] for r in results) else BAD_INPUT if refused else DONE
-    if refused:
-        complain("check", f"{len(refused)} of {plural(len(bags), 'recording')} not checked, as said above")
+    complain_of_unchecked("check", len(refused), len(bags))
     if options.json:
         of_all = "unknown" if refused and status != ALARM else outcome(results)
         ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}

@@ -1,9 +1,12 @@
-"""Options of `check` and `report` that say how the monitor is deployed, and the check that takes them."""
+"""Options of `check`, `report` and `plot` that say how the monitor is deployed, and the check that takes them."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.cli.command import complain
 
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
@@ -120,3 +123,58 @@ def check_recording(
         return deployed.check(transient), decisions
     heard = read_field(recording, signals, decisions, condition.topic, condition.field)
     return deployed.check(transient, *heard), decisions
+
+
+def check_or_complain(
+    command: str, deployed: DeployedMonitor, recording: Recording, several: bool, progress: Progress | None = None
+) -> tuple[Verdicts, Decisions] | str:
+    """Read and judge one recording; of several, one that cannot be checked keeps none of the others from it.
+
+    Parameters
+    ----------
+    command : str
+        Name of the command, for the error.
+    deployed : DeployedMonitor
+        Of `deployed_monitor`.
+    recording : Recording
+        The recording.
+    several : bool
+        Whether there are others.
+    progress : Progress, optional
+        As in `read_transients`.
+
+    Returns
+    -------
+    (Verdicts, Decisions) or str
+        As of `check_recording`; or why it was not checked, which was printed.
+
+    Raises
+    ------
+    UncertainLTIError
+        As of `check_recording`, if there are no others.
+    """
+    from uncertain_lti.base.errors import BagError, SignalError
+
+    try:
+        return check_recording(deployed, recording, progress)
+    except (BagError, SignalError) as error:
+        if not several:
+            raise
+        complain(command, str(error))
+        return str(error)
+
+
+def complain_of_unchecked(command: str, unchecked: int, recordings: int) -> None:
+    """Say how many recordings were not checked, if any.
+
+    Parameters
+    ----------
+    command : str
+        Name of the command.
+    unchecked : int
+        Recordings that were not checked.
+    recordings : int
+        All recordings.
+    """
+    if unchecked:
+        complain(command, f"{unchecked} of {plural(recordings, 'recording')} not checked, as said above")

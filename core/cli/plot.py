@@ -8,8 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import BagError, ModelError
-from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, print_json, print_notes, print_summary
-from uncertain_lti.cli.deployed import add_rule_arguments, check_recording, deployed_monitor
+from uncertain_lti.cli.command import (
+    ALARM,
+    BAD_INPUT,
+    DONE,
+    SILENT,
+    Command,
+    load_model,
+    print_json,
+    print_notes,
+    print_summary,
+)
+from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, complain_of_unchecked, deployed_monitor
 
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
@@ -54,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
     Returns
     -------
     int
-        Exit status: 1 if recordings were checked and the alarm was raised, else 0.
+        Exit status: 1 if recordings were checked and the alarm was raised, else 2 if one could not be checked, else 0.
 
     Raises
     ------
@@ -72,19 +82,20 @@ def run(options: argparse.Namespace) -> int:
         raise ModelError(f"--signals {options.signals}: the model has its signals; leave the option out")
     bags = group_recordings(paths, layout=None if model is None else model.signals.table) if paths else []
     output = _target(options.output or ("plot.html" if bags else "plot.png"), options.what[0] if named else "", bags)
-    alarm = False
+    status = DONE
     if model is not None and not bags:
         _image(_model_figure(model), output)
     elif model is not None:
-        alarm = _plot_check(options, model, bags, output)
+        status = _plot_check(options, model, bags, output)
     else:
         if output.suffix != ".html":
             raise BagError(f"{output}: recordings without a model are drawn as a page; end the name in .html")
         _write(f"Recorded: {_listed(bags)}", _plot_bags(options, bags), output)
     print_summary(options, f"plot written to {output}")
     if options.json:
-        print_json({"plot": str(output), "recordings": [str(bag.path) for bag in bags], "alarm": alarm})
-    return ALARM if alarm else DONE
+        recordings = [str(bag.path) for bag in bags]
+        print_json({"plot": str(output), "recordings": recordings, "alarm": status == ALARM, "exit_status": status})
+    return status
 
 
 def _names_model(path: str) -> bool:
@@ -118,17 +129,21 @@ def _model_figure(model: UncertainLTI) -> Any:
     return matrices_figure(model)
 
 
-def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Recording], output: Path) -> bool:
-    """Plot recordings that are checked; whether the alarm was raised."""
+def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Recording], output: Path) -> int:
+    """Plot recordings that are checked; the exit status."""
     from uncertain_lti.reports.interactive import plotted_check
 
     page = output.suffix == ".html"
     if not page and len(bags) > 1:
         raise BagError(f"{output}: an image shows one recording; name one, or end the name in .html")
     deployed = deployed_monitor(options, model)
-    plotted, alarm = [], False
+    plotted, alarm, checked = [], False, 0
     for bag in bags:
-        verdicts, _ = check_recording(deployed, bag, options.progress.iterate("reading"))
+        found = check_or_complain("plot", deployed, bag, len(bags) > 1, options.progress.iterate("reading"))
+        if isinstance(found, str):
+            continue
+        verdicts, _ = found
+        checked += 1
         print_notes(options, verdicts.transient.notes)
         alarm |= bool(verdicts.alarm.any())
         if page:
@@ -137,10 +152,13 @@ def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Rec
             from uncertain_lti.reports.figures import envelope_figure
 
             _image(envelope_figure(model, verdicts), output)
+    complain_of_unchecked("plot", len(bags) - checked, len(bags))
+    if not checked:
+        raise BagError("no recording could be checked, so nothing is drawn; name one that has the topics of the model")
     if page:
         name = os.path.basename(options.what[0])
         _write(f"{name}: {_listed(bags)}", plotted, output)
-    return alarm
+    return ALARM if alarm else BAD_INPUT if checked < len(bags) else DONE
 
 
 def _plot_bags(options: argparse.Namespace, bags: list[Recording]) -> list[PlottedRecording]:

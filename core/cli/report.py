@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import argparse
 
-from uncertain_lti.cli.command import ALARM, DONE, SILENT, Command, load_model, print_json, print_notes, print_summary
-from uncertain_lti.cli.deployed import add_rule_arguments, check_recording, deployed_monitor
+from uncertain_lti.cli.command import (
+    ALARM,
+    BAD_INPUT,
+    DONE,
+    SILENT,
+    Command,
+    load_model,
+    print_json,
+    print_notes,
+    print_summary,
+)
+from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, complain_of_unchecked, deployed_monitor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     Returns
     -------
     int
-        Exit status: 1 if the alarm was raised, else 0.
+        Exit status: 1 if the alarm was raised, else 2 if a recording could not be checked, else 0.
 
     Raises
     ------
@@ -53,10 +63,18 @@ def run(options: argparse.Namespace) -> int:
     output = page_target(options.output or (None if options.json else "report.html"), options.model, bags)
     deployed = deployed_monitor(options, model)
     checked = []
+    refused: list[dict[str, str]] = []
     for bag in bags:
-        verdicts, _ = check_recording(deployed, bag, options.progress.iterate("reading"))
+        found = check_or_complain("report", deployed, bag, len(bags) > 1, options.progress.iterate("reading"))
+        if isinstance(found, str):
+            refused.append({"recording": str(bag.path), "error": found})
+            continue
+        verdicts, _ = found
         print_notes(options, verdicts.transient.notes)
         checked.append(verdicts)
+    complain_of_unchecked("report", len(refused), len(bags))
+    if not checked:
+        return BAD_INPUT
     facts = findings(model, options.model, checked, deployed.monitor.rule, deployed.words())
     print_summary(options, findings_text(facts))
     if output is not None:
@@ -66,8 +84,8 @@ def run(options: argparse.Namespace) -> int:
         write_page(output, html_report(model, checked, facts, options.progress.iterate("drawing", "sections")))
         print_summary(options, f"report written to {output}")
     if options.json:
-        print_json(facts)
-    return ALARM if facts["alarm"] else DONE
+        print_json({**facts, "not_checked": refused})
+    return ALARM if facts["alarm"] else BAD_INPUT if refused else DONE
 
 
 COMMAND = Command(
