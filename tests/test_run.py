@@ -226,6 +226,23 @@ def test_a_start_from_the_environment_itself_does_not_use_what_it_removes(run, s
     assert (checkout / ".venv/bin/python").resolve().exists() and (checkout / ".venv/bin/pip").exists()
 
 
+def test_a_start_from_the_environment_itself_does_not_make_it_again(run, slow, tmp_path):
+    """The interpreter that made it was a link; that of .venv names what the link leads to."""
+    pytest.importorskip("ensurepip", reason="this Python cannot make virtual environments")
+    environment, link = tmp_path / "a checkout" / ".venv", tmp_path / "link" / "python3"
+    link.parent.mkdir()
+    link.symlink_to(Path(sys.executable).resolve())
+    outside = slow.replace(this_python(), f'exec "{link}" "$@"')
+    assert "ready" in run("setup", programs={"python3": outside}).stdout
+    made_from = (environment / "made-from").read_text()
+    shutil.rmtree(environment)
+    subprocess.run([link, "-m", "venv", "--without-pip", environment], check=True)
+    (environment / "made-from").write_text(made_from)
+    done = run("setup", programs={"python3": f'exec "{environment}/bin/python3" "$@"'})
+    assert done.returncode == 0 and "ready" in done.stdout and "installing" not in done.stdout, done
+    assert (tmp_path / "made").read_text() == "x"
+
+
 def test_ctrl_c_while_installing_is_one_sentence_and_130(run, slow, tmp_path):
     for name, text in {"python3": slow}.items():
         (tmp_path / "bin" / name).write_text(f"#!{tmp_path / 'bin'}/bash\n{text}\n")
