@@ -35,7 +35,7 @@ SIGNALS = SignalMap(
 
 
 def runs(samples):
-    """States (bags, samples, 5) and controls (bags, samples, 4) of the published matrices, drawn anew at each step."""
+    """States (bags, samples, 5) and controls (bags, samples, 4) of the published matrices, drawn at each step."""
     rng = np.random.default_rng(0)
     plant = leibov2006()
     nominal, spread = np.hstack([plant.A, plant.B]), np.hstack([plant.dA, plant.dB])

@@ -1,7 +1,7 @@
 """Bags into arrays, side by side with rosbags and mcap-ros2-support (pip install mcap-ros2-support) in one run.
 
 python benchmarks/bag_to_arrays.py most      # a million messages, nearly all of the bag wanted, against both peers
-python benchmarks/bag_to_arrays.py images    # one small topic beside large images
+python benchmarks/bag_to_arrays.py images    # one small topic among large images
 python benchmarks/bag_to_arrays.py eighth    # one topic of eight
 python benchmarks/bag_to_arrays.py memory    # peak memory of a process of its own, by size of the bag
 python benchmarks/bag_to_arrays.py samples   # the whole way to samples (t, x, u), against message by message
@@ -146,7 +146,7 @@ def most(folder, scale, share):
 
 
 def images(folder, scale, share):
-    """One small topic beside large images: chunks are decompressed for it whole."""
+    """One small topic among large images: chunks are decompressed for it whole."""
     number = max(int(1200 * scale), 40)
     wanted = {"/imu": PATHS["/imu"]}
     rows = []
@@ -159,7 +159,7 @@ def images(folder, scale, share):
             write_messages(path, topics, mixed(bundled, pictures(number, 2)), compression)
         rows.append(where_it_goes(path, wanted, 10 * number, share, [compression]))
         keep_or_drop(folder, path)
-    table(f"{10 * number} Imu messages beside {number} images of 640 x 480", ["compression", *WHERE], rows)
+    table(f"{10 * number} Imu messages among {number} images of 640 x 480", ["compression", *WHERE], rows)
 
 
 def mixed(bundled, shown):

@@ -1,4 +1,4 @@
-"""Our fits beside their peers, on the same data in one run: widths, coverage of fresh recordings, time.
+"""Our fits compared with their peers, on the same data in one run: widths, coverage of fresh recordings, time.
 
     ./run python benchmarks/comparison.py [--quick] [--only WORDS] [--peers PYTHON] [--write docs/validation.md]
 

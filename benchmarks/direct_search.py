@@ -1,4 +1,4 @@
-"""The paper's solver (direct search, golden-section line searches) beside the exact one: objective of (10) and time.
+"""The paper's solver (direct search, golden-section line searches) and the exact one: objective of (10) and time.
 
 ./run python benchmarks/direct_search.py
 """

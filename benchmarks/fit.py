@@ -41,7 +41,7 @@ DT = 0.025
 
 
 def drawn(N, seed=0, noise=0.0, model=None):
-    """N independent transitions of matrices drawn anew inside their intervals at each step: (x, u, x_next)."""
+    """N independent transitions of matrices drawn inside their intervals at each step: (x, u, x_next)."""
     rng = np.random.default_rng(seed)
     model = model or leibov2006()
     x, u = rng.uniform(-1, 1, (N, model.n)), rng.uniform(-1, 1, (N, model.m))
@@ -133,7 +133,7 @@ def million(scale):
 
 
 def recorded(N, seed=0, schedule=None):
-    """A recording of the published matrices, drawn anew inside their intervals at each step.
+    """A recording of the published matrices, drawn inside their intervals at each step.
 
     With a schedule on a control they are weaker at one end of it than at the other, and the state at rest moves.
     """

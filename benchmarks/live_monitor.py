@@ -1,4 +1,4 @@
-"""The live monitor beside a bare rclpy node on the same topics: CPU per sample, time to the flag, losses, memory.
+"""The live monitor and a bare rclpy node on the same topics: CPU per sample, time to the flag, losses, memory.
 
     ./run python benchmarks/live_monitor.py                        # the table: rates 500 Hz and 1 kHz, n = 5 and 50
     ./run python benchmarks/live_monitor.py --left 0.003           # the same, three in a thousand samples out of bounds
@@ -174,7 +174,7 @@ def relay(n: int, names: list[str]) -> None:
 
 
 def bare_delay(executor: str) -> None:
-    """As `take`, with a look at the clock in each callback, which is not part of what costs are held against."""
+    """As `take`, with a look at the clock in each callback, which is not part of what costs are compared with."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.experimental import EventsExecutor

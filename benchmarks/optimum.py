@@ -61,7 +61,7 @@ def case(seed: int) -> Case:
     A = -np.diag(rng.uniform(0.5, 8, n)) + rng.uniform(-1, 1, (n, n))
     B = rng.uniform(-3, 3, (n, m))
     u = np.repeat(rng.uniform(-1, 1, (count // 12 + 1, m)), 12, axis=0)[: count + 1]
-    if m == 0 or rng.random() < 0.2:  # nothing but the controls moves it, so it is drawn anew now and then
+    if m == 0 or rng.random() < 0.2:  # nothing but the controls moves it, so it is drawn again now and then
         restart = 25
     else:
         restart = 0

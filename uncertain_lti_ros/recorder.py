@@ -141,7 +141,7 @@ def _record(life: Life, subscriptions: list[MatchedSubscription], file: _File, d
 
 
 class _File:
-    """MCAP file that bears its name only once it is whole."""
+    """MCAP file that gets its name only once it is whole."""
 
     def __init__(self, path: Path, notes: dict[str, str]) -> None:
         self.path, self._notes = path, notes

@@ -1,4 +1,4 @@
-"""Files that bear their name only once they are whole, and what a file is by its first bytes."""
+"""Files that get their name only once they are whole, and what a file is by its first bytes."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
 
 
 def target(output: str | os.PathLike[str], *, holds: bytes, kind: str, example: str) -> Path:
-    """Where a file of a kind goes, that holds such words (`may_replace`); an older one gives way, and nothing else.
+    """Where a file of a kind goes, that holds such words (`may_replace`); an older one is replaced, and nothing else.
 
     Parameters
     ----------

@@ -235,7 +235,7 @@ class Columns:
         """For an `additive` option.
 
         With a constant Δt, Δt·dc + v is one number: v takes it and dc is 0, because v is the one that still
-        holds when another recording has another Δt. With a schedule c is unknown beside every
+        holds when another recording has another Δt. With a schedule c is unknown together with every
         additive term: it carries the steady state from knot to knot. Without such a term c is 0, as at rest its
         rounding would have no half-width to lie in.
 

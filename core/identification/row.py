@@ -43,7 +43,7 @@ of the squared widths. Whether it was is seen from the optimum of δ alone, at t
 """
 NEAR = 2e-6
 """Distance from the optimum of (11), relative, up to which a row with many blocks is left as it is if a smaller weight
-leads to no answer: to break the ties of so many unknowns among the exact optima takes minutes."""
+leads to no answer: to break the ties of that many unknowns among the exact optima takes minutes."""
 LEAST_REGULARISATION = 1e-9
 """Weight below which it is left to the simplex method and to a programme of the ties of their own."""
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre

@@ -28,7 +28,7 @@ _VECTORS = tuple(name for name in ARRAYS if SHAPES[name].regressor == "1")
 def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot: int | None = None) -> Any:
     """The nominal model as a `control.StateSpace`; its outputs are the states.
 
-    Half-widths have no place there: keep the model beside it. A drift c becomes a last input called `drift`, to be
+    Half-widths have no place there: keep the model as well. A drift c becomes a last input called `drift`, to be
     held at 1. Of a scheduled model there is one system per block, each for deviations from the one operating point, all
     with the same inputs; between the knots `model.at(...)` is a model without a schedule, with a system of its own.
 
@@ -53,7 +53,7 @@ def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot
     Raises
     ------
     ModelError
-        dt is not a positive number, a control is called `drift` beside a drift, or there is no such block.
+        dt is not a positive number, a control is called `drift` and there is a drift, or there is no such block.
     """
     if dt is not None and not (math.isfinite(dt) and dt > 0):
         raise ModelError(f"dt is {dt}; it must be a positive number of seconds, or left out")
@@ -225,7 +225,7 @@ def _cells(values: Sequence[Any]) -> NDArray[np.object_]:
 
 
 def _schedule_variables(model: Any) -> dict[str, Any]:
-    """Variables of a scheduled model beside its arrays."""
+    """Variables of a scheduled model other than its arrays."""
     point, schedule = model.operating_point, model.schedule
     values = schedule.recorded_values(model.signals.signals)
     facts = model.block_data

@@ -838,7 +838,7 @@ class UncertainLTI:
     def discrepancy(self, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
         """Discrepancies (4) and (5) between the free-running nominal model and a recorded transient.
 
-        The run starts anew from the recorded sample at the start of every segment, and after every sample that
+        The run starts again from the recorded sample at the start of every segment, and after every sample that
         is not finite.
 
         Parameters

@@ -37,7 +37,7 @@ class Candidate:
     unit : str, default ""
         Of the signal; empty where it is unknown.
     reason : str, default ""
-        Why it is not proposed; empty where it is, or nothing speaks against it.
+        Why it is not proposed; empty if it is, or if there is no reason against it.
     ready : str, default ""
         `state` or `control` for one that a person may well want back; empty for others.
     steady : float, default 0.0
@@ -150,5 +150,5 @@ class Source:
 
     @property
     def free(self) -> list[Candidate]:
-        """Candidates that nothing speaks against."""
+        """Candidates without a reason against them."""
         return [c for c in self.candidates if not c.reason]

@@ -120,7 +120,7 @@ def _not_carried(choice: Choice) -> str:
 
 
 def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:
-    """Pieces of each recording, evenly spread, so that about so many transitions are left in all.
+    """Pieces of each recording, evenly spread, so that about this many transitions are left in total.
 
     Parameters
     ----------

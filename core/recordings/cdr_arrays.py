@@ -86,7 +86,7 @@ class _Segment:
     The anchor is where the segment before ends, brought to a multiple of align; begin is where it stands in the
     message the layout is made from (all places count from behind the encapsulation); bytes `at` to `at + len` have
     to agree with it in the bits of the mask. tail says what follows: a string (_TEXT) whose length stands in the
-    last four bytes, or a sequence of so many bytes an element (its count stands there), or nothing (0).
+    last four bytes, or a sequence with this many bytes per element (its count is there), or nothing (0).
     """
 
     align: int

@@ -147,7 +147,7 @@ def annotate(
     decisions : Decisions
         Of the same reading (`reading.read_as_fitted_with_decisions`).
     output : path
-        MCAP file to write; it bears this name once it is whole.
+        MCAP file to write; it gets this name once it is whole.
     model : UncertainLTI
         What was checked with, for the record.
     model_file : path, default ""

@@ -46,7 +46,7 @@ def new_figure(width: float, height: float) -> Any:
 
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
-    # Where a notebook is not told to draw with matplotlib, it asks an object itself.
+    # A notebook that has no matplotlib backend asks the object itself.
     figure._repr_png_ = MethodType(_png, figure)  # type: ignore[attr-defined]
     return figure
 

@@ -581,7 +581,7 @@ def _figure(figure: Any, caption: str, shows: str = "") -> str:
     """
     image = plots.pixels(figure, _DPI * _DENSITY)
     height, width, _ = image.shape
-    # 256 colours, none of them far from one drawn (median cut turns a scale grey beside much white): half the bytes
+    # 256 colours, none far from one drawn, at half the bytes. Median cut turns colour scales grey in a white image.
     coloured = Image.fromarray(image).quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     edges = [0, *between_rows(figure, image), height]
     strips = []

@@ -275,7 +275,7 @@ def _asset(name: str) -> str:
 
 
 def _stretches(recordings: int, numbers: int) -> int:
-    """Stretches of one recording with so many numbers in each."""
+    """Stretches of one recording that has this many numbers in each."""
     return max(MOST_NUMBERS // (max(recordings, 1) * max(numbers, 1)), _FEWEST)
 
 

@@ -15,7 +15,7 @@ IMAGES = {".png": b"\x89PNG", ".svg": b"<svg", ".pdf": b"%PDF"}
 
 
 def page_target(output: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Recording]) -> Path | None:
-    """Where the page goes; an older page gives way, a recording or the model never.
+    """Where the page goes; an older page is replaced, a recording or the model never.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def page_target(output: str | os.PathLike[str] | None, model_file: str, bags: Se
 
 
 def image_target(output: str | os.PathLike[str], model_file: str, bags: Sequence[Recording]) -> Path:
-    """Where an image goes; an older one of the same format gives way, a recording or the model never.
+    """Where an image goes; an older one of the same format is replaced, a recording or the model never.
 
     Parameters
     ----------

@@ -180,7 +180,7 @@ def _instant(t_ns: int) -> str:
 def likely_groups(transients: Sequence[Transient]) -> str:
     """A sentence if recordings seem to come in groups, by the folders and the hours they are from; else "".
 
-    Recordings that overlap in time (simulated ones, mostly) cannot be told apart by their hours.
+    Recordings that overlap in time (simulated ones, mostly) cannot be distinguished by their hours.
 
     Parameters
     ----------
