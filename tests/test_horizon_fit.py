@@ -12,8 +12,8 @@ from scipy.optimize import linprog
 from uncertain_lti import EnvelopeMonitor, Transient
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification import fit
-from uncertain_lti.identification.horizons import fit_horizons
-from uncertain_lti.identification.problem import assemble
+from uncertain_lti.identification.horizons import better_run, fit_horizons, run_of
+from uncertain_lti.identification.problem import Regimes, assemble
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.reports.check_data import check_data
@@ -74,13 +74,13 @@ def test_every_window_is_inside_by_the_arithmetic_of_the_verdict(criterion: Any,
 
 
 def windows_naively(model: UncertainLTI, transients: list[Transient], steps: int) -> tuple[Any, Any]:
-    """Regressors [x_k; ū; 1] and what is left of the state after the run of the model."""
-    phi, left = [], []
+    """Regressors [x_k; ū; 1] and what is left of the state after the run."""
+    phi, left, run = [], [], model.run or model
     for t in transients:
         for k in range(len(t) - steps):
             x = t.x[k].copy()
             for j in range(steps):
-                x = x + t.dt[k + j] * (model.A @ x + model.B @ t.u[k + j] + model.c)
+                x = x + t.dt[k + j] * (run.A @ x + run.B @ t.u[k + j] + run.c)
             phi.append([*t.x[k], t.u[k : k + steps].mean(), 1.0])
             left.append(t.x[k + steps] - x)
     return np.array(phi), np.array(left)
@@ -107,6 +107,39 @@ def test_the_largest_width_is_that_of_the_programme_as_written(widths: Any) -> N
         )  # fmt: skip
         found = model.fit_summary["horizons"][0]["max_width"][i]
         assert found == pytest.approx(2.0 * answer.x[-1], rel=1e-6)
+
+
+@pytest.mark.parametrize(("additive", "drift"), [("noise", False), ("both", True)])
+@pytest.mark.parametrize("knots", [None, (-0.5, 0.5)])
+def test_what_is_run_are_the_least_squares_of_the_elements_that_the_model_has(
+    additive: Any, drift: bool, knots: Any
+) -> None:
+    transients = runs()
+    model = fit(transients, additive=additive, schedule={"x1": knots} if knots else None, horizons=[3])
+    steps = [t.transitions() for t in transients]
+    x, u, dt, after = (np.concatenate([getattr(s, name) for s in steps]) for name in ("x", "u", "dt", "x_next"))
+    one = [np.ones((len(x), 1))] if drift or knots else []  # a regime has a steady state of its own
+    weights = [np.ones(len(x))] if not knots else model.schedule.weights(x[:, :1].T)
+    columns = np.hstack([w[:, None] * np.hstack([x, u, *one]) for w in weights]) * dt[:, None]
+    expected = np.linalg.lstsq(columns, after - x, rcond=None)[0].reshape(len(weights), -1, 2)
+    regimes = None if model.schedule is None else Regimes(model.schedule, (0,))
+    problem = assemble(transients, model.operating_point, None, additive, regimes=regimes)
+    run = run_of(problem)
+    found = np.concatenate([np.atleast_3d(run.A.T).T.reshape(len(weights), 2, 2), run.B.reshape(-1, 2, 1)], axis=2)
+    np.testing.assert_allclose(found, expected[:, :3].transpose(0, 2, 1), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(run.c.reshape(-1, 2), expected[:, 3] if one else 0.0 * run.c.reshape(-1, 2), atol=1e-8)
+
+
+def test_the_run_that_stays_nearer_to_the_recordings_is_taken() -> None:
+    transients = runs()
+    model = fit(transients, additive="noise", horizons=[20])
+    problem = assemble(transients, model.operating_point, None, "noise")
+    least_squares = run_of(problem)
+    worse = model.replace(A=model.A + 2.0 * np.eye(2), run=None)
+    taken = better_run(worse, problem, [20], None)
+    assert taken is not None and taken.A.tobytes() == least_squares.A.tobytes()
+    same = model.replace(A=least_squares.A, B=least_squares.B, c=least_squares.c, run=None)
+    assert better_run(same, problem, [20], None) is None
 
 
 def test_a_window_with_a_discarded_transition_is_left_out() -> None:
@@ -168,7 +201,7 @@ def test_horizons_without_windows_or_numbers_are_dropped_by_name() -> None:
     model = fit(transients, additive="noise", horizons=[4, 39])
     assert [h.steps for h in model.horizons] == [4]
     assert any("no horizon of 39 steps: 3 windows" in text for text in model.fit_summary["messages"])
-    away = model.replace(A=1e4 * np.eye(2))
+    away = model.replace(A=1e4 * np.eye(2), run=None)
     problem = assemble(runs(), model.operating_point, None, "noise")
     found, _, messages = fit_horizons(away, problem, [2, 140])
     assert [h.steps for h in found] == [2] and "'x1' beyond all numbers" in messages[0]

@@ -15,7 +15,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base import compiled
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.domain import Sampling
-from uncertain_lti.model.horizon import MOST_STEPS, Horizon
+from uncertain_lti.model.horizon import MOST_STEPS, Horizon, Run
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, SHAPES
 from uncertain_lti.sampling.sampler import Sampler, Step
@@ -39,6 +39,7 @@ def with_horizons(rng: np.random.Generator, steps: tuple[int, ...], schedule: Sc
         **{name: getattr(one, name) for name in ARRAYS},
         schedule=schedule,
         horizons=[horizon(rng, h, blocks) for h in steps],
+        run=Run(*(getattr(horizon(rng, 2, blocks), name) for name in "ABc")) if steps else None,
     )
 
 
@@ -52,6 +53,7 @@ def test_horizons_come_back_from_the_file_in_order(schedule: Schedule | None, tm
     for mine, theirs in zip(model.horizons, again.horizons, strict=True):
         assert all(getattr(mine, name).tobytes() == getattr(theirs, name).tobytes() for name in ARRAYS)
     assert "2, 4, 9 steps" in repr(again)
+    assert all(getattr(model.run, name).tobytes() == getattr(again.run, name).tobytes() for name in "ABc")
 
 
 def test_a_model_of_one_step_has_none_and_stays_in_its_format() -> None:
@@ -97,6 +99,22 @@ def test_a_negative_half_width_and_another_number_of_states_are_refused() -> Non
         model.replace(horizons=[horizon(rng, 3, n=3)])
     with pytest.raises(ModelError, match="do not fit the model"):
         model.replace(horizons=[horizon(rng, 3, blocks=2)])
+
+
+@pytest.mark.parametrize(
+    ("run", "words"),
+    [
+        ([], "'run' must be an object with 'blocks'"),
+        ({"blocks": []}, "a list of 1 block"),
+        ({"blocks": [{"A": [[1.0, 0.0], [0.0, 1.0]], "B": [[1.0], [1.0]]}]}, r"'run.blocks\[0\]' must be an object"),
+        ({"blocks": [{"A": [[1.0]], "B": [[1.0], [1.0]], "c": [0.0, 0.0]}]}, r"run.blocks\[0\].A"),
+        ({"blocks": [{"A": [[1.0, 0.0], [0.0, 1e400]], "B": [[1.0], [1.0]], "c": [0.0, 0.0]}]}, "not finite"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_by_name(run: Any, words: str) -> None:
+    data = with_horizons(np.random.default_rng(4), (2,)).to_dict() | {"run": run}
+    with pytest.raises(ModelError, match=words):
+        UncertainLTI.from_dict(data)
 
 
 def test_format_1_has_no_horizons() -> None:
@@ -145,6 +163,7 @@ def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
         signals=signals,
         sampling=Sampling("/c", time={"/c": "header"}, max_gap=0.05, dt_min=0.01, dt_max=0.015),
         horizons=[horizon(rng, h, blocks, n, m) for h in lengths],
+        run=draw(st.sampled_from([None, Run(*(getattr(horizon(rng, 2, blocks, n, m), name) for name in "ABc"))])),
     )
     sampler = Sampler(signals)
     pushed = [s for k in range(len(t)) for s in sampler.push("/c", int(t[k]), int(t[k]), z[k].tolist())]
@@ -229,7 +248,8 @@ def test_windows_are_those_of_the_rules_worked_out_naively(case: tuple[Uncertain
             x, total, mean = z[begin, :n].tolist(), 0.0, [0.0] * m
             for k in range(begin, end):
                 step = float(dt[k])
-                rows = np.hstack([blended(model, "A", k), blended(model, "B", k), blended(model, "c", k)[:, None]])
+                run = model.run or model
+                rows = np.hstack([blended(run, "A", k), blended(run, "B", k), blended(run, "c", k)[:, None]])
                 rate = summed(rows, [*x, *z[k, n : n + m].tolist(), 1.0])
                 x = [r * step + a for r, a in zip(rate, x, strict=True)]
                 total += step

@@ -17,7 +17,7 @@ from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.horizons import fit_horizons
+from uncertain_lti.identification.horizons import better_run, fit_horizons
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem, Regimes, assemble, median_step
@@ -222,12 +222,12 @@ def fit(
     model = model.replace(repeats=repeats_of(model, transients))
     if not horizons:
         return model.replace(fit_summary=facts)
-    found, facts["horizons"], dropped = fit_horizons(
-        model, problem, [int(h) for h in horizons], widths, criterion, progress
-    )
+    lengths = [int(h) for h in horizons]
+    model = model.replace(run=better_run(model, problem, lengths, structure))
+    found, facts["horizons"], dropped = fit_horizons(model, problem, lengths, widths, criterion, progress)
     if "messages" in facts or dropped:
         facts["messages"] = [*facts.get("messages", []), *dropped]
-    return model.replace(fit_summary=facts, horizons=found)
+    return model.replace(fit_summary=facts, horizons=found, run=model.run if found else None)
 
 
 def fit_fleet(

@@ -1,8 +1,8 @@
 """Envelopes over several steps: the same programmes, whose transitions are windows.
 
 A window of h transitions in a row gives one transition of step T from x_k with the mean control ū; the state at its end
-is counted from x̂, the run of the fitted model. What is unknown is linear again, so working set, proof and repair are
-those of one step.
+is counted from x̂, the run of the model or of the least squares of its elements. What is unknown is linear again, so
+working set, proof and repair are those of one step.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
@@ -22,11 +23,12 @@ from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.problem import Columns, Problem, Regimes
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
-from uncertain_lti.model.horizon import Horizon, Widths
+from uncertain_lti.model.horizon import Horizon, Run, Widths
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 _UNKNOWN = frozenset({"c", "v"})
+_COMPARED = 100_000  # transitions at most on which two runs are compared
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,83 @@ class _Envelope:
         self.horizon.columns_centre_and_half(z, dt, centre, half, base, self.schedule)
 
 
+def run_of(problem: Problem, structure: Structure | None = None) -> Run:
+    """The least squares of the elements of a model, one step ahead: what is run over the windows.
+
+    Parameters
+    ----------
+    problem : Problem
+        The transitions.
+    structure : Structure, optional
+        As in `fit`; an element beyond its bounds is put onto them.
+
+    Returns
+    -------
+    Run
+        With one block for each of the schedule.
+    """
+    engine = WorkingSet(Fleet.of(problem), structure)
+    for row in engine.rows:
+        row.start()
+    n, p, columns = problem.n, problem.p, problem.columns
+    theta = np.column_stack([row.theta for row in engine.rows]).reshape(columns.count, -1, n)
+    names = [term.nominal for term in columns.nominal]
+    drift = theta[:, p + names.index("c")] if "c" in names else np.zeros((columns.count, n))
+    found = theta[:, :n].transpose(0, 2, 1), theta[:, n:p].transpose(0, 2, 1), drift
+    return Run(*(found if columns.regimes is not None else (values[0] for values in found)))
+
+
+def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None) -> Run | None:
+    """What is to be run over the windows: least squares where their run stays nearer to the recordings.
+
+    Compared is the largest distance of a window's end from the run with a linear correction, which is what widths are
+    made of: its geometric mean over horizons and states. Of many transitions, pieces of the recordings are looked at.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Fitted to the transitions.
+    problem : Problem
+        The transitions.
+    steps : sequence of int
+        Lengths of the horizons.
+    structure : Structure or None
+        As in `fit`.
+
+    Returns
+    -------
+    Run or None
+        None where the nominal model stays nearer.
+    """
+    lengths = sorted(set(steps))
+    k, signals, dt, after = *_in_order(problem), problem.dt, problem.next_columns
+    piece = max(20 * lengths[-1], 1000)
+    if len(dt) > _COMPARED:
+        starts = np.linspace(0, len(dt) - piece, max(_COMPARED // piece, 1)).astype(np.intp)
+        some = np.unique((starts[:, None] + np.arange(piece)).ravel())
+        k, signals, dt, after = k[some], signals[:, some], dt[some], after[:, some]
+
+    def distance(which: UncertainLTI) -> float:
+        logs = []
+        for windows in which.windows(k, signals, dt, lengths):
+            left = (after[:, windows.last] - windows.run).T
+            if not np.isfinite(left).all():
+                return np.inf
+            phi = np.vstack([windows.z[: problem.p], np.ones(len(left))]).T
+            left = left - phi @ np.linalg.lstsq(phi, left, rcond=None)[0]
+            logs.append(np.log(np.maximum(np.abs(left).max(axis=0, initial=0.0), 1e-300)))
+        return float(np.mean(logs)) if logs else 0.0
+
+    run = run_of(problem, structure)
+    return run if distance(model.replace(run=run)) < distance(model) else None
+
+
+def _in_order(problem: Problem) -> tuple[NDArray[np.intp], Array]:
+    """Numbers of the samples, with those of another recording never following, and [x; u; s], one column for each."""
+    signals = problem.z_columns if problem.s_columns is None else np.vstack([problem.z_columns, problem.s_columns])
+    return problem.k + problem.source * (int(problem.k.max(initial=0)) + 2), signals
+
+
 def fit_horizons(
     model: UncertainLTI,
     problem: Problem,
@@ -62,7 +141,7 @@ def fit_horizons(
     Parameters
     ----------
     model : UncertainLTI
-        Fitted to the transitions.
+        Fitted to the transitions, with what is run over the windows (`better_run`).
     problem : Problem
         The transitions; a window ends where one is missing, also by being discarded.
     steps : sequence of int
@@ -91,8 +170,7 @@ def fit_horizons(
     found: list[Horizon] = []
     facts: list[dict[str, Any]] = []
     messages: list[str] = []
-    signals = problem.z_columns if problem.s_columns is None else np.vstack([problem.z_columns, problem.s_columns])
-    k = problem.k + problem.source * (int(problem.k.max(initial=0)) + 2)  # two recordings never follow each other
+    k, signals = _in_order(problem)
     n, p = problem.n, problem.p
     axes = 0 if model.schedule is None else len(model.schedule.axes)
     regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))

@@ -863,12 +863,23 @@ class Judge:
         for corner in range(corners):
             if weights[corner] > 0.0 and not self._known[places[corner]]:
                 unknown = 1
-        size = self.n * self.p
+        self._sum_blocks(corners)
+        return unknown
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _sum_blocks(self, corners: cython.Py_ssize_t) -> cython.void:
+        """Elements of the blocks in `_places` with their weights, into `_theta`, `_delta` and `_v`."""
+        corner: cython.Py_ssize_t
+        size: cython.Py_ssize_t = self.n * self.p
+        places: cython.longlong[::1] = self._places
+        weights: cython.double[::1] = self._weights
         for corner in range(corners):
             self._add(self._theta, self._all_theta, size, corner, places[corner] * size, weights[corner])
             self._add(self._delta, self._all_delta, size, corner, places[corner] * size, weights[corner])
             self._add(self._v, self._all_v, self.n, corner, places[corner] * self.n, weights[corner])
-        return unknown
 
     @cython.cfunc
     @cython.boundscheck(False)
@@ -1103,7 +1114,7 @@ class Judge:
 
 @cython.cclass
 class Runs:
-    """Runs of the nominal model, one from each measured state, and what the horizons say of the states they lead to.
+    """Runs, one from each measured state, and what the horizons say of the states they lead to.
 
     Parameters
     ----------
@@ -1111,6 +1122,8 @@ class Runs:
         Of the model.
     horizons : sequence of Horizon
         Envelopes after a number of steps, the shortest first; at least one.
+    runner : Judge, optional
+        Of the elements that are run, with the same signals and schedule; default the nominal ones of the model.
 
     Attributes
     ----------
@@ -1120,11 +1133,12 @@ class Runs:
     Raises
     ------
     ValueError
-        The horizons do not fit the model, or are not in order.
+        The horizons or the runner do not fit the model, or the horizons are not in order.
     """
 
     count = cython.declare(cython.Py_ssize_t, visibility="readonly")
     _judge = cython.declare(Judge)
+    _runner = cython.declare(Judge)
     _longest: cython.Py_ssize_t
     _under_way: cython.Py_ssize_t  # runs, in the first places
     _newest: cython.Py_ssize_t
@@ -1147,9 +1161,13 @@ class Runs:
     _mean: cython.double[::1]
     _blank = cython.declare(object)
 
-    def __init__(self, judge: Judge, horizons: Sequence[Any]) -> None:
+    def __init__(self, judge: Judge, horizons: Sequence[Any], runner: Judge | None = None) -> None:
         n, m = judge.n, judge.size - judge.n
         self._judge, self.count = judge, len(horizons)
+        self._runner = judge if runner is None else runner
+        mine = self._runner.n, self._runner.size, self._runner.total, self._runner.p, self._runner.blocks
+        if mine != (judge.n, judge.size, judge.total, judge.p, judge.blocks):
+            raise ValueError("the runner does not fit the model")
         tables = [horizon.tables for horizon in horizons]
         lead = () if judge.blocks == 1 and tables[0][0].ndim == 2 else (judge.blocks,)
         steps = [horizon.steps for horizon in horizons]
@@ -1221,7 +1239,7 @@ class Runs:
         self._under_way = min(self._under_way + 1, self._longest)
         self._x[:, newest] = self._start[:, newest] = z[:n, 0]
         self._time[newest], self._control[:, newest], self._vectors[:, newest] = 0.0, 0.0, s
-        judge._advance_columns(self._x, self._time, self._control, z, dt)
+        self._runner._advance_columns(self._x, self._time, self._control, z, dt)
         found = np.full((self.count, n), np.nan)
         for values, steps, (theta, delta, v) in zip(found, self._steps, self._tables, strict=True):
             if steps > self._under_way:
@@ -1241,6 +1259,7 @@ class Runs:
     @cython.wraparound(False)
     def _one(self, after: Any, dt: cython.double) -> Any:
         judge: Judge = self._judge
+        runner: Judge = self._runner
         n: cython.Py_ssize_t = judge.n
         m: cython.Py_ssize_t = judge.size - n
         i: cython.Py_ssize_t
@@ -1278,7 +1297,15 @@ class Runs:
         for i in range(corners):
             self._places[4 * k + i] = judge._places[i]
             self._weights[4 * k + i] = judge._weights[i]
-        judge._advance(self._x, self._time, self._control, longest, 0, self._under_way, dt)
+        if runner is not judge:
+            for i in range(judge.size):
+                runner._phi[i] = judge._phi[i]
+            if judge._axes:
+                for i in range(corners):
+                    runner._places[i] = judge._places[i]
+                    runner._weights[i] = judge._weights[i]
+                runner._sum_blocks(corners)
+        runner._advance(self._x, self._time, self._control, longest, 0, self._under_way, dt)
         blank = array("d", self._blank)
         values: cython.double[::1] = blank
         for h in range(self.count):

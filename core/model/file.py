@@ -19,7 +19,7 @@ from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
-from uncertain_lti.model.horizon import Horizon
+from uncertain_lti.model.horizon import Horizon, Run
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
@@ -59,7 +59,7 @@ def structure(model: Any) -> dict[str, Any]:
     scheduled = model.schedule is not None
     one_rule = model.alarm == (model.alarm_rule,)
     newer = scheduled or model.domain.measure is not None or model.signals.table is not None or bool(model.horizons)
-    newer = newer or not one_rule or model.residuals is not None
+    newer = newer or not one_rule or model.residuals is not None or model.run is not None
     newer |= s.step is not None or any(g.memory or g.valid is not None or g.ignore for g in model.signals)
     newer = newer or model.repeats is not None or bool(model.signatures)
     regimes: dict[str, Any] = {}
@@ -91,6 +91,7 @@ def structure(model: Any) -> dict[str, Any]:
         | ({} if model.signals.table is None else {"table": model.signals.table.to_dict()}),
         **(regimes if scheduled else {name: getattr(model, name).tolist() for name in arrays}),
         **({"horizons": [horizon.to_dict() for horizon in model.horizons]} if model.horizons else {}),
+        **({} if model.run is None else {"run": model.run.to_dict()}),
         "domain": {
             name: [v if math.isfinite(v) else None for v in getattr(model.domain, name).tolist()]
             for name in ("x_min", "x_max", "u_min", "u_max")
@@ -151,7 +152,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     scheduled = data["format"] != FORMATS[0] and "schedule" in data
     known = {"format", "states", "controls", "sampling", "domain", "alarm", "fit", "validation"}
     known |= {"schedule", "scheduling", "blocks"} if scheduled else set(ARRAYS)
-    known |= {"horizons", "residuals", "frozen", "signatures"} if data["format"] != FORMATS[0] else set()
+    known |= {"horizons", "run", "residuals", "frozen", "signatures"} if data["format"] != FORMATS[0] else set()
     for name in ("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)):
         if name not in data:
             raise ModelError(f"field '{name}' is missing; fit the model again")
@@ -215,6 +216,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         **arrays,
         **regimes,
         "horizons": horizons,
+        "run": Run.from_dict(data["run"], n, m, blocks) if "run" in data else None,
         "signals": signals,
         "sampling": sampling,
         "domain": domain,

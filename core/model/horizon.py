@@ -1,7 +1,7 @@
 """Horizon: the envelope of the state several steps after a measured one.
 
-The nominal model is run from the measured x_k with the recorded controls over h steps to x̂; with T = Σ Δt_j and the
-mean control ū = Σ Δt_j u_j / T,
+A nominal model (`Run`) is run from the measured x_k with the recorded controls over h steps to x̂; with T = Σ Δt_j and
+the mean control ū = Σ Δt_j u_j / T,
 
     centre = x̂ + T (A' x_k + B' ū + c')
     half   = T (ΔA |x_k| + ΔB |ū| + Δc) + v
@@ -32,12 +32,13 @@ Widths = Literal["growing", "constant"]
 """Half-widths that grow with |x| and |u|, or are the same everywhere."""
 MOST_STEPS = 10_000
 """Steps of a horizon at most: so many runs are under way at a time."""
+_OF_RUN = ("A", "B", "c")
 _PRODUCTS = 65536  # per block: they stay in the cache
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Transitions in a row without a break, as many as a horizon has steps, and the nominal model run over them.
+    """Transitions in a row without a break, as many as a horizon has steps, and the run over them.
 
     Parameters
     ----------
@@ -63,6 +64,103 @@ class Windows:
     def last(self) -> NDArray[np.intp]:
         """Position of the last transition of each (K,): its arrival is what the envelope is compared with."""
         return self.start + (self.steps - 1)
+
+
+class Run:
+    """A linear model that is run over the windows of the horizons in place of the nominal one.
+
+    The centre of the narrowest envelope of one step may be unstable in a block whose ends few samples visit; over many
+    steps the least squares of the same elements often stay nearer to the machine.
+
+    Parameters
+    ----------
+    A : array (n, n), or (R, n, n) with a schedule, and so for those that follow
+        1/s.
+    B : array (n, m)
+        1/s.
+    c : array (n,)
+        Drift, 1/s.
+
+    Raises
+    ------
+    ModelError
+        Shapes do not fit one another, or a number is not finite.
+    """
+
+    def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike) -> None:
+        self.A: Array = checked(A, "run.A", None)
+        self.B: Array = checked(B, "run.B", None)
+        if self.A.ndim not in (2, 3) or self.A.shape[-1] != self.A.shape[-2] or not self.A.size:
+            raise ModelError(f"field 'run.A' has shape {self.A.shape}; it must be square, once for each block")
+        lead, n = self.A.shape[:-2], self.A.shape[-1]
+        if self.B.size == 0:
+            self.B = np.zeros((*lead, n, 0))
+        if self.B.shape[:-1] != (*lead, n):
+            raise ModelError(f"field 'run.B' has shape {self.B.shape}; it must have {plural(n, 'row')} in each block")
+        self.c: Array = checked(c, "run.c", (*lead, n))
+        for name in _OF_RUN:
+            getattr(self, name).flags.writeable = False
+
+    def __repr__(self) -> str:
+        return f"Run({plural(self.A.shape[-1], 'state')}; {plural(self.B.shape[-1], 'control')})"
+
+    @property
+    def tables(self) -> tuple[Array, Array, Array]:
+        """As `terms.tables`, with half-widths of 0."""
+        zeros = np.zeros_like(self.c)
+        still = {"dA": np.zeros_like(self.A), "dB": np.zeros_like(self.B), "dc": zeros, "v": zeros}
+        return tables({"A": self.A, "B": self.B, "c": self.c, **still})
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it is in a model file.
+
+        Returns
+        -------
+        dict
+            The arrays of each block.
+        """
+        arrays = {name: getattr(self, name) for name in _OF_RUN}
+        if self.A.ndim == 2:
+            arrays = {name: value[None] for name, value in arrays.items()}
+        return {
+            "blocks": [{name: value[r].tolist() for name, value in arrays.items()} for r in range(len(arrays["c"]))]
+        }
+
+    @classmethod
+    def from_dict(cls, data: Any, n: int, m: int, blocks: int | None) -> Run:
+        """From a model file.
+
+        Parameters
+        ----------
+        data : Any
+            What `to_dict` gives.
+        n : int
+            Number of states.
+        m : int
+            Number of controls.
+        blocks : int or None
+            Number of blocks of the schedule; None without one.
+
+        Returns
+        -------
+        Run
+            As listed.
+
+        Raises
+        ------
+        ModelError
+            It is not that; names the field.
+        """
+        parts = data.get("blocks") if isinstance(data, dict) and set(data) == {"blocks"} else None
+        if not isinstance(parts, list) or len(parts) != (blocks or 1):
+            raise ModelError(f"field 'run' must be an object with 'blocks', a list of {plural(blocks or 1, 'block')}")
+        arrays: dict[str, list[Array]] = {name: [] for name in _OF_RUN}
+        for r, part in enumerate(parts):
+            if not isinstance(part, dict) or set(part) != set(_OF_RUN):
+                raise ModelError(f"field 'run.blocks[{r}]' must be an object with {', '.join(_OF_RUN)}")
+            for name, values in arrays.items():
+                values.append(checked(part[name], f"run.blocks[{r}].{name}", SHAPES[name].shape(n, m)))
+        return cls(*(values[0] if blocks is None else np.stack(values) for values in arrays.values()))
 
 
 def unbroken_over(k: NDArray[np.intp], vectors: Array, schedule: Schedule | None) -> NDArray[np.int64]:
@@ -98,7 +196,7 @@ def windows_of(
     Parameters
     ----------
     judge : Judge
-        Of the model.
+        Of the elements that are run.
     z : array (n + m + q, N)
         Normalised [x; u; s] of the transitions, in order of time.
     vectors : array (axes, N)

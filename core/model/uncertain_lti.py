@@ -37,7 +37,7 @@ from uncertain_lti.model.bounds import (
 )
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
-from uncertain_lti.model.horizon import Horizon, Windows, checked_horizons, unbroken_over, windows_of
+from uncertain_lti.model.horizon import Horizon, Run, Windows, checked_horizons, unbroken_over, windows_of
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
@@ -86,6 +86,8 @@ class UncertainLTI:
         What the fit knows of each block; default nothing.
     horizons : sequence of Horizon, optional
         Envelopes over several steps; default none. The model has them sorted, the shortest first.
+    run : Run, optional
+        What is run over the windows of the horizons; default the nominal model.
     signals : SignalMap, optional
         Names, topics, operating point; default names x1, x2, ..., u1, u2, ... and values used as they are.
     sampling : Sampling, optional
@@ -126,6 +128,7 @@ class UncertainLTI:
         schedule: Schedule | None = None,
         block_data: Sequence[BlockData] | None = None,
         horizons: Sequence[Horizon] = (),
+        run: Run | None = None,
         signals: SignalMap | None = None,
         sampling: Sampling | None = None,
         domain: Domain | None = None,
@@ -165,6 +168,12 @@ class UncertainLTI:
         for name in ARRAYS:
             getattr(self, name).flags.writeable = False
         self.horizons = checked_horizons(horizons, self.A.shape, m)
+        self.run = run
+        if run is not None and (run.A.shape, run.B.shape) != (self.A.shape, self.B.shape):
+            raise ModelError(
+                f"run: A {run.A.shape} and B {run.B.shape} do not fit the model, whose A is {self.A.shape} and B "
+                f"{self.B.shape}"
+            )
         if signals is None:
             signals = SignalMap(
                 tuple(Signal(f"x{i + 1}", "", f"x{i + 1}") for i in range(n)),
@@ -598,9 +607,12 @@ class UncertainLTI:
         Judge
             With the same bits as `bounds`.
         """
+        return self._judge(self.tables, margin, counted)
+
+    def _judge(self, elements: tuple[Array, Array, Array], margin: float, counted: NDArray[np.bool_]) -> Judge:
         point, domain = self.operating_point, self.domain
         return Judge(
-            *self.tables,
+            *elements,
             point.steady,
             point.scale,
             domain.least,
@@ -612,6 +624,10 @@ class UncertainLTI:
             self._positions,
             [data.known for data in self.block_data],
         )
+
+    def _runner(self) -> Judge:
+        """Of the elements that are run over the windows of the horizons."""
+        return self._judge(self.tables if self.run is None else self.run.tables, 1.0, np.ones(self.n, dtype=bool))
 
     def runs_of(self, judge: Judge) -> Runs | None:
         """What judges the state several steps after each measured one.
@@ -626,10 +642,12 @@ class UncertainLTI:
         Runs or None
             With the same bits as `horizon_utilisation`; None without horizons.
         """
-        return Runs(judge, self.horizons) if self.horizons else None
+        if not self.horizons:
+            return None
+        return Runs(judge, self.horizons, None if self.run is None else self._runner())
 
     def windows(self, k: NDArray[np.intp], z: Array, dt: Array, steps: Sequence[int]) -> Iterator[Windows]:
-        """The nominal model run over so many transitions in a row.
+        """`run`, or the nominal model, taken over so many transitions in a row.
 
         Parameters
         ----------
@@ -647,7 +665,7 @@ class UncertainLTI:
         iterator of Windows
             Of each length; good until the next one is asked for.
         """
-        judge, vectors = self.judge_of(1.0, np.ones(self.n, dtype=bool)), z[self._positions]
+        judge, vectors = self._runner(), z[self._positions]
         begin = unbroken_over(k, vectors, self.schedule)
         return windows_of(judge, z, vectors, dt, begin, steps, self.n, self.m)
 
@@ -953,8 +971,8 @@ class UncertainLTI:
         arguments = {
             name: getattr(self, name)
             for name in (
-                *ARRAYS, "schedule", "block_data", "horizons", "signals", "sampling", "domain", "alarm", "residuals",
-                "repeats", "signatures", "fit_summary", "validation",
+                *ARRAYS, "schedule", "block_data", "horizons", "run", "signals", "sampling", "domain", "alarm",
+                "residuals", "repeats", "signatures", "fit_summary", "validation",
             )
         }  # fmt: skip
         if self.repeats is not None and not {*ARRAYS, "schedule"}.isdisjoint(changes):
