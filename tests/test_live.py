@@ -19,8 +19,8 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
+from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.envelope_monitor import Verdict
-from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.sampling.reading import read_as_fitted
@@ -39,6 +39,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64
 from std_srvs.srv import Trigger
 
+JUDGED = [output for output in outputs.JUDGED if output.of == "states"]  # the models here have no horizons
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 STATE, CONTROL = "/plant/state", "/plant/control"
 JOINT_STATE, VECTOR = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Vector3Stamped"
