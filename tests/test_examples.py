@@ -39,7 +39,7 @@ def test_bags_are_fitted_and_the_figure_is_an_image_where_it_was_asked_for(tmp_p
 
 def test_the_calibrated_rule_keeps_to_the_target_and_still_sees_the_fault(tmp_path):
     said = said_by("calibrate_alarm.py", tmp_path)
-    assert re.search(r"at most 1500 false alarms per hour with 90% confidence", said)
+    assert re.search(r"at most 600 false alarms per hour with 90% confidence", said)
     alarms = [(float(m), float(t)) for m, t in re.findall(r"margin (\S+): first alarm at (\S+) s", said)]
     assert len(alarms) == 2 and alarms[0][0] == 1.0 < alarms[1][0]
     assert 24.0 < alarms[0][1] <= alarms[1][1], "a wider envelope alarms no sooner"

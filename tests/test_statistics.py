@@ -37,8 +37,8 @@ def oracle(kind: str, T: float, dt: np.ndarray, rows: np.ndarray, allowance: flo
         found = []
         for u, step in zip(rows, dt, strict=True):
             e = e + (u - e) * step / (T + step)
-            up = np.maximum(0, up + (u - allowance) * step / T)
-            down = np.maximum(0, down + (-u - allowance) * step / T)
+            up = np.maximum(0, up * T / (T + step) + (u - allowance) * step / T)
+            down = np.maximum(0, down * T / (T + step) + (-u - allowance) * step / T)
             found.append(e if kind == "ewma" else np.where(up >= down, up, -down))
         return np.array(found)
     if kind == "chi2":

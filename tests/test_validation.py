@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 from fractions import Fraction
 from math import comb
 
@@ -18,6 +19,8 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.reports.validation_text import validation_text
+from uncertain_lti.validation import calibration
+from uncertain_lti.validation.armed import Armed, kinds_of, sets_of
 from uncertain_lti.validation.blocks import cut, remaining_spans
 from uncertain_lti.validation.calibration import calibrate, detection
 from uncertain_lti.validation.fitted_model import leave_out_with_fit, validate_model
@@ -412,6 +415,96 @@ def test_detection_of_a_stated_fault_is_that_of_a_monitor(validation, runs):
     assert (share == 0).all() and np.isinf(delay).all()
 
 
+# --- calibration of statistics ---
+
+
+@pytest.fixture(scope="module")
+def with_statistics(validation):
+    return calibrate(validation, 20 * 3600 / 120, statistics="mean,chi2")
+
+
+def test_statistics_are_armed_together_with_containment(validation, with_statistics):
+    found = with_statistics
+    assert [rule.kind for rule in found.rules] == ["containment", "mean", "chi2"]
+    containment, mean, chi2 = found.rules
+    assert containment == found.alarm_rule and containment.margin >= 1.0
+    assert len(mean.threshold) == 3 and mean.window_s == chi2.window_s
+    windows = [c.window_s for c in found.candidates]
+    assert windows == pytest.approx([5 * DT, 10 * DT]), "as long as ten of them fit into a recording"
+    assert all(c.upper <= found.target for c in found.candidates if c.margin is not None)
+    assert "mean of the utilisation over" in found.words and "chi-square of the residuals over" in found.words
+    data = found.to_dict()
+    json.dumps(data, allow_nan=False)
+    assert [r["kind"] for r in data["candidates"][0]["rules"]][0] == "containment"
+    armed = validation.model.replace(alarm=found.rules)
+    assert UncertainLTI.from_dict(armed.to_dict()).alarm == found.rules
+
+
+def test_a_level_is_above_the_factor_exactly_where_the_monitor_alarms(validation, runs):
+    rules = sets_of(("energy", "cusum", "chi2"), validation.model, [5])[0]
+    armed = Armed(rules, validation.parts)
+    for g in (0, 7):
+        others = Armed(rules, [p for i, p in enumerate(validation.parts) if i != g])
+        model = fit(runs[:g] + runs[g + 1 :], additive="noise")
+        for factor in (0.5, 0.8, 1.0, 1.3):
+            verdicts = EnvelopeMonitor(model, rules=others.at(factor)).check(runs[g])
+            assert np.array_equal(verdicts.alarm[verdicts.judged], armed.levels[g] > factor)
+
+
+def test_statistics_see_small_faults_that_containment_misses(validation):
+    """The same target: a fault of a fifth of a mean width that lasts."""
+    plain, summed = calibrate(validation, 600.0, rules=[(1, 1)]), calibrate(validation, 600.0, statistics="cusum")
+    seen = [detection(validation.parts, found.rules, size=0.2)[0].mean() for found in (plain, summed)]
+    assert seen[1] > seen[0] + 0.05, seen
+
+
+def test_detection_by_statistics_is_that_of_a_monitor(validation, runs):
+    """The fault in residuals and utilisation is the fault in the recorded next samples, judged from measured ones."""
+    g, start, state, size = 4, 30, 1, 0.4
+    part = validation.parts[g]
+    s = runs[g].transitions()
+    centre, half = part.model.centre_and_half(s.x, s.u, s.dt)
+    moved = s.x_next.copy()
+    moved[start:, state] += size * part.mean_width[state]
+    table = part.table[start:].copy()
+    calibration._add_fault(part, table, start, state, np.full(len(table), size), True)
+    np.testing.assert_allclose(table[:, -1], (moved - centre)[start:], atol=1e-12)
+    np.testing.assert_allclose(table[:, 0], ((moved - centre) / half)[start:], atol=1e-9)
+
+
+def test_no_margin_lies_inside_the_envelope(validation):
+    """Below 1, samples like those that were fitted would count as violations."""
+    assert {c.margin for c in calibrate(validation, 5000.0).candidates} == {1.0}
+    assert calibrate(validation, 5000.0, statistics="energy").alarm_rule.margin == 1.0
+
+
+def test_windows_go_as_far_as_the_recordings_support(validation):
+    assert max(c.window for c in calibrate(validation, 500.0).candidates) == 10
+    long = [replace(p, dt=p.dt * 1.0, starts=(0,)) for p in validation.parts]
+    joined = replace(
+        long[0],
+        **{
+            name: np.concatenate([getattr(p, name) for p in long])
+            for name in ("dt", "utilisation", "narrowness", "residual", "block")
+        },
+    )
+    whole = replace(validation, parts=(joined, joined))
+    windows = [c.window for c in calibrate(whole, 500.0).candidates]
+    assert windows == [1, 5, 10, 20, 50, 100], "a tenth of 1200 steps"
+
+
+@pytest.mark.parametrize("statistics", ["median", "", ","])
+def test_statistics_that_are_none_are_refused(validation, statistics):
+    with pytest.raises(FitError, match="choose from energy, mean, ewma, cusum, chi2, or all"):
+        kinds_of(statistics)
+
+
+def test_statistics_need_recordings_that_are_long_enough(validation):
+    short = [replace(p, dt=p.dt[:40], utilisation=p.utilisation[:40]) for p in validation.parts]
+    with pytest.raises(FitError, match="windows of at least 5 steps"):
+        calibrate(replace(validation, parts=tuple(short)), 500.0, statistics="all")
+
+
 # --- what is promised holds: fresh plants, fresh recordings, many times ---
 
 
@@ -497,6 +590,20 @@ def test_validate_then_watch_with_the_rule_found(folder, capsys):
     assert main(["validate", model, "--blocks", "3", "--gap", "0.1", "--json"]) == 0
     data = json.loads(capsys.readouterr().out)["validation"]
     assert data["kind"] == "blocks" and data["parts"] == 18 and data["gap"] == 0.1
+
+
+def test_statistics_on_the_command_line(folder, capsys):
+    capsys.readouterr()
+    model, better = str(folder / "m.json"), str(folder / "better.json")
+    assert main(["validate", model, "--statistics", "chi2"]) == 2
+    assert "--statistics goes with --false-alarms" in capsys.readouterr().err
+    assert main(["validate", model, "--statistics", "sum", "--false-alarms", "2000"]) == 2
+    assert "'sum' is none" in capsys.readouterr().err
+    assert main(["validate", model, "--statistics", "energy,chi2", "--false-alarms", "2000", "--output", better]) == 0
+    assert "chi-square of the residuals over" in capsys.readouterr().out
+    found = UncertainLTI.load(better)
+    assert [rule.kind for rule in found.alarm] == ["containment", "energy", "chi2"] and found.residuals is not None
+    assert main(["check", better, str(folder / "run0.mcap")]) in (0, 1)
 
 
 def test_without_a_rule_nothing_is_written(folder, capsys):

@@ -50,6 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="time within which a fault shall be seen (default: 1 s or 20 steps, at most a quarter of a recording)",
     )
     parser.add_argument(
+        "--statistics",
+        metavar="LIST",
+        help="with --false-alarms: arm these statistics over a window, too: energy, mean, ewma, cusum, chi2, with "
+        "commas between them, or all",
+    )
+    parser.add_argument(
         "--output",
         metavar="MODEL",
         help="write the model with this validation, and the alarm rule found, to this file; where --false-alarms "
@@ -80,6 +86,7 @@ def run(options: argparse.Namespace) -> int:
         The recordings do not give the model again, or no alarm rule keeps to the rate.
     """
     from uncertain_lti import UncertainLTI
+    from uncertain_lti.model.alarm_rule import AlarmRule
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.validation_text import validation_text
     from uncertain_lti.sampling.reading import read_as_fitted
@@ -93,6 +100,8 @@ def run(options: argparse.Namespace) -> int:
     bags = options.bags or list(dict.fromkeys(s["file"] for s in sources))
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
+    if options.statistics is not None and options.false_alarms is None:
+        raise FitError("--statistics goes with --false-alarms: their thresholds follow from the rate; give both")
     if options.output is not None:
         own = os.path.exists(options.output) and os.path.samefile(options.output, options.model)
         model_target(options.output, options.force or own)
@@ -115,10 +124,10 @@ def run(options: argparse.Namespace) -> int:
     data = validation.to_dict()
     refusal = ""
     if options.false_alarms is not None:
-        calibration = calibrate(validation, options.false_alarms)
+        calibration = calibrate(validation, options.false_alarms, statistics=options.statistics or ())
         data["calibration"] = calibration.to_dict()
         if calibration.alarm_rule is not None:
-            model = model.replace(alarm_rule=calibration.alarm_rule)
+            model = model.replace(alarm=calibration.rules, residuals=model.residuals or validation.model.residuals)
         elif options.output is not None:
             refusal = f"{options.output}: not written: {calibration.words}"
     with options.progress.stage("injecting faults") as step:
@@ -134,7 +143,12 @@ def run(options: argparse.Namespace) -> int:
     else:
         print_summary(options, validation_text(data))
         if output is not None:
-            rule = f"{model.alarm_rule.violations} of {model.alarm_rule.window}, margin {model.alarm_rule.margin:.3g}"
+            rule = "; ".join(
+                f"{r.violations} of {r.window}, margin {r.margin:.3g}" + f" over {r.horizon} steps" * (r.horizon > 1)
+                if isinstance(r, AlarmRule)
+                else r.words
+                for r in model.alarm
+            )
             kept = ", unchanged" if options.false_alarms is None else ""
             print_summary(options, f"model written to {output}; its alarm rule{kept}: {rule}")
     if refusal:  # whoever asked for a rule and deploys the file would deploy one without it

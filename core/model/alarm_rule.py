@@ -104,7 +104,8 @@ class StatisticRule:
     - ``energy``: :math:`\sum u_k^2 Δt_k / T` over the last T seconds under verdict;
     - ``mean``: :math:`|\sum u_k Δt_k / T|` over the same;
     - ``ewma``: :math:`|e_k|` of the low-pass :math:`e_k = e_{k-1} + (u_k - e_{k-1}) Δt_k / (T + Δt_k)`;
-    - ``cusum``: the larger of :math:`s_k^± = \max(0, s_{k-1}^± + (± u_k - a) Δt_k / T)`, with a the allowance;
+    - ``cusum``: the larger of :math:`s_k^± = \max(0, s_{k-1}^± T / (T + Δt_k) + (± u_k - a) Δt_k / T)`, with a the
+      allowance: a sum that forgets, so that what it reaches in a session does not grow with its length;
     - ``chi2``: :math:`\sum (r_k - \bar r)^T C^{-1} (r_k - \bar r) Δt_k / T` of the one-step residuals of all states
       together, with the mean and the covariance of `UncertainLTI.residuals`.
 

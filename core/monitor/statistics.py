@@ -217,6 +217,7 @@ class Statistic:
         i: cython.Py_ssize_t
         value: cython.double
         weight: cython.double
+        kept: cython.double
         down: cython.double
         over: cython.bint = False
         if not self._take(row, begin):
@@ -229,9 +230,10 @@ class Statistic:
                 self._values[i] = self._up[i] / self._thresholds[i]
         elif self._kind == CUSUM:
             weight = dt / self._window
+            kept = self._window / (self._window + dt)
             for i in range(self._size):
-                value = self._up[i] + (self._terms[i] - self._allowance) * weight
-                down = self._down[i] + (-self._terms[i] - self._allowance) * weight
+                value = self._up[i] * kept + (self._terms[i] - self._allowance) * weight
+                down = self._down[i] * kept + (-self._terms[i] - self._allowance) * weight
                 self._up[i] = value = value if value > 0.0 else 0.0
                 self._down[i] = down = down if down > 0.0 else 0.0
                 self._values[i] = (value if value >= down else -down) / self._thresholds[i]

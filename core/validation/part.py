@@ -58,6 +58,10 @@ class Part:
         Utilisation by each horizon of the full model; NaN where a window is broken, or the left-out model has none.
     longer_width : array (H, n), optional
         Mean width of the left-out model's envelopes over each horizon on this part, recorded units; NaN likewise.
+    residual : array (K, n), optional
+        x_next - centre of every judged transition, normalised.
+    judged_by : UncertainLTI, optional
+        The full model with the residuals of the left-out one: what a statistic on this part takes.
     """
 
     name: str
@@ -78,6 +82,8 @@ class Part:
     transient: Transient | None = None
     longer: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     longer_width: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    residual: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    judged_by: UncertainLTI | None = None
 
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
@@ -116,12 +122,25 @@ class Part:
         """
         severity = self.severity if severity is None else severity
         level = np.empty(len(severity))
-        for start, stop in zip(self.starts, [*self.starts[1:], len(severity)], strict=True):
+        for start, stop in self.spans:
             padded = np.concatenate([np.full(window - 1, -np.inf), severity[start:stop]])
-            if stop > start:
-                windows = np.lib.stride_tricks.sliding_window_view(padded, window)
-                level[start:stop] = np.partition(windows, window - violations, axis=1)[:, window - violations]
+            most = max(1, _NUMBERS // window)
+            for first in range(0, stop - start, most):  # a piece at a time, as each number is there `window` times
+                windows = np.lib.stride_tricks.sliding_window_view(padded[first : first + most + window - 1], window)
+                part = np.partition(windows, window - violations, axis=1)[:, window - violations]
+                level[start + first : start + first + len(part)] = part
         return level
+
+    @property
+    def spans(self) -> list[tuple[int, int]]:
+        """[start, stop) of the verdicts over which the alarm goes on from a cleared one."""
+        return list(zip(self.starts, [*self.starts[1:], self.judged], strict=True))
+
+    @property
+    def table(self) -> Array:
+        """(K, rows, n): utilisation for one step and for each horizon, then the residual, as `AlarmStatistic` takes."""
+        rows = [self.utilisation[:, None], self.longer, self.residual[:, None]]
+        return np.concatenate([row for row in rows if row.size or not self.judged], axis=1)
 
     def alarms(self, rule: AlarmRule) -> int:
         """How often the alarm is raised (rising edges).
@@ -137,6 +156,9 @@ class Part:
             Rising edges.
         """
         return rising(self.level(rule.violations, rule.window) > rule.margin, self.starts)
+
+
+_NUMBERS = 2**22  # of one piece of `Part.level`
 
 
 def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str, group: str = "") -> Part:
@@ -196,6 +218,8 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         model,
         transient,
         *_longer(model, full, steps, verdicts.horizon_utilisation[judged][:, 1:]),
+        residual=_residual(model, steps),
+        judged_by=full.replace(residuals=model.residuals or full.residuals),
     )
 
 
@@ -210,6 +234,14 @@ def _longer(model: UncertainLTI, full: UncertainLTI, steps: Transitions, table: 
         if half.size:
             width[places[horizon.steps]] = 2.0 * half.mean(axis=1) * model.operating_point.X
     return utilisation, width
+
+
+def _residual(model: UncertainLTI, steps: Transitions) -> Array:
+    """What the centre of one step leaves unexplained, normalised."""
+    z = model.normalised_columns(steps)
+    centre, half = np.empty((model.n, len(steps.dt))), np.empty((model.n, len(steps.dt)))
+    model.columns_centre_and_half(z, steps.dt, centre, half)
+    return np.asarray(model.operating_point.normalise_x(steps.x_next) - centre.T)
 
 
 def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
