@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -32,8 +32,8 @@ STEP = STEP_NS * 1e-9
 class Rig:
     """A session fed by hand, and its event log; time goes on by one step with every sample."""
 
-    def __init__(self, **rule: Any) -> None:
-        model = self.model = by_hand(alarm_rule=AlarmRule(2, 5))
+    def __init__(self, alarm: Sequence[AlarmRule | StatisticRule] = (AlarmRule(2, 5),), **rule: Any) -> None:
+        model = self.model = by_hand(alarm=alarm)
         self.said: list[tuple[int, str]] = []
         self.now, self.t_ns = 100.0, EPOCH_NS
         self.x, self.u = np.zeros(model.n), np.full(model.m, 0.2)
@@ -105,6 +105,19 @@ def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end
     rig.send(10)
     ((level, line),) = rig.said
     assert level == OK and re.fullmatch(r"the alarm is over after 0\.0\d+ s", line)
+
+
+def test_an_alarm_by_a_statistic_says_which_state_and_by_how_much() -> None:
+    """Every sample lies within its bounds; their mean does not."""
+    rig = Rig([AlarmRule(2, 5), StatisticRule("mean", 5 * STEP, 0.4)])
+    rig.send(10)
+    assert rig.lines[0].endswith("alarm when at least 2 of 5 verdicts violated, or mean of the utilisation over "
+                                 f"{5 * STEP:.3g} s above 0.4")  # fmt: skip
+    rig.send(8, off=0.6)
+    (line,) = rig.lines
+    assert re.fullmatch(r"alarm, mean of a at 1\S* times its threshold, mean of b at 1\S* times its threshold", line)
+    assert rig.session.last is not None and not rig.session.last.violated and rig.session.last.alarm
+    assert rig.session.rule_text() in rig.session.report(rig.now, TIMEOUT)[0].message
 
 
 def test_masked_states_are_not_named_and_a_latched_alarm_says_what_ends_it() -> None:

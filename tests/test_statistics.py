@@ -14,6 +14,9 @@ from uncertain_lti.model.alarm_rule import KINDS, PER_STATE, AlarmRule, Statisti
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.monitor import statistics
 from uncertain_lti.monitor.statistics import LIMIT, Statistic
+from uncertain_lti.reports.check_data import check_data
+from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.reports.model_text import model_text
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
 
@@ -234,6 +237,18 @@ def test_the_alarm_says_which_rule_state_and_value() -> None:
     assert (why.label, why.kind, why.horizon, why.state) == ("mean", "mean", 1, "x3") and why.value < -1
     assert "mean of x3 at 1" in why.words and "its threshold" in why.words
     assert verdicts.raised(0) == ()
+
+
+def test_check_says_what_raised_the_alarm() -> None:
+    given = model([AlarmRule(50, 50), StatisticRule("mean", 0.05, 0.5)])
+    x = np.zeros((12, 3))
+    x[:, 2] = [0.0, *(-0.24 * np.arange(1, 12))]
+    run = Transient(np.arange(12) * 0.01, x, np.zeros((12, 1)), state_names=["x1", "x2", "x3"], control_names=["u1"])
+    data = check_data(given, EnvelopeMonitor(given).check(run))
+    (why,) = data["alarms"][0]["raised"]
+    assert (why["rule"], why["state"], why["horizon"]) == ("mean", "x3", 1) and why["value"] < -1
+    assert f"raised by {why['words']}" in check_text(data)
+    assert "alarm: mean of the utilisation over 0.05 s above 0.5" in model_text(given)
 
 
 def test_unarmed_verdicts_leave_no_trace() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from uncertain_lti.base.english import plural
+from uncertain_lti.model.alarm_rule import CONTAINMENT
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.session import OK, WARN, WHY, Session
 from uncertain_lti.sampling.status import Status
@@ -102,9 +103,11 @@ class EventLog:
         self._alarm = session.alarm
         if session.alarm:
             frozen = next((v.frozen for v in verdicts if v.alarm and v.frozen), ())
-            cause = next((v for v in verdicts if v.alarm and v.violated), session.last)
+            cause = next((v for v in verdicts if v.alarm and (v.violated or v.raised)), session.last)
             left = f": {_left(session, cause)}" if cause is not None and cause.violated else ""
-            line = f"alarm, {session.rule_text()}{left}"
+            raised = () if cause is None else cause.raised
+            by = [reason.words for reason in raised if reason.label != CONTAINMENT]
+            line = f"alarm, {', '.join(by[:_SHOWN]) if by else session.rule_text()}{left}"
             if frozen:
                 line = f"alarm, frozen: {'; '.join(session.frozen_text(moved) for moved in frozen[:_SHOWN])}"
             line += "; it lasts until ~/reset" if session.rule.latch else ""

@@ -93,7 +93,10 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "states": states,
         "horizons": _horizons(model, verdicts),
         "alarm": bool(alarms),
-        "alarms": [{**_instant(transient, start), **_length(t, (start, stop))} for start, stop in alarms],
+        "alarms": [
+            {**_instant(transient, start), **_length(t, (start, stop)), "raised": _raised(verdicts, start)}
+            for start, stop in alarms
+        ],
         "frozen": _repeats(model, verdicts, verdicts.frozen),
         "repeats": _repeats(model, verdicts, verdicts.repeating & ~_before(verdicts.frozen, verdicts.repeating)),
     }
@@ -242,6 +245,14 @@ def outcome(recordings: Sequence[dict[str, Any]]) -> str:
         One of OUTCOMES.
     """
     return next(o for o in OUTCOMES if o == OUTCOMES[-1] or any(r["outcome"] == o for r in recordings))
+
+
+def _raised(verdicts: Verdicts, k: int) -> list[dict[str, Any]]:
+    """Which rules, states and horizons raised the alarm at a sample."""
+    return [
+        {"rule": r.label, "state": r.state, "horizon": r.horizon, "value": r.value, "words": r.words}
+        for r in verdicts.raised(k)
+    ]
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:

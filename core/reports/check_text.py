@@ -68,6 +68,9 @@ def check_text(data: dict[str, Any]) -> str:
         lines.append(
             f"ALARM: raised {times(len(data['alarms']))}, first at {first['t']:.4f} s for {number(first['seconds'])} s"
         )
+        by = [r["words"] for r in first.get("raised", ()) if r["rule"] != "containment"]
+        if by:
+            lines.append(f"  raised by {', '.join(by[:MOST_REPEATS])}")
     elif data["outcome"] == "unknown" and data["verdicts"]:
         lines.append(f"no alarm, but UNKNOWN: {data['reason']}")
     else:

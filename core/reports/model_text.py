@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uncertain_lti.base.english import plural
+from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.reports.detectable_text import condition_text, detectable_data, detectable_words
 from uncertain_lti.reports.regimes import MOST_REGIMES, block_facts, blocks_in_words
@@ -61,11 +62,15 @@ def model_text(model: UncertainLTI) -> str:
         ]
         lines.append(table(("one-step envelope", "mean width", "largest"), widths))
     lines += horizon_widths_text(model)
-    alarm = model.alarm_rule
-    lines.append(
-        f"alarm: {alarm.violations} of the last {plural(alarm.window, 'verdict')} violated; margin "
-        f"{number(alarm.margin)}"
-    )
+    for rule in model.alarm:
+        if isinstance(rule, AlarmRule):
+            over = "" if rule.horizon == 1 else f" over {rule.horizon} steps"
+            lines.append(
+                f"alarm: {rule.violations} of the last {plural(rule.window, 'verdict')} violated{over}; margin "
+                f"{number(rule.margin)}"
+            )
+        else:
+            lines.append(f"alarm: {rule.words}")
     if (faults := detectable_data(model.validation)) is not None:
         lines += [condition_text(faults), *(f"  {text}" for text in detectable_words(faults))]
     return "\n".join(lines + [f"note: {message}" for message in facts.get("messages", [])])
