@@ -229,12 +229,13 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
     flags.count(10)
 
     u = plant.model.operating_point.u_s
+    before = diagnostics.count
     for k in range(60):  # the control goes on, the state does not
         message = stamped(Vector3Stamped(), plant.t_ns + k * STEP_NS)
         message.vector.x, message.vector.y = float(u[0]), float(u[1])
         plant.control.publish(message)
         time.sleep(0.01)
-    status = diagnostics.reaches(STALE, saying=f"no message on {STATE} for", patience=20)
+    status = diagnostics.reaches(STALE, saying=f"no message on {STATE} for", patience=20, since=before)
     values = Diagnostics.values(status)
     assert float(values[f"age {CONTROL}"]) < 0.4 <= float(values[f"age {STATE}"])
     assert len(flags.messages) == 10 and violation.messages[-1].data is False

@@ -47,6 +47,7 @@ _SUMMARY = (
 )
 _TICK = 0.2  # s between two runs of the periodic tasks
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
+_AT_ONCE, _PAUSE = 200, 0.01  # messages that had waited are taken so many at once, with so many s in between
 _NOTE = 0.05  # s between two checks for changes to log
 _LAST_WORDS = 1.0  # s that the end waits until readers of /diagnostics have the last report
 
@@ -423,7 +424,9 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._take_all(self.session, messages, now)
 
     def _take_all(self, session: Session, messages: Sequence[Waiting], now: float) -> None:
-        for topic, arrival, data in messages:
+        for number, (topic, arrival, data) in enumerate(messages, 1):
+            if number % _AT_ONCE == 0:  # a burst of outputs would drive out what reliable readers have not had yet
+                time.sleep(_PAUSE)
             try:
                 self._take(session, topic, arrival, data, now)
             except Exception as error:
