@@ -251,7 +251,7 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
     got = np.isnan([m.position[0] for m in flags.count(95)[15:]])
     held = np.flatnonzero(got)[0]
     assert 49 <= held <= 52 and got[held:].all(), held
-    assert ever(diagnostics, ERROR, "a signal is missing, stale or not finite")
+    until(lambda: ever(diagnostics, ERROR, "a signal is missing, stale or not finite"), "a report of it", 20)
     values = Diagnostics.values(diagnostics.reaches(STALE, patience=20))
     assert float(values[f"age {CONTROL}"]) > 0.5 and int(values["stale p"]) > 20
 
