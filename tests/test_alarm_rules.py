@@ -21,6 +21,8 @@ RULES = (
     StatisticRule("energy", 0.1, 0.5),
     StatisticRule("cusum", 1.0, 2.0, horizon=4, allowance=0.25),
     StatisticRule("chi2", 0.5, 7.0),
+    StatisticRule("mewma", 0.2, 9.0),
+    StatisticRule("chi2", 0.0, 8.0, horizon=4),
     AlarmRule(3, 4, 2.0, horizon=4),
 )
 
@@ -28,7 +30,12 @@ RULES = (
 def two_states(**options: Any) -> UncertainLTI:
     return UncertainLTI(
         -np.eye(2), np.zeros((2, 0)), ZEROS, np.zeros((2, 0)), v=[0.1, 0.2],
-        horizons=[Horizon(4, ZEROS, np.zeros((2, 0)), ZEROS, np.zeros((2, 0)), v=[0.3, 0.3], widths="constant")],
+        horizons=[
+            Horizon(
+                4, ZEROS, np.zeros((2, 0)), ZEROS, np.zeros((2, 0)), v=[0.3, 0.3], widths="constant",
+                residuals=Residuals([0.0, 0.2], [[3.0, 0.5], [0.5, 2.0]]),
+            )
+        ],
         residuals=Residuals([0.0, 0.1], [[1.0, 0.5], [0.5, 2.0]]), **options,
     )  # fmt: skip
 
@@ -41,7 +48,7 @@ def test_rules_and_residuals_go_through_the_file(tmp_path: Path) -> None:
     assert again.residuals is not None and model.residuals is not None
     assert np.array_equal(again.residuals.covariance, model.residuals.covariance)
     assert json.loads((tmp_path / "m.json").read_text())["format"] == "uncertain-lti/2"
-    assert labels(RULES) == ("containment", "energy", "energy#2", "cusum@4", "chi2", "containment@4")
+    assert labels(RULES) == ("containment", "energy", "energy#2", "cusum@4", "chi2", "mewma", "chi2@4", "containment@4")
 
 
 def test_one_rule_for_one_step_stays_in_format_1() -> None:
@@ -75,13 +82,36 @@ def test_an_alarm_that_cannot_be_is_refused(alarm: list[Any], words: str) -> Non
 def test_chi2_needs_the_covariance() -> None:
     with pytest.raises(ModelError, match="chi2 needs the covariance"):
         two_states().replace(residuals=None, alarm=[StatisticRule("chi2", 1.0, 1.0)])
+    without = [two_states().horizons[0].with_residuals(None)]
+    with pytest.raises(
+        ModelError, match="mewma needs the covariance of the residuals over 4 steps; fit the model again"
+    ):
+        two_states().replace(horizons=without, alarm=[StatisticRule("mewma", 1.0, 1.0, horizon=4)])
+    learnt = two_states().replace(horizons=without, residuals=None).with_residuals_of(two_states())
+    assert learnt.replace(alarm=RULES).to_dict() == two_states(alarm=RULES).to_dict()
+
+
+@pytest.mark.parametrize(
+    ("residuals", "words"),
+    [
+        ([], r"'horizons\[0\].residuals' is not an object"),
+        ({"mean": [0.0, 0.0]}, r"'horizons\[0\].residuals.covariance' is missing"),
+        ({"mean": [0.0, 0.0], "covariance": ZEROS.tolist(), "odd": 1}, r"unknown field 'horizons\[0\].residuals.odd'"),
+        ({"mean": [0.0], "covariance": [[1.0]]}, "horizon of 4 steps: residuals of 1 state for 2 states"),
+    ],
+)
+def test_residuals_of_a_horizon_that_are_none_are_refused(residuals: Any, words: str) -> None:
+    data = json.loads(json.dumps(two_states().to_dict()))
+    data["horizons"][0]["residuals"] = residuals
+    with pytest.raises(ModelError, match=words):
+        UncertainLTI.from_dict(data)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"kind": "median"}, "kind.* is 'median'; it must be one of containment, energy"),
-        ({"window_s": 0}, "window_s of energy is 0"),
+        ({"window_s": -1}, "window_s of energy is -1; it must be a number of seconds, 0 for one verdict"),
         ({"window_s": True}, "window_s of energy is True"),
         ({"window_s": 1e10}, "window_s of energy is"),
         ({"threshold": -1}, "threshold of energy is -1"),
@@ -111,7 +141,8 @@ def test_a_rule_of_a_file_that_cannot_be_is_refused_by_name(change: dict[str, An
         ([7], r"alarm.rules\[0\]' is not an object"),
         ([{"kind": "chi2", "window_s": 1.0}], r"rules\[0\].threshold' is missing"),
         ([{"kind": "chi2", "window_s": 1.0, "threshold": [1.0, 1.0]}], "chi2 is one number for all states"),
-        ([{"kind": "chi2", "window_s": 1.0, "threshold": 1.0, "horizon": 4}], "chi2 takes the residuals of one step"),
+        ([{"kind": "cusum", "window_s": 0, "threshold": 1.0}], "window_s of cusum is 0; it must be a positive number"),
+        ([{"kind": "mewma", "window_s": 1.0, "threshold": [1.0, 1.0]}], "mewma is one number for all states"),
         ([{"kind": "cusum", "window_s": 1.0, "threshold": 1.0, "allowance": -1}], "allowance is -1"),
         ([{"kind": "containment", "violations": 1, "window": 1, "margin": "x"}], r"rules\[0\].margin' is 'x'"),
         ([{"kind": "containment", "violations": 2, "window": 1, "margin": 1}], "violations is 2 of window 1"),

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from test_horizon_fit import runs
 
-from uncertain_lti import SignalMap, fit
+from uncertain_lti import EnvelopeMonitor, SignalMap, fit
 from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.proposal.horizons import MOST, choose_horizons, lengths_of
 from uncertain_lti.reports.fit_text import horizons_text
 from uncertain_lti.signals.horizon_rule import HorizonRule
+from uncertain_lti.validation.armed import sets_of, values_of
 from uncertain_lti.validation.left_out import validate
 
 RUNS = runs(count=4, length=200, noise=1e-2, bend=0.0)
@@ -89,6 +91,21 @@ def test_left_out_parts_have_the_utilisations_of_the_model_fitted_without_them()
         assert part.longer.shape == (part.judged, 2, 2)
         assert (~np.isnan(part.longer[:, 0, 0])).sum() == len(run) - 4
         assert (part.longer_width > 0).all()
+
+
+def test_statistics_at_a_horizon_take_the_residuals_of_the_model_fitted_without() -> None:
+    model = fit(RUNS, additive="noise", horizons={"steps": [4, 9]}, widths="constant")
+    rules = sets_of(("cusum", "chi2", "mewma"), model, [5])[0]
+    found = {(rule.kind, rule.horizon, getattr(rule, "allowance", 0.0)) for rule in rules}
+    assert found >= {("chi2", 9, 0.0), ("mewma", 1, 0.0), ("mewma", 9, 0.0), ("cusum", 9, 0.02), ("cusum", 1, 0.1)}
+    assert StatisticRule("chi2", 0.0, 1.0, 9) in rules, "at a horizon over one verdict, too"
+    assert rules == tuple(r for r in rules if not isinstance(r, StatisticRule) or r.horizon in (1, 9))
+    for part, run in zip(validate(RUNS, full=model, additive="noise").parts, RUNS, strict=True):
+        assert part.model is not None
+        verdicts = EnvelopeMonitor(part.model.replace(alarm=rules)).check(run)
+        expected = np.abs(verdicts.statistics[verdicts.judged])
+        values = [v for v, rule in zip(values_of(rules, part), rules, strict=True) if isinstance(rule, StatisticRule)]
+        np.testing.assert_array_equal(np.concatenate(values, axis=1), np.nan_to_num(expected))
 
 
 def test_horizons_that_lose_are_refused() -> None:

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base import compiled
-from uncertain_lti.model.alarm_rule import KINDS, PER_STATE, AlarmRule, StatisticRule
+from uncertain_lti.identification import fit
+from uncertain_lti.model.alarm_rule import JOINT, KINDS, PER_STATE, AlarmRule, StatisticRule
+from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.monitor import statistics
 from uncertain_lti.monitor.statistics import LIMIT, Statistic
@@ -25,7 +27,7 @@ MEAN = np.array([0.1, -0.2, 0.0])
 
 
 def statistic(kind: str, window: float = 1.0, threshold: float = 1.0, n: int = 3, allowance: float = 0.0) -> Statistic:
-    joint = kind == "chi2"
+    joint = kind in JOINT
     return Statistic(
         KINDS.index(kind), n, window, [threshold] * (1 if joint else n), [True] * n, allowance,
         MEAN[:n], Residuals(MEAN[:n], C[:n, :n]).whitening([True] * n),
@@ -44,8 +46,17 @@ def oracle(kind: str, T: float, dt: np.ndarray, rows: np.ndarray, allowance: flo
             down = np.maximum(0, down * T / (T + step) + (-u - allowance) * step / T)
             found.append(e if kind == "ewma" else np.where(up >= down, up, -down))
         return np.array(found)
+    r = rows - MEAN[: rows.shape[1]]
+    if kind == "mewma":
+        e, spread, found = np.zeros(rows.shape[1]), 0.0, []
+        root = np.linalg.cholesky(C[: rows.shape[1], : rows.shape[1]])
+        for white, step in zip(np.clip(np.linalg.solve(root, r.T).T, -LIMIT, LIMIT), dt, strict=True):
+            weight = step / (T + step)
+            spread = (1 - weight) ** 2 * spread + weight**2 if spread else weight / (2 - weight)
+            e = e + weight * (white - e)
+            found.append([e @ e / spread])
+        return np.array(found)
     if kind == "chi2":
-        r = rows - MEAN[: rows.shape[1]]
         terms = np.einsum("ki,ij,kj->k", r, np.linalg.inv(C[: rows.shape[1], : rows.shape[1]]), r)[:, None]
     else:
         terms = rows**2 if kind == "energy" else rows
@@ -99,7 +110,7 @@ def test_compiled_gives_the_bits_of_uncompiled(kind: str, n: int, seed: int, win
     found = []
     for source in (statistics, compiled.uncompiled("monitor.statistics")):
         made = source.Statistic(
-            KINDS.index(kind), n, window, [0.7] * (1 if kind == "chi2" else n), [True] * n,
+            KINDS.index(kind), n, window, [0.7] * (1 if kind in JOINT else n), [True] * n,
             0.1, MEAN[:n], Residuals(MEAN[:n], C[:n, :n]).whitening([True] * n),
         )  # fmt: skip
         alarm, values = made.push_all(dt, rows)
@@ -124,8 +135,6 @@ def test_what_is_missing_changes_nothing(kind: str) -> None:
     without = np.insert(rows, [50, 50, 120], np.nan, axis=0)
     _, plain = statistic(kind, 0.2).push_all(dt, rows)
     alarm, broken = statistic(kind, 0.2).push_all(np.full(203, 0.01), without)
-    if kind == "chi2":  # residuals are never missing
-        return
     assert np.delete(broken, [50, 51, 122], axis=0).tobytes() == plain.tobytes()
     assert broken[51].tobytes() == broken[49].tobytes() and alarm[51] == alarm[49]
 
@@ -138,6 +147,27 @@ def test_until_there_is_a_window_what_is_missing_counts_as_0() -> None:
 def test_a_window_shorter_than_a_step_holds_one_verdict() -> None:
     _, values = statistic("mean", 0.001).push_all(np.full(3, 0.01), np.array([[1.0] * 3, [2.0] * 3, [-3.0] * 3]))
     assert values[:, 0].tolist() == [1.0, 2.0, -3.0]
+
+
+@pytest.mark.parametrize("kind", ["energy", "mean", "ewma", "chi2", "mewma"])
+def test_a_window_of_0_is_one_verdict(kind: str) -> None:
+    rng = np.random.default_rng(4)
+    dt, rows = rng.uniform(0.001, 0.02, 60), rng.normal(size=(60, 3))
+    _, values = statistic(kind, 0.0).push_all(dt, rows)
+    r = rows - MEAN
+    square = np.einsum("ki,ij,kj->k", r, np.linalg.inv(C), r)[:, None]
+    expected = {"energy": rows**2, "mean": rows, "ewma": rows}.get(kind, square)
+    np.testing.assert_allclose(values, expected, rtol=1e-12)
+
+
+def test_the_joint_moving_average_of_healthy_residuals_is_distributed_like_chi_square() -> None:
+    """Its mean is the number of states whatever the window and the steps are, so one threshold fits them all."""
+    rng = np.random.default_rng(6)
+    rows = rng.multivariate_normal(MEAN, C, size=40_000)
+    for window, jitter in ((0.02, 0.0), (0.5, 0.0), (0.5, 0.9)):
+        dt = 0.01 * (1 + jitter * rng.uniform(-1, 1, len(rows)))
+        _, values = statistic("mewma", window).push_all(dt, rows)
+        assert values[len(rows) // 10 :].mean() == pytest.approx(3.0, rel=0.1)
 
 
 def test_reset_forgets_everything() -> None:
@@ -157,9 +187,11 @@ def test_reset_forgets_everything() -> None:
 
 
 def model(rules: Any, n: int = 3) -> UncertainLTI:
+    zeros = np.zeros((n, n)), np.zeros((n, 1))
     return UncertainLTI(
-        -0.5 * np.eye(n), np.zeros((n, 1)), np.zeros((n, n)), np.zeros((n, 1)), v=np.full(n, 0.3),
-        residuals=Residuals(MEAN[:n], 0.01 * C[:n, :n]), alarm=rules,
+        -0.5 * np.eye(n), np.zeros((n, 1)), *zeros, v=np.full(n, 0.3), alarm=rules,
+        residuals=Residuals(MEAN[:n], 0.01 * C[:n, :n]),
+        horizons=[Horizon(4, *zeros, *zeros, v=np.full(n, 0.5), residuals=Residuals(-MEAN[:n], 0.02 * C[:n, :n]))],
     )  # fmt: skip
 
 
@@ -170,6 +202,9 @@ RULES = (
     StatisticRule("ewma", 0.3, 0.4),
     StatisticRule("cusum", 0.3, 0.5, allowance=0.2),
     StatisticRule("chi2", 0.2, 9.0),
+    StatisticRule("mewma", 0.2, 30.0),
+    StatisticRule("chi2", 0.0, 9.0, horizon=4),
+    StatisticRule("mewma", 0.1, 20.0, horizon=4),
 )
 
 
@@ -201,8 +236,8 @@ def test_offline_is_live(masked: tuple[str, ...]) -> None:
     verdicts = monitor.check(run)
     assert verdicts.alarm.any() and not verdicts.alarm.all()
     assert verdicts.rule_alarms.any(axis=0).all(), "every rule raises the alarm somewhere"
-    assert verdicts.statistics.shape == (400, 13) and verdicts.statistic_names[0] == "energy/x1"
-    assert verdicts.statistic_names[-1] == "chi2/joint"
+    assert verdicts.statistics.shape == (400, 16) and verdicts.statistic_names[0] == "energy/x1"
+    assert verdicts.statistic_names[-4:] == ("chi2/joint", "mewma/joint", "chi2@4/joint", "mewma@4/joint")
     live = EnvelopeMonitor(model(RULES), masked=masked)
     for k, step in enumerate(steps_of(run)):
         verdict = live.judge(step)
@@ -270,4 +305,45 @@ def test_rules_of_a_monitor_take_the_place_of_the_models() -> None:
 def test_kinds_are_numbered_in_the_order_of_the_rules() -> None:
     for number, name in enumerate(KINDS):
         assert getattr(statistics, name.upper()) == number
-    assert (*PER_STATE, "chi2") == KINDS
+    assert (*PER_STATE, *JOINT) == KINDS
+
+
+def test_residuals_at_a_horizon_are_those_of_its_windows() -> None:
+    """chi2 over one verdict is r C^-1 r of x_{k+4} less the centre, the states that count alone."""
+    rule = StatisticRule("chi2", 0.0, 2.0, horizon=4)
+    given = model([AlarmRule(50, 50), rule])
+    run = a_run(3)
+    verdicts = EnvelopeMonitor(given, masked=("x2",)).check(run)
+    horizon, known = given.horizons[0], given.residuals_at(4)
+    some = [0, 2]
+    inverse = np.linalg.inv(known.covariance[np.ix_(some, some)])
+    looked = 0
+    for k in range(4, 400):
+        if np.isnan(verdicts.longer_utilisation[k]).all():
+            continue
+        x = run.x[k - 4]
+        for j in range(k - 4, k):
+            x = x + run.dt[j] * (given.A @ x)
+        r = (run.x[k] - x - known.mean)[some]
+        assert verdicts.statistics[k, 0] == pytest.approx(r @ inverse @ r / 2.0, rel=1e-9)
+        looked += 1
+    assert looked > 300 and horizon.residuals is known
+
+
+def test_a_fit_knows_the_residuals_of_its_windows() -> None:
+    rng = np.random.default_rng(8)
+    x = np.zeros((2001, 2))
+    for k in range(2000):
+        x[k + 1] = x[k] + 0.01 * (np.array([[-1.0, 0.5], [0.0, -2.0]]) @ x[k]) + 0.01 * rng.normal(size=2)
+    run = Transient(np.arange(2001) * 0.01, x, np.zeros((2001, 0)))
+    fitted = fit(run, additive="noise", horizons=[2, 10], widths="constant")  # type: ignore[arg-type]
+    steps = run.transitions()
+    _, residual = fitted.over_horizons(steps.k, fitted.normalised_columns(steps), steps.dt, steps.x_next)
+    for j, h in enumerate((2, 10)):
+        r = residual[:, j][~np.isnan(residual[:, j, 0])]
+        assert len(r) == 2001 - h
+        np.testing.assert_allclose(fitted.residuals_at(h).mean, r.mean(axis=0), rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(fitted.residuals_at(h).covariance, np.cov(r.T, bias=True), rtol=1e-9)
+    again = UncertainLTI.from_dict(fitted.to_dict())
+    assert again.to_dict() == fitted.to_dict()
+    assert np.array_equal(again.residuals_at(10).covariance, fitted.residuals_at(10).covariance)

@@ -511,7 +511,7 @@ def test_windows_go_as_far_as_the_recordings_support(validation):
 
 @pytest.mark.parametrize("statistics", ["median", "", ","])
 def test_statistics_that_are_none_are_refused(validation, statistics):
-    with pytest.raises(FitError, match="choose from energy, mean, ewma, cusum, chi2, or all"):
+    with pytest.raises(FitError, match="choose from energy, mean, ewma, cusum, chi2, mewma, or all"):
         kinds_of(statistics)
 
 

@@ -52,8 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--statistics",
         metavar="LIST",
-        help="with --false-alarms: arm these statistics over a window, too: energy, mean, ewma, cusum, chi2, with "
-        "commas between them, or all",
+        help="with --false-alarms: arm these statistics over a window, too: energy, mean, ewma, cusum, chi2, "
+        "mewma, with commas between them, or all",
     )
     parser.add_argument(
         "--output",
@@ -127,7 +127,7 @@ def run(options: argparse.Namespace) -> int:
         calibration = calibrate(validation, options.false_alarms, statistics=options.statistics or ())
         data["calibration"] = calibration.to_dict()
         if calibration.alarm_rule is not None:
-            model = model.replace(alarm=calibration.rules, residuals=model.residuals or validation.model.residuals)
+            model = model.with_residuals_of(validation.model).replace(alarm=calibration.rules)
         elif options.output is not None:
             refusal = f"{options.output}: not written: {calibration.words}"
     with options.progress.stage("injecting faults") as step:

@@ -231,7 +231,7 @@ def _fitted(
 
     def build(theta: Array, d: Array) -> _Envelope:
         nominal, half = theta.reshape(columns.count, -1, n), d.reshape(columns.count, -1, n)
-        arrays = {
+        arrays: dict[str, Any] = {
             "A": nominal[:, :n].transpose(0, 2, 1),
             "B": nominal[:, n:p].transpose(0, 2, 1),
             "c": nominal[:, p],
@@ -249,7 +249,7 @@ def _fitted(
         raise FitError(f"horizon of {steps} steps: {error}") from None
     mean_width = 2.0 * (sums.width_sum @ d) / sums.count
     X = model.operating_point.X
-    return envelope.horizon, {
+    return envelope.horizon.with_residuals(engine.fleet.residuals(envelope)), {
         "steps": steps,
         "seconds": float(np.median(part.dt)),
         "widths": widths,

@@ -670,11 +670,7 @@ def _judged(block: Block, model: Envelope) -> Judged:
 
 def _inside_and_half(model: Envelope, block: Block) -> tuple[NDArray[np.bool_], Array]:
     """The verdict on each row of each transition, and its half-width, both (n, K)."""
-    centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
-    if block.base is None:
-        model.columns_centre_and_half(block.signals, block.dt, centre, half)
-    else:
-        model.columns_centre_and_half(block.signals, block.dt, centre, half, block.base)
+    centre, half = _centre_and_half(model, block)
     inside: NDArray[np.bool_] = centre - half <= block.x_next
     if block.base is not None:  # of a horizon the verdict is the utilisation
         with np.errstate(over="ignore", invalid="ignore"):
@@ -682,6 +678,14 @@ def _inside_and_half(model: Envelope, block: Block) -> tuple[NDArray[np.bool_], 
     centre += half
     inside &= block.x_next <= centre
     return inside, half
+
+
+def _centre_and_half(model: Envelope, block: Block) -> tuple[Array, Array]:
+    """Of each transition, both (n, K)."""
+    centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
+    base = () if block.base is None else (block.base,)
+    model.columns_centre_and_half(block.signals, block.dt, centre, half, *base)
+    return centre, half
 
 
 def _judged_in_doubt(block: Block, model: Envelope, known: Array) -> Judged | None:
@@ -783,9 +787,7 @@ def residual_sums(part: Partition, model: Envelope) -> tuple[Array, Array]:
     """
     total, products = np.zeros(part.n), np.zeros((part.n, part.n))
     for block in _pieces(part):
-        centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
-        model.columns_centre_and_half(block.signals, block.dt, centre, half)
-        r = block.x_next - centre
+        r = block.x_next - _centre_and_half(model, block)[0]
         total += r.sum(axis=1)
         products += _gram(r, r)
     return total, products

@@ -21,10 +21,12 @@ CONTAINMENT = "containment"
 """Kind of `AlarmRule`."""
 PER_STATE = ("energy", "mean", "ewma", "cusum")
 """Kinds of `StatisticRule` that look at the utilisation of each state."""
-JOINT = "chi2"
-"""Kind of `StatisticRule` that looks at the one-step residuals of all states together."""
-KINDS = (*PER_STATE, JOINT)
+JOINT = ("chi2", "mewma")
+"""Kinds of `StatisticRule` that look at the residuals of all states together."""
+KINDS = (*PER_STATE, *JOINT)
 """Kinds of `StatisticRule`."""
+FADING = ("ewma", "cusum", "mewma")
+"""Kinds that forget little by little; the others forget what is older than the window."""
 
 
 @dataclass(frozen=True)
@@ -106,19 +108,23 @@ class StatisticRule:
     - ``ewma``: :math:`|e_k|` of the low-pass :math:`e_k = e_{k-1} + (u_k - e_{k-1}) Δt_k / (T + Δt_k)`;
     - ``cusum``: the larger of :math:`s_k^± = \max(0, s_{k-1}^± T / (T + Δt_k) + (± u_k - a) Δt_k / T)`, with a the
       allowance: a sum that forgets, so that what it reaches in a session does not grow with its length;
-    - ``chi2``: :math:`\sum (r_k - \bar r)^T C^{-1} (r_k - \bar r) Δt_k / T` of the one-step residuals of all states
-      together, with the mean and the covariance of `UncertainLTI.residuals`.
+    - ``chi2``: :math:`\sum (r_k - \bar r)^T C^{-1} (r_k - \bar r) Δt_k / T` of the residuals of all states together,
+      with the mean and the covariance of `UncertainLTI.residuals` or, at a horizon, of `Horizon.residuals`;
+    - ``mewma``: :math:`e_k^T (s_k C)^{-1} e_k` of the same residuals' low-pass
+      :math:`e_k = e_{k-1} + (r_k - \bar r - e_{k-1}) λ_k`, :math:`λ_k = Δt_k / (T + Δt_k)`, whose covariance is
+      :math:`s_k C` with :math:`s_k = (1 - λ_k)^2 s_{k-1} + λ_k^2`: at a constant step :math:`λ / (2 - λ)`, where it
+      begins (Lowry et al., Technometrics 34, 1992).
 
     Parameters
     ----------
-    kind : {"energy", "mean", "ewma", "cusum", "chi2"}
+    kind : {"energy", "mean", "ewma", "cusum", "chi2", "mewma"}
         The statistic.
     window_s : float
-        T, s.
+        T, s; 0 for the last verdict alone, of every kind but ``cusum``.
     threshold : float or sequence of float (n,)
         What raises the alarm if it is exceeded: of every state, or of each.
     horizon : int, default 1
-        Steps of the bounds whose utilisation it takes; chi2 takes those of one step.
+        Steps of the bounds whose utilisation or residuals it takes.
     allowance : float, default 0.0
         a of ``cusum``: the utilisation that adds nothing.
 
@@ -139,10 +145,13 @@ class StatisticRule:
             raise ModelError(
                 f"alarm: kind is {reprlib.repr(self.kind)}; it must be one of {', '.join((CONTAINMENT, *KINDS))}"
             )
-        if not (_number(self.window_s) and 0.0 < self.window_s <= LONGEST_S):
+        if not (
+            _number(self.window_s) and 0.0 <= self.window_s <= LONGEST_S and (self.window_s or self.kind != "cusum")
+        ):
+            least = "a positive number of seconds" if self.kind == "cusum" else "a number of seconds, 0 for one verdict"
             raise ModelError(
-                f"alarm: window_s of {self.kind} is {reprlib.repr(self.window_s)}; it must be a positive number of "
-                f"seconds, at most {LONGEST_S:g}"
+                f"alarm: window_s of {self.kind} is {reprlib.repr(self.window_s)}; it must be {least}, at most "
+                f"{LONGEST_S:g}"
             )
         each = self.threshold if isinstance(self.threshold, (list, tuple)) else (self.threshold,)
         if not each or not all(_number(t) and 1 / LARGEST <= t <= LARGEST for t in each):
@@ -151,12 +160,12 @@ class StatisticRule:
                 f"one for each state, {1 / LARGEST:g} to {LARGEST:g}"
             )
         if isinstance(self.threshold, (list, tuple)):
-            if self.kind == JOINT:
-                raise ModelError("alarm: chi2 is one number for all states, so its threshold must be one number")
+            if self.kind in JOINT:
+                raise ModelError(
+                    f"alarm: {self.kind} is one number for all states, so its threshold must be one number"
+                )
             object.__setattr__(self, "threshold", tuple(map(float, self.threshold)))
         _check_horizon(self.horizon)
-        if self.kind == JOINT and self.horizon != 1:
-            raise ModelError("alarm: chi2 takes the residuals of one step; leave its horizon out")
         if not (_number(self.allowance) and 0.0 <= self.allowance <= LARGEST):
             raise ModelError(
                 f"alarm: allowance is {reprlib.repr(self.allowance)}; it must be a number, 0 to {LARGEST:g}"
@@ -165,7 +174,7 @@ class StatisticRule:
             raise ModelError(f"alarm: allowance goes with cusum; leave it out of {self.kind}")
 
     def thresholds(self, n: int) -> tuple[float, ...]:
-        """The threshold of each state, or the one of chi2.
+        """The threshold of each state, or the one of a joint statistic.
 
         Parameters
         ----------
@@ -174,7 +183,7 @@ class StatisticRule:
 
         Returns
         -------
-        tuple of float (n,), or (1,) of chi2
+        tuple of float (n,), or (1,) of a joint statistic
             Positive.
 
         Raises
@@ -182,7 +191,7 @@ class StatisticRule:
         ModelError
             There are thresholds for another number of states.
         """
-        if self.kind == JOINT:
+        if self.kind in JOINT:
             return (float(self.threshold),)  # type: ignore[arg-type]  # checked above
         if not isinstance(self.threshold, tuple):
             return (float(self.threshold),) * n
@@ -201,11 +210,13 @@ class StatisticRule:
             "mean": f"mean of the utilisation{over}",
             "ewma": f"moving average of the utilisation{over}",
             "cusum": f"cumulative sum of the utilisation{over}",
-            JOINT: "chi-square of the residuals",
+            "chi2": f"chi-square of the residuals{over}",
+            "mewma": f"joint moving average of the residuals{over}",
         }[self.kind]
+        span = f"over {self.window_s:.3g} s" if self.window_s else "of one verdict"
         limits = self.threshold if isinstance(self.threshold, tuple) else (self.threshold,)
         low, high = f"{min(limits):.3g}", f"{max(limits):.3g}"
-        return f"{what} over {self.window_s:.3g} s above {low if low == high else f'{low} to {high}'}"
+        return f"{what} {span} above {low if low == high else f'{low} to {high}'}"
 
     def to_dict(self) -> dict[str, Any]:
         """The rule as the model file holds it.

@@ -1129,6 +1129,8 @@ class Runs:
     ----------
     count : int
         Number of horizons.
+    residuals : buffer of doubles (horizons n,)
+        x less the centre, normalised, where the last `push` gives the utilisation; the next one writes there.
 
     Raises
     ------
@@ -1137,6 +1139,8 @@ class Runs:
     """
 
     count = cython.declare(cython.Py_ssize_t, visibility="readonly")
+    residuals = cython.declare(object, visibility="readonly")
+    _residual: cython.double[::1]
     _judge = cython.declare(Judge)
     _runner = cython.declare(Judge)
     _longest: cython.Py_ssize_t
@@ -1189,6 +1193,8 @@ class Runs:
             self._one_v, self._mean = _doubles(np.zeros(n)), _doubles(np.zeros(m or 1))
             self._rate, self._spread = _doubles(np.zeros(n)), _doubles(np.zeros(n))
             self._blank = array("d", np.full(self.count * n, np.nan).tobytes())
+            self.residuals = array("d", self._blank)
+            self._residual = self.residuals
         else:
             self._steps, self._tables = steps, tables
             self._x, self._time = np.zeros((n, longest)), np.zeros(longest)
@@ -1240,8 +1246,8 @@ class Runs:
         self._x[:, newest] = self._start[:, newest] = z[:n, 0]
         self._time[newest], self._control[:, newest], self._vectors[:, newest] = 0.0, 0.0, s
         self._runner._advance_columns(self._x, self._time, self._control, z, dt)
-        found = np.full((self.count, n), np.nan)
-        for values, steps, (theta, delta, v) in zip(found, self._steps, self._tables, strict=True):
+        found, left = np.full((2, self.count, n), np.nan)
+        for values, residual, steps, (theta, delta, v) in zip(found, left, self._steps, self._tables, strict=True):
             if steps > self._under_way:
                 break
             k = (newest - steps + 1) % self._longest
@@ -1251,7 +1257,9 @@ class Runs:
             phi = np.concatenate([self._start[:, run], self._control[:, run] / time, ones])
             places, weights = (None, None) if schedule is None else schedule.corners(self._vectors[:, run])
             centre, half = centre_and_half(theta, delta, v, phi, time, places, weights, self._x[:, run])
-            values[:] = utilisation_of(x_next - centre[:, 0], half[:, 0])
+            residual[:] = x_next - centre[:, 0]
+            values[:] = utilisation_of(residual, half[:, 0])
+        self.residuals = array("d", left.tobytes())
         return array("d", found.tobytes())
 
     @cython.cfunc
@@ -1310,6 +1318,8 @@ class Runs:
         values: cython.double[::1] = blank
         for h in range(self.count):
             if self._steps[h] > self._under_way:
+                for i in range(h * n, self.count * n):
+                    self._residual[i] = values[i]
                 break
             k = self._newest - self._steps[h] + 1
             if k < 0:
@@ -1342,6 +1352,7 @@ class Runs:
                 x_next = normalised(x_next, judge._steady[i], judge._scale[i])
                 value = centre_of(self._x[i * longest + k], time, self._rate[i])
                 size = half_of(time, self._spread[i], v[i])
+                self._residual[h * n + i] = x_next - value
                 values[h * n + i] = utilisation_of(x_next - value, size)
         return blank
 

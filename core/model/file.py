@@ -221,7 +221,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         "sampling": sampling,
         "domain": domain,
         "alarm": _alarm(data.get("alarm", {}), data["format"] != FORMATS[0]),
-        "residuals": _residuals(data["residuals"]) if "residuals" in data else None,
+        "residuals": Residuals.from_dict(data["residuals"]) if "residuals" in data else None,
         "signatures": Signature.list_from(data.get("signatures", [])),
         "repeats": Repeats.from_dict(data["frozen"]) if data.get("frozen") is not None else None,
         "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in _object(data.get("fit", {}), "fit").items()},
@@ -243,14 +243,6 @@ def _alarm(data: Any, newer: bool) -> tuple[Rule, ...]:
     if "margin" in alarm:
         alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
     return (AlarmRule(**alarm),)
-
-
-def _residuals(data: Any) -> Residuals:
-    found = _object(data, "residuals", {"mean", "covariance"})
-    for name in ("mean", "covariance"):
-        if name not in found:
-            raise ModelError(f"field 'residuals.{name}' is missing; fit the model again")
-    return Residuals(**found)
 
 
 def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[str, Any]]:

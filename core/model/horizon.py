@@ -25,6 +25,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.bounds import Judge, centre_and_half
+from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked, regressors, tables
 
@@ -256,6 +257,8 @@ class Horizon:
         Half-width that T does not multiply, normalised; 0 by default.
     widths : {"growing", "constant"}, default "growing"
         Constant if dA, dB and dc are 0.
+    residuals : Residuals, optional
+        Of the windows of the fit; default unknown.
 
     Raises
     ------
@@ -274,6 +277,7 @@ class Horizon:
         dc: ArrayLike | None = None,
         v: ArrayLike | None = None,
         widths: Widths = "growing",
+        residuals: Residuals | None = None,
     ) -> None:
         if isinstance(steps, bool) or not isinstance(steps, int) or not 2 <= steps <= MOST_STEPS:
             raise ModelError(f"horizons: steps is {steps!r}; it must be a whole number, 2 to {MOST_STEPS}")
@@ -304,6 +308,9 @@ class Horizon:
             raise ModelError(
                 f"horizon of {steps} steps: widths are constant, and dA, dB or dc is not 0; call it growing"
             )
+        if residuals is not None and len(residuals.mean) != n:
+            raise ModelError(f"{here}residuals of {plural(len(residuals.mean), 'state')} for {plural(n, 'state')}")
+        self.residuals = residuals
 
     def __repr__(self) -> str:
         return f"Horizon({self.steps} steps, {self.widths} half-widths)"
@@ -317,6 +324,22 @@ class Horizon:
     def tables(self) -> tuple[Array, Array, Array]:
         """Nominal elements and half-widths side by side, and what T does not multiply (`terms.tables`)."""
         return tables({name: getattr(self, name) for name in ARRAYS})
+
+    def with_residuals(self, residuals: Residuals | None) -> Horizon:
+        """The same envelope with other residuals.
+
+        Parameters
+        ----------
+        residuals : Residuals or None
+            Of its windows.
+
+        Returns
+        -------
+        Horizon
+            Of the same bits.
+        """
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        return Horizon(self.steps, **arrays, widths=self.widths, residuals=residuals)
 
     def columns_centre_and_half(
         self, z: Array, time: Array, centre: Array, half: Array, base: Array, schedule: Schedule | None = None
@@ -354,13 +377,14 @@ class Horizon:
         Returns
         -------
         dict
-            Steps, widths, and the arrays of each block.
+            Steps, widths, the arrays of each block, and the residuals if they are known.
         """
         arrays = {name: getattr(self, name) for name in ARRAYS}
         if not self.lead:
             arrays = {name: value[None] for name, value in arrays.items()}
         blocks = [{name: value[r].tolist() for name, value in arrays.items()} for r in range(len(arrays["v"]))]
-        return {"steps": self.steps, "widths": self.widths, "blocks": blocks}
+        found = {"steps": self.steps, "widths": self.widths, "blocks": blocks}
+        return found | ({} if self.residuals is None else {"residuals": self.residuals.to_dict()})
 
     @classmethod
     def list_from(cls, data: Any, n: int, m: int, blocks: int | None) -> tuple[Horizon, ...]:
@@ -394,8 +418,8 @@ class Horizon:
             here = f"horizons[{i}]"
             if not isinstance(entry, dict) or "steps" not in entry or "blocks" not in entry:
                 raise ModelError(f"field '{here}' must be an object with 'steps', 'widths' and 'blocks'")
-            if unknown := set(entry) - {"steps", "widths", "blocks"}:
-                raise ModelError(f"unknown field '{here}.{min(unknown)}'; known are blocks, steps, widths")
+            if unknown := set(entry) - {"steps", "widths", "blocks", "residuals"}:
+                raise ModelError(f"unknown field '{here}.{min(unknown)}'; known are blocks, residuals, steps, widths")
             parts = entry["blocks"]
             if not isinstance(parts, list) or len(parts) != (blocks or 1):
                 raise ModelError(f"field '{here}.blocks' must be a list of {plural(blocks or 1, 'block')}")
@@ -414,7 +438,15 @@ class Horizon:
                     value = np.zeros(shape) if part.get(name) is None else part[name]
                     arrays[name].append(checked(value, f"{here}.blocks[{r}].{name}", shape, name in HALF_WIDTHS))
             stacked = {name: values[0] if blocks is None else np.stack(values) for name, values in arrays.items()}
-            found.append(cls(entry["steps"], **stacked, widths=entry.get("widths", "growing")))
+            residuals = entry.get("residuals")
+            found.append(
+                cls(
+                    entry["steps"],
+                    **stacked,
+                    widths=entry.get("widths", "growing"),
+                    residuals=None if residuals is None else Residuals.from_dict(residuals, f"{here}.residuals"),
+                )
+            )
         return tuple(found)
 
 

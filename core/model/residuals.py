@@ -1,7 +1,8 @@
-"""Residuals: mean and covariance of what the centre of one step leaves unexplained of healthy recordings."""
+"""Residuals: mean and covariance of what the centre of the bounds leaves unexplained of healthy recordings."""
 
 from __future__ import annotations
 
+import reprlib
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,15 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.terms import checked
 
+_KEYS = ("mean", "covariance")
 _LEAST = 1e-12
 """Share of the state's own variance below which what the others leave of it counts as none."""
 
 
 class Residuals:
     """Mean and covariance of r_k = x_{k+1} - centre_k over the transitions of the fit, normalised.
+
+    Of a horizon those of x_{k+h} less the centre of its envelope, over the windows of the fit.
 
     Parameters
     ----------
@@ -86,3 +90,34 @@ class Residuals:
             Plain data.
         """
         return {"mean": self.mean.tolist(), "covariance": self.covariance.tolist()}
+
+    @classmethod
+    def from_dict(cls, data: Any, name: str = "residuals") -> Residuals:
+        """From a model file.
+
+        Parameters
+        ----------
+        data : Any
+            What `to_dict` gives.
+        name : str
+            Field, for errors.
+
+        Returns
+        -------
+        Residuals
+            As listed.
+
+        Raises
+        ------
+        ModelError
+            It is not that; names the field.
+        """
+        if not isinstance(data, dict):
+            raise ModelError(f"field '{name}' is not an object")
+        for key in data:
+            if key not in _KEYS:
+                raise ModelError(f"unknown field '{name}.{reprlib.repr(key)[1:-1]}'; known are {', '.join(_KEYS)}")
+        for key in _KEYS:
+            if key not in data:
+                raise ModelError(f"field '{name}.{key}' is missing; fit the model again")
+        return cls(**data)

@@ -224,9 +224,61 @@ class UncertainLTI:
                 )
             if isinstance(rule, StatisticRule):
                 rule.thresholds(self.n)
-            if rule.kind == JOINT and self.residuals is None:
-                raise ModelError("alarm: chi2 needs the covariance of the residuals; fit the model again")
+            if rule.kind in JOINT:
+                self.residuals_at(rule.horizon, rule.kind)
         return rules
+
+    def residuals_at(self, horizon: int = 1, kind: str = "a joint statistic") -> Residuals:
+        """Mean and covariance of the healthy residuals of one step, or of a horizon.
+
+        Parameters
+        ----------
+        horizon : int
+            Steps; 1 or those of a horizon.
+        kind : str
+            What needs them, for errors.
+
+        Returns
+        -------
+        Residuals
+            Of the recordings of the fit.
+
+        Raises
+        ------
+        ModelError
+            They are not known.
+        """
+        found = self.residuals if horizon == 1 else self.horizons[self.steps.index(horizon)].residuals
+        if found is None:
+            over = "" if horizon == 1 else f" over {horizon} steps"
+            raise ModelError(f"alarm: {kind} needs the covariance of the residuals{over}; fit the model again")
+        return found
+
+    def with_residuals_of(self, other: UncertainLTI, instead: bool = False) -> UncertainLTI:
+        """The same model with the residuals of another fit, as far as it has the same horizons.
+
+        Parameters
+        ----------
+        other : UncertainLTI
+            Where the residuals are taken from.
+        instead : bool
+            Also in place of those that are known.
+
+        Returns
+        -------
+        UncertainLTI
+            With the same bounds.
+        """
+
+        def chosen(own: Residuals | None, given: Residuals | None) -> Residuals | None:
+            return given or own if instead else own or given
+
+        of = {horizon.steps: horizon.residuals for horizon in other.horizons}
+        return self.replace(
+            residuals=chosen(self.residuals, other.residuals),
+            horizons=[h.with_residuals(chosen(h.residuals, of.get(h.steps))) for h in self.horizons],
+            signatures=self.signatures,
+        )
 
     @property
     def alarm_rule(self) -> AlarmRule:
@@ -640,7 +692,7 @@ class UncertainLTI:
         Returns
         -------
         Runs or None
-            With the same bits as `horizon_utilisation`; None without horizons.
+            With the same bits as `over_horizons`; None without horizons.
         """
         if not self.horizons:
             return None
@@ -669,8 +721,8 @@ class UncertainLTI:
         begin = unbroken_over(k, vectors, self.schedule)
         return windows_of(judge, z, vectors, dt, begin, steps, self.n, self.m)
 
-    def horizon_utilisation(self, k: NDArray[np.intp], z: Array, dt: Array, x_next: Array) -> Array:
-        """Where in the envelopes over several steps the arrivals lie.
+    def over_horizons(self, k: NDArray[np.intp], z: Array, dt: Array, x_next: Array) -> tuple[Array, Array]:
+        """Where in the envelopes over several steps the arrivals lie, and how far from their centres.
 
         Parameters
         ----------
@@ -687,15 +739,19 @@ class UncertainLTI:
         -------
         array (N, horizons, n)
             (x - centre) / half; NaN where the window of the horizon is broken.
+        array (N, horizons, n)
+            x - centre, normalised; NaN likewise.
         """
-        found = np.full((len(dt), len(self.horizons), self.n), np.nan)
-        for j, (windows, centre, half) in enumerate(self._envelopes(k, z, dt)):
+        found = np.full((2, len(dt), len(self.horizons), self.n), np.nan)
+        utilisation, residual = found
+        for j, (windows, centre, half) in enumerate(self.envelopes(k, z, dt)):
             with np.errstate(over="ignore", invalid="ignore"):
-                found[windows.last, j] = utilisation_of(x_next[windows.last].T - centre, half).T
-        return found
+                left = x_next[windows.last].T - centre
+                residual[windows.last, j], utilisation[windows.last, j] = left.T, utilisation_of(left, half).T
+        return utilisation, residual
 
-    def horizon_halves(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[Array]:
-        """Half-widths of the envelopes over several steps.
+    def envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:
+        """Envelopes over several steps.
 
         Parameters
         ----------
@@ -708,14 +764,13 @@ class UncertainLTI:
 
         Yields
         ------
+        Windows
+            Of each horizon; good until the next one is asked for.
         array (n, K)
-            Of each horizon at the ends of its windows, normalised.
+            Centre at their ends, normalised.
+        array (n, K)
+            Half-width there, normalised.
         """
-        for _, _, half in self._envelopes(k, z, dt):
-            yield half
-
-    def _envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:
-        """Windows of each horizon, with the centre and half-width of the envelope at their ends."""
         windows_of_each = self.windows(k, z, dt, self.steps)
         for horizon, windows in zip(self.horizons, windows_of_each, strict=True):
             centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)

@@ -77,7 +77,8 @@ class AlarmStatistic(Protocol):
         violated : bool
             Whether the one-step bounds are violated by a state that counts.
         table : buffer of doubles
-            Rows of n: the utilisation for one step and for each horizon, then the one-step residual.
+            Rows of n: the utilisation for one step and for each horizon, then the residual of each likewise
+            (`residual_row`).
 
         Returns
         -------
@@ -246,10 +247,7 @@ class AlarmOverThreshold:
         self.rule: Rule = rule
         self._row = row_of(rule, model)
         self._begin = self._row * model.n
-        whitening = None
-        if rule.kind == JOINT:
-            assert model.residuals is not None, "checked by the model"
-            whitening = model.residuals.whitening(counted)
+        residuals = model.residuals_at(rule.horizon) if rule.kind in JOINT else None
         self._statistic = Statistic(
             KINDS.index(rule.kind),
             model.n,
@@ -257,8 +255,8 @@ class AlarmOverThreshold:
             rule.thresholds(model.n),
             counted.tolist(),
             rule.allowance,
-            None if model.residuals is None else model.residuals.mean,
-            whitening,
+            None if residuals is None else residuals.mean,
+            None if residuals is None else residuals.whitening(counted),
         )
 
     @property
@@ -305,7 +303,7 @@ class AlarmOverThreshold:
         -------
         array of bool (K,)
             The alarm after each.
-        array (K, n), or (K, 1) of chi2
+        array (K, n), or (K, 1) of a joint statistic
             `values` after each.
         """
         after, values = self._statistic.push_all(dt, table[:, self._row])
@@ -316,7 +314,7 @@ class AlarmOverThreshold:
 
         Returns
         -------
-        array of doubles (n,), or (1,) of chi2
+        array of doubles (n,), or (1,) of a joint statistic
             NaN before the first verdict.
         """
         return self._statistic.values()
@@ -335,11 +333,26 @@ def row_of(rule: Rule, model: UncertainLTI) -> int:
     Returns
     -------
     int
-        0 for one step.
+        0 for the utilisation of one step.
     """
-    if rule.kind == JOINT:
-        return 1 + len(model.horizons)
-    return 0 if rule.horizon == 1 else 1 + [h.steps for h in model.horizons].index(rule.horizon)
+    place = 0 if rule.horizon == 1 else 1 + model.steps.index(rule.horizon)
+    return residual_row(model) + place if rule.kind in JOINT else place
+
+
+def residual_row(model: UncertainLTI) -> int:
+    """Row of the table at which the residuals begin: those of one step, then those of each horizon.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Its horizons are in the rows before.
+
+    Returns
+    -------
+    int
+        Half of the number of rows.
+    """
+    return 1 + len(model.horizons)
 
 
 class Alarm:
@@ -380,7 +393,7 @@ class Alarm:
                 parts.append(AlarmWindow(rule, (begin + np.flatnonzero(counted)).tolist() if begin else ()))
             else:
                 parts.append(AlarmOverThreshold(rule, model, counted))
-                names += [f"{label}/{s}" for s in ((EVERY_STATE,) if rule.kind == JOINT else model.state_names)]
+                names += [f"{label}/{s}" for s in ((EVERY_STATE,) if rule.kind in JOINT else model.state_names)]
         self.parts, self.names = tuple(parts), tuple(names)
         self.needs_table = any(rule.horizon > 1 or rule.kind != "containment" for rule in self.rules)
         self._only = self.parts[0] if len(self.parts) == 1 else None
@@ -468,8 +481,8 @@ class Alarm:
                 blamed = [names[j] for j in np.flatnonzero(left & self._counted)]
                 found += [Raised(label, rule.kind, rule.horizon, name, 1.0) for name in blamed or [""]]
                 continue
-            begin = sum(1 if r.kind == JOINT else n for r in self.rules[:i] if not isinstance(r, AlarmRule))
-            if rule.kind == JOINT:
+            begin = sum(1 if r.kind in JOINT else n for r in self.rules[:i] if not isinstance(r, AlarmRule))
+            if rule.kind in JOINT:
                 found.append(Raised(label, rule.kind, rule.horizon, "", float(values[begin])))
                 continue
             for j in np.flatnonzero(self._counted).tolist():

@@ -34,7 +34,7 @@ from uncertain_lti.model.bounds import (
 )
 from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Alarm, Raised
+from uncertain_lti.monitor.alarm import Alarm, Raised, residual_row
 from uncertain_lti.monitor.arming import Armed
 from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Looked
 from uncertain_lti.sampling.sampler import Step
@@ -659,9 +659,11 @@ class EnvelopeMonitor:
         return Verdict(step, self.alarm, judgement, status, alarms, longer, looked)
 
     def _table(self, judgement: Judgement, longer: Any) -> array[float]:
-        """Utilisation for one step and for each horizon, and the residual, row by row."""
-        over = array("d") if longer is None else longer
-        return array("d", judgement.numbers(UTILISATION)) + over + array("d", judgement.numbers(RESIDUAL))
+        """Utilisation for one step and for each horizon, then the residuals likewise, row by row."""
+        utilisation, residual = array("d", judgement.numbers(UTILISATION)), array("d", judgement.numbers(RESIDUAL))
+        if self._runs is None:
+            return utilisation + residual
+        return utilisation + array("d", longer) + residual + array("d", self._runs.residuals)
 
     def check(self, transient: Transient, armed: Armed | None = None) -> Verdicts:
         """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.
@@ -730,7 +732,7 @@ class EnvelopeMonitor:
             steps, arrival, z, x_next = steps.take(kept), arrival[kept], z[:, kept], x_next[kept]
             residual, unknown = residual[kept], unknown[kept]
         longer = np.full((count, len(model.horizons), n), np.nan)
-        longer[arrival] = model.horizon_utilisation(steps.k, z, steps.dt, x_next)
+        longer[arrival], longer_residual = model.over_horizons(steps.k, z, steps.dt, x_next)
         judged[arrival] = True
         unknown_regime = np.zeros(count, dtype=bool)
         unknown_regime[arrival] = unknown
@@ -739,11 +741,12 @@ class EnvelopeMonitor:
         alarms = Alarm(self.alarms.rules, model, self._counted)
         statistics = np.full((count, len(alarms.names)), np.nan)
         alarm, each = np.zeros(count, dtype=bool), np.zeros((count, len(alarms.rules)), dtype=bool)
-        dt, rows = np.zeros(count), 2 + len(model.horizons) if alarms.needs_table else 0
+        dt, half = np.zeros(count), residual_row(model) if alarms.needs_table else 0
         dt[arrival] = steps.dt
-        table = np.empty((count, rows, n))
-        if rows:
-            table[:, 0], table[:, 1:-1], table[arrival, -1] = utilisation, longer, residual
+        table = np.empty((count, 2 * half, n))
+        if half:
+            table[:, 0], table[:, 1:half] = utilisation, longer
+            table[arrival, half], table[arrival, half + 1 :] = residual, longer_residual
         for start, stop in _alarm_spans(transient.t_ns, armed):
             part = slice(start, stop)
             on = np.flatnonzero(judged[part]) + start

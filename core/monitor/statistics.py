@@ -21,10 +21,11 @@ import numpy as np
 
 from uncertain_lti.base.compiled import use_twin
 
-ENERGY, MEAN, EWMA, CUSUM, CHI2 = range(5)
+ENERGY, MEAN, EWMA, CUSUM, CHI2, MEWMA = range(6)
 """Kinds, in the order of `model.alarm_rule.KINDS`."""
 LIMIT = 10.0
-"""Utilisation at which ewma and cusum cut: a jump violates the bounds anyway, and must not hold them for long."""
+"""Where ewma and cusum cut the utilisation, and mewma the residuals, uncorrelated and in standard deviations: a jump is
+seen anyway, and must not hold them for long."""
 _MOST = 1e50  # at which the others cut: squares stay finite
 _LONGEST = 1_000_000  # verdicts of a window at most
 
@@ -41,16 +42,16 @@ class Statistic:
         Number of states.
     window_s : float
         T, s.
-    thresholds : sequence of float (n,), or (1,) of chi2
+    thresholds : sequence of float (n,), or (1,) of chi2 and mewma
         What raises the alarm if it is exceeded.
     counted : sequence of bool (n,)
         States that raise it.
     allowance : float
         Of cusum.
     mean : array (n,), optional
-        Of the residuals, for chi2.
+        Of the residuals, for chi2 and mewma.
     whitening : array (n, n), optional
-        Of the residuals, for chi2.
+        Of the residuals, for chi2 and mewma.
 
     Attributes
     ----------
@@ -74,10 +75,11 @@ class Statistic:
     _counted: cython.uchar[::1]
     _mean: cython.double[::1]
     _whitening: cython.double[::1]
-    _terms: cython.double[::1]  # what this verdict adds
+    _terms: cython.double[::1]  # what this verdict adds; of mewma the uncorrelated residuals
     _values: cython.double[::1]  # the statistic over its threshold
     _up: cython.double[::1]  # sum of the newer half; moving average; sum upwards
     _down: cython.double[::1]
+    _spread: cython.double  # variance of the moving average of mewma, that of a residual being 1; 0 before the first
     _queue: cython.double[::1]  # terms of the newer half, sums of the older one
     _steps: cython.longlong[::1]  # ns
     _begin: cython.Py_ssize_t  # of the window in the queue
@@ -98,20 +100,21 @@ class Statistic:
         mean: Any = None,
         whitening: Any = None,
     ) -> None:
-        size = 1 if kind == CHI2 else n
+        joint = kind == CHI2 or kind == MEWMA
+        size = 1 if joint else n
         if len(thresholds) != size or len(counted) != n:
             raise ValueError("the thresholds or the states that count do not fit the states")
-        if kind == CHI2 and (np.shape(mean) != (n,) or np.shape(whitening) != (n, n)):
+        if joint and (np.shape(mean) != (n,) or np.shape(whitening) != (n, n)):
             raise ValueError("the residuals do not fit the states")
         self._kind, self._n, self._size = kind, n, size
         self._window, self._window_ns = window_s, round(window_s * 1e9)
         self._allowance = allowance
         self._thresholds = array("d", map(float, thresholds))
-        self._counted = bytearray([1]) if kind == CHI2 else bytearray(map(bool, counted))
+        self._counted = bytearray([1]) if joint else bytearray(map(bool, counted))
         self._mean = _doubles(np.zeros(n) if mean is None else mean)
         self._whitening = _doubles(np.zeros(1) if whitening is None else np.reshape(whitening, -1))
-        self._terms, self._values = array("d", bytes(8 * size)), array("d", bytes(8 * size))
-        self._up, self._down = array("d", bytes(8 * size)), array("d", bytes(8 * size))
+        self._terms, self._values = array("d", bytes(8 * n)), array("d", bytes(8 * size))
+        self._up, self._down = array("d", bytes(8 * n)), array("d", bytes(8 * n))
         self._capacity = 64
         self._queue, self._steps = array("d", bytes(8 * size * 64)), array("q", bytes(8 * 64))
         self.reset()
@@ -119,8 +122,11 @@ class Statistic:
     def reset(self) -> None:
         """Forget every verdict."""
         i: cython.Py_ssize_t
+        for i in range(self._n):
+            self._up[i] = self._down[i] = 0.0
         for i in range(self._size):
-            self._up[i] = self._down[i] = self._values[i] = 0.0
+            self._values[i] = 0.0
+        self._spread = 0.0
         self._begin = self._middle = self._end = 0
         self._total = 0
         self._pushed = False
@@ -131,7 +137,7 @@ class Statistic:
 
         Returns
         -------
-        array of doubles (n,), or (1,) of chi2
+        array of doubles (n,), or (1,) of chi2 and mewma
             A copy; of mean, ewma and cusum with the sign of the utilisation.
         """
         if not self._pushed:
@@ -180,7 +186,7 @@ class Statistic:
         -------
         array of bool (K,)
             The alarm after each.
-        array (K, n), or (K, 1) of chi2
+        array (K, n), or (K, 1) of chi2 and mewma
             `values` after each.
 
         Raises
@@ -237,6 +243,18 @@ class Statistic:
                 self._up[i] = value = value if value > 0.0 else 0.0
                 self._down[i] = down = down if down > 0.0 else 0.0
                 self._values[i] = (value if value >= down else -down) / self._thresholds[i]
+        elif self._kind == MEWMA:
+            weight = dt / (self._window + dt)
+            kept = 1.0 - weight
+            if self._spread == 0.0:
+                self._spread = weight / (2.0 - weight)
+            else:
+                self._spread = kept * kept * self._spread + weight * weight
+            value = 0.0
+            for i in range(self._n):
+                self._up[i] += (self._terms[i] - self._up[i]) * weight
+                value += self._up[i] * self._up[i]
+            self._values[0] = value / self._spread / self._thresholds[0]
         else:
             self._move(dt)
             weight = self._window if self._total <= self._window_ns else dt
@@ -263,14 +281,20 @@ class Statistic:
         square: cython.double = 0.0
         limit: cython.double
         nothing: cython.bint = True
-        if self._kind == CHI2:
+        if self._kind == CHI2 or self._kind == MEWMA:
             for i in range(n):
+                value = row[begin + i]
+                if value == value:
+                    nothing = False
                 total = 0.0
                 for j in range(i + 1):
                     total += self._whitening[i * n + j] * (row[begin + j] - self._mean[j])
+                if self._kind == MEWMA:
+                    self._terms[i] = -LIMIT if total < -LIMIT else total if total <= LIMIT else LIMIT
                 square += total * total
-            self._terms[0] = square if square <= _MOST else _MOST
-            return True
+            if self._kind == CHI2:
+                self._terms[0] = square if square <= _MOST else _MOST
+            return not nothing
         limit = LIMIT if self._kind == EWMA or self._kind == CUSUM else _MOST
         for i in range(n):
             value = row[begin + i]

@@ -21,8 +21,8 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, row_of
 from uncertain_lti.validation.part import Part, unit_numbers
 
-ALLOWANCE = 0.25
-"""Allowance of cusum: utilisation of a quarter adds nothing."""
+ALLOWANCES = (0.02, 0.1)
+"""Allowances of cusum: utilisation of so much adds nothing. What is small and lasts is what it is for."""
 WINDOWS = (5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Windows tried, in median steps, as far as the recordings support them."""
 SUPPORT = 10
@@ -94,7 +94,8 @@ def sets_of(kinds: Sequence[str], model: UncertainLTI, windows: Sequence[int]) -
     Returns
     -------
     list of tuple of Rule
-        Containment of one step and of each horizon, and every kind at one step and at the longest horizon.
+        Containment of one step and of each horizon, and every kind at one step and at the longest horizon; there chi2
+        of one verdict, too.
     """
     steps = [horizon.steps for horizon in model.horizons]
     dt = model.sampling.dt_median
@@ -103,9 +104,11 @@ def sets_of(kinds: Sequence[str], model: UncertainLTI, windows: Sequence[int]) -
         assert dt is not None
         rules: list[Rule] = [AlarmRule(1, 1, 1.0, h) for h in (1, *steps)]
         for kind in kinds:
-            for h in (1, *steps[-1:]) if kind != JOINT else (1,):
-                allowance = ALLOWANCE if kind == "cusum" else 0.0
-                rules.append(StatisticRule(kind, count * dt, 1.0, h, allowance))
+            for h in (1, *steps[-1:]):
+                for allowance in ALLOWANCES if kind == "cusum" else (0.0,):
+                    rules.append(StatisticRule(kind, count * dt, 1.0, h, allowance))
+        if "chi2" in kinds and steps:
+            rules.append(StatisticRule("chi2", 0.0, 1.0, steps[-1]))
         found.append(tuple(rules))
     return found
 
@@ -138,7 +141,7 @@ def values_of(rules: Sequence[Rule], part: Part, table: Array | None = None) -> 
             severity = np.where(np.isnan(sizes).all(axis=1), 0.0, np.nan_to_num(sizes, nan=np.inf).max(axis=1))
             found.append(severity[:, None])
             continue
-        values = np.zeros((part.judged, 1 if rule.kind == JOINT else model.n))
+        values = np.zeros((part.judged, 1 if rule.kind in JOINT else model.n))
         for start, stop in part.spans:
             span = slice(start, stop)
             violated = np.zeros(stop - start, dtype=bool)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule, containment
-from uncertain_lti.monitor.alarm import Alarm, raised
+from uncertain_lti.monitor.alarm import Alarm, raised, residual_row
 from uncertain_lti.validation.armed import SUPPORT, WINDOWS, Armed, kinds_of, sets_of, supported_windows
 from uncertain_lti.validation.false_alarms import borrowed_margin, peaks
 from uncertain_lti.validation.intervals import cluster_size, rate_interval
@@ -422,7 +422,8 @@ def _add_fault(part: Part, table: Array, start: int, i: int, shift: Array, longe
     if not longer or model is None:
         return
     width = float(part.mean_width[i] / model.operating_point.X[i])
-    table[:, -1, i] += shift * width
+    first = residual_row(model)
+    table[:, first, i] += shift * width
     dt = float(np.median(part.dt))
     kept = float(np.clip(1.0 + dt * np.mean(model.A[..., i, i]), 0.0, 1.0))  # of what was added, after one step
     for j, horizon in enumerate(model.horizons):
@@ -430,6 +431,7 @@ def _add_fault(part: Part, table: Array, start: int, i: int, shift: Array, longe
         added = np.convolve(shift, weights)[: len(shift)] * width
         half = 0.5 * part.longer_width[j, i] / model.operating_point.X[i]
         table[:, 1 + j, i] += added / max(half, 1e-300) if half == half else 0.0
+        table[:, first + 1 + j, i] += added
 
 
 def _memory(part: Part, rules: Sequence[Rule]) -> int:

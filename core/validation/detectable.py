@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
-from uncertain_lti.model.alarm_rule import JOINT, AlarmRule
+from uncertain_lti.model.alarm_rule import FADING, AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.instants import to_ns
@@ -502,7 +502,7 @@ def _memory(model: UncertainLTI, step: float) -> int:
         if isinstance(rule, AlarmRule):
             own = rule.window
         else:
-            own = math.ceil(rule.window_s / step * (1 if rule.kind in ("energy", "mean", JOINT) else DECAYED))
+            own = math.ceil(rule.window_s / step * (DECAYED if rule.kind in FADING else 1))
         found = max(found, own + rule.horizon)
     return min(found, LONGEST_MEMORY)
 

@@ -60,6 +60,8 @@ class Part:
         Mean width of the left-out model's envelopes over each horizon on this part, recorded units; NaN likewise.
     residual : array (K, n), optional
         x_next - centre of every judged transition, normalised.
+    longer_residual : array (K, H, n), optional
+        The same of each horizon; NaN as in `longer`.
     judged_by : UncertainLTI, optional
         The full model with the residuals of the left-out one: what a statistic on this part takes.
     """
@@ -83,6 +85,7 @@ class Part:
     longer: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     longer_width: Array = field(default_factory=lambda: np.zeros((0, 0)))
     residual: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    longer_residual: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     judged_by: UncertainLTI | None = None
 
     def __repr__(self) -> str:
@@ -138,8 +141,8 @@ class Part:
 
     @property
     def table(self) -> Array:
-        """(K, rows, n): utilisation for one step and for each horizon, then the residual, as `AlarmStatistic` takes."""
-        rows = [self.utilisation[:, None], self.longer, self.residual[:, None]]
+        """(K, rows, n): utilisation for one step and for each horizon, then the residuals, for `AlarmStatistic`."""
+        rows = [self.utilisation[:, None], self.longer, self.residual[:, None], self.longer_residual]
         return np.concatenate([row for row in rows if row.size or not self.judged], axis=1)
 
     def alarms(self, rule: AlarmRule) -> int:
@@ -186,6 +189,7 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
     judged = verdicts.judged
     steps = transient.transitions()
     steps = steps.take(judged[steps.k + 1])
+    longer, longer_width, longer_residual = _longer(model, full, steps, verdicts.horizon_utilisation[judged][:, 1:])
     width = (verdicts.upper - verdicts.lower)[judged]
     point = full.operating_point
     low, high = full.bounds(
@@ -217,23 +221,28 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         full.main_block(full.normalised_columns(steps)),
         model,
         transient,
-        *_longer(model, full, steps, verdicts.horizon_utilisation[judged][:, 1:]),
+        longer,
+        longer_width,
         residual=_residual(model, steps),
-        judged_by=full.replace(residuals=model.residuals or full.residuals),
+        longer_residual=longer_residual,
+        judged_by=full.with_residuals_of(model, instead=True),
     )
 
 
-def _longer(model: UncertainLTI, full: UncertainLTI, steps: Transitions, table: Array) -> tuple[Array, Array]:
-    """Utilisation and mean widths over the horizons of the full model."""
+def _longer(model: UncertainLTI, full: UncertainLTI, steps: Transitions, table: Array) -> tuple[Array, Array, Array]:
+    """Utilisation, mean widths and residuals over the horizons of the full model."""
     places = {horizon.steps: j for j, horizon in enumerate(full.horizons)}
-    utilisation = np.full((len(steps.dt), len(places), model.n), np.nan)
-    width = np.full((len(places), model.n), np.nan)
-    halves = model.horizon_halves(steps.k, model.normalised_columns(steps), steps.dt)
-    for j, (horizon, half) in enumerate(zip(model.horizons, halves, strict=True)):
-        utilisation[:, places[horizon.steps]] = table[:, j]
+    utilisation, residual = np.full((2, len(steps.dt), len(places), model.n), np.nan)
+    width, point = np.full((len(places), model.n), np.nan), model.operating_point
+    x_next = point.normalise_x(steps.x_next).T
+    envelopes = model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)
+    for j, (windows, centre, half) in enumerate(envelopes):
+        place = places[windows.steps]
+        utilisation[:, place] = table[:, j]
         if half.size:
-            width[places[horizon.steps]] = 2.0 * half.mean(axis=1) * model.operating_point.X
-    return utilisation, width
+            residual[windows.last, place] = (x_next[:, windows.last] - centre).T
+            width[place] = 2.0 * half.mean(axis=1) * point.X
+    return utilisation, width, residual
 
 
 def _residual(model: UncertainLTI, steps: Transitions) -> Array:
