@@ -1,6 +1,6 @@
 """Damaged recordings and messages, seeded: each must give a clear error or a correct reading, soon and in bounds.
 
-    ./run python benchmarks/fuzz.py                            # 10 000 of each kind: files, structures, messages
+    ./run python benchmarks/fuzz.py                            # 10 000 of each kind
     ./run python benchmarks/fuzz.py --kinds structures --count 2000
     ./run python benchmarks/fuzz.py --count 1 --seed 4711      # one case again
 
@@ -9,7 +9,10 @@ a minute, when it asks for over 1 GiB of memory, or when its reading is wrong. A
 disagree (by message and by arrays, or layout and middleware), when a chunk whose checksum holds gives a message that
 was never written, or when an annotated copy holds other messages than were read, or another library cannot walk it.
 Files are damaged after they are written; structures are made to hurt (`tests/hostile_writer.py`): lengths that reach
-over their neighbours, the smallest records repeated, chunks in chunks, schemas without end, an index that lies. Cases
+over their neighbours, the smallest records repeated, chunks in chunks, schemas without end, an index that lies.
+Streams are whole, and in disorder (`tests/perturbed.py`): the verdicts of a live session, with schedule, horizons,
+statistics, memories and frozen states, have to be those of a check, to the bit, also after a swap of the model and if
+messages are held up. Cases
 run in processes of their own, in batches, so that what kills a process or hangs in C is noticed as well.
 """
 
@@ -44,6 +47,7 @@ if not any("uncertain_lti" in str(p) for p in sys.path):
 
 from bag_writer import Layout, Message, Topic, cdr, float64, header, message, places, write  # noqa: E402
 from hostile_writer import hostile_file  # noqa: E402
+from perturbed import CASES, difference  # noqa: E402
 
 LIMIT_CPU_S = 5.0  # of processor time, which a busy machine does not lengthen
 LIMIT_S = 60.0
@@ -374,11 +378,22 @@ def read_recorded(kind: str, paths: list[Any], messages: list[bytes]) -> tuple[i
     return None if stamps[-1] == NO_STAMP else int(stamps[-1]), values[-1].tobytes()
 
 
-KINDS: dict[str, Callable[[random.Random, Path], str]] = {
+def judge_streams(rng: random.Random, folder: Path) -> str:
+    """One stream in disorder, live and in a recording."""
+    case = rng.choice(CASES)
+    ours, theirs = case(np.random.default_rng(rng.randrange(2**32)), folder)
+    if found := difference(ours, theirs):
+        raise WrongError(f"{case.__name__}: {found}")
+    return f"{case.__name__.replace('_', ' ')}, {'with' if any(row['alarm'] for row in ours) else 'without'} an alarm"
+
+
+DAMAGED: dict[str, Callable[[random.Random, Path], str]] = {
     "files": read_file,
     "structures": read_structure,
     "messages": read_messages,
 }
+"""Kinds whose cases are read, or refused."""
+KINDS = DAMAGED | {"streams": judge_streams}
 
 
 # --- many cases ---------------------------------------------------------------------------------------------

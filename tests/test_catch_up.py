@@ -6,8 +6,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import perturbed
 import pytest
 from engine_bag import SIGNALS, engine_bag
+from perturbed import Arriving as Message
+from perturbed import held_up, run
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit, read_transients
 from uncertain_lti.monitor.catch_up import MOST, STALL, WINDOW, CatchUp
@@ -19,7 +22,6 @@ from uncertain_lti.sampling.reading import read_as_fitted
 
 STEP = 0.025  # s, of the engine's recordings
 STOPPED = 4.0  # s
-Message = tuple[float, str, int, bytes]  # when it comes (s, steady), topic, log time, data
 
 
 @pytest.fixture(scope="module")
@@ -47,43 +49,8 @@ def sent(bag: Bag) -> list[Message]:
     return [((m.log_time_ns - began) * 1e-9, m.topic, m.log_time_ns, m.data) for m in messages]
 
 
-def run(session: Session, messages: list[Message], until: float = 100.0) -> list[Any]:
-    """Verdicts of a session that gets these messages, and is asked every 0.1 s what it releases, as by the node."""
-    verdicts, now = list[Any](), 0.0
-    for at, topic, arrival_ns, data in [*messages, (until, "", 0, b"")]:
-        while now + 0.1 < at:
-            now += 0.1
-            for message in session.release(now):
-                verdicts += session.take(*message, now)[0]
-        if topic:
-            for message in session.accept(topic, arrival_ns, data, at):
-                verdicts += session.take(*message, at)[0]
-    return verdicts
-
-
-def held_up(messages: list[Message], topic: str, begin: float, until: float) -> list[Message]:
-    """Messages of a topic sent from `begin` to `until` come at its end, in a burst; a microsecond between two."""
-    moved = []
-    for at, name, log_time, data in messages:
-        come = until - 1e-3 + 1e-6 * len(moved) if name == topic and begin <= at < until else at
-        moved.append((come, name, log_time + round((come - at) * 1e9), data))
-    return sorted(moved, key=lambda m: m[0])
-
-
 def stopped(messages: list[Message], begin: float, chunk: int, first: str) -> list[Message]:
-    """Nothing is received for 4 s; then what came meanwhile does, a chunk of one topic after a chunk of the other."""
-    end = begin + STOPPED
-    late = [m for m in messages if begin <= m[0] < end]
-    by_topic = {
-        t: [m for m in late if m[1] == t] for t in sorted({STATE_TOPIC, CONTROL_TOPIC}, key=lambda t: t != first)
-    }
-    order = []
-    for at in range(0, len(late), chunk):
-        for own in by_topic.values():
-            order += own[at : at + chunk]
-    burst = [(end + 2e-5 * i, t, log + round((end - at) * 1e9), d) for i, (at, t, log, d) in enumerate(order)]
-    others = [m for m in messages if not begin <= m[0] < end]
-    return sorted([*burst, *others], key=lambda m: m[0])
+    return perturbed.stopped(messages, begin, chunk, first, STOPPED)
 
 
 DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {

@@ -208,7 +208,7 @@ class AlarmWindow:
         assert isinstance(self.rule, AlarmRule)
         given: NDArray[np.bool_] = np.ones(len(violated), dtype=bool)
         if self._places:
-            sizes = np.abs(table.reshape(len(violated), -1)[:, self._places])
+            sizes = np.abs(table.reshape(len(table), table.shape[1] * table.shape[2])[:, self._places])
             given = np.asarray(~np.isnan(sizes).all(axis=1))
             violated = np.asarray(~(sizes <= self._margin).all(axis=1))
         after = np.concatenate([[False], raised(violated[given], self.rule)])

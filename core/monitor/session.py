@@ -607,9 +607,9 @@ class Session:
         try:
             (value,) = self._reads_condition.read(data)[1]
         except UnreadableError as error:
-            value = math.nan
             if topic not in self._readers:
                 self._note_unreadable(topic, error)
+            return  # as in a recording: the value before it is kept
         self.arming.learn(value)
         if not self.arming.on:
             self.monitor.reset()

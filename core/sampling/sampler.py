@@ -89,9 +89,10 @@ class _Message:
     arrival: cython.longlong
     stamp: cython.longlong
     values: list[float]
+    given: Any  # the values as received, where one of them does not count
 
     def __init__(self, arrival: cython.longlong, stamp: cython.longlong, values: list[float]) -> None:
-        self.arrival, self.stamp, self.values = arrival, stamp, values
+        self.arrival, self.stamp, self.values, self.given = arrival, stamp, values, None
 
 
 @cython.cclass
@@ -388,6 +389,8 @@ class Sampler:
             )
         for i, signal in state.limited:
             if not signal.admits(message.values[i]):
+                if message.given is None:
+                    message.given = list(message.values)
                 message.values[i] = math.nan
                 self.counters.add(INVALID, signal.name)
         if state is self._clock:
@@ -533,13 +536,16 @@ class Sampler:
         Returns
         -------
         list of (int, int, list of float)
-            Stamp (0 for none) and arrival, ns, and values.
+            Stamp (0 for none) and arrival, ns, and values: those too that do not count for the signals of this sampler.
         """
         state: _Topic = self._topics[topic]
         message: _Message
         found = []
         for message in state.kept:
-            found.append((message.stamp, message.arrival, message.values))
+            values = message.values
+            if message.given is not None:
+                values = [given if math.isnan(v) else v for v, given in zip(values, message.given, strict=True)]
+            found.append((message.stamp, message.arrival, values))
         return found
 
     def latest(self) -> tuple[int, list[float]] | None:
