@@ -18,7 +18,7 @@ from bag_writer import JAZZY, Layout, Message, Topic, cdr, float64, header, mess
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
 from uncertain_lti.cli.deployed import check_recording
-from uncertain_lti.model.alarm_rule import KINDS, AlarmRule, StatisticRule
+from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.horizon import Horizon, Run
 from uncertain_lti.model.repeats import Repeats
@@ -98,17 +98,22 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
         return {name: found[name] * scale for name in ARRAYS}
 
     lengths = [h for h in LENGTHS if may(0.35)]
-    horizons = [Horizon(h, **elements(0.4)) for h in lengths]
+
+    def residuals() -> Residuals:
+        spread = rng.normal(size=(n, n))
+        return Residuals(1e-3 * rng.normal(size=n), 1e-4 * (spread @ spread.T + np.eye(n)))
+
+    horizons = [Horizon(h, **elements(0.4), residuals=residuals()) for h in lengths]
     run = elements(0.9)
     rules: list[Any] = [AlarmRule(int(m_ := rng.integers(1, 4)), int(m_ + rng.integers(0, 6)))]
     rules += [AlarmRule(3, 9, 1.3, horizon=h) for h in lengths[:1] if may(0.5)]
     for kind in KINDS:
         if may(0.5):
-            over = int(rng.choice([1, *lengths])) if kind != "chi2" else 1
-            threshold = tuple(rng.uniform(0.3, 1.5, n).tolist()) if kind != "chi2" else float(rng.uniform(2, 30))
+            over = int(rng.choice([1, *lengths]))
+            threshold = float(rng.uniform(2, 30)) if kind in JOINT else tuple(rng.uniform(0.3, 1.5, n).tolist())
             allowance = 0.2 if kind == "cusum" else 0.0
-            rules.append(StatisticRule(kind, float(rng.choice([0.05, 0.3, 1.0])), threshold, over, allowance))
-    spread = rng.normal(size=(n, n))
+            windows = [0.05, 0.3, 1.0] if kind == "cusum" else [0.0, 0.05, 0.3, 1.0]
+            rules.append(StatisticRule(kind, float(rng.choice(windows)), threshold, over, allowance))
     size = n + m
     pairs = size * (size - 1) // 2
     return UncertainLTI(
@@ -127,7 +132,7 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
             Occupancy(4, rng.random((pairs, 4, 4)) < 0.9) if may(0.5) else None,
         ),
         alarm=rules,
-        residuals=Residuals(1e-3 * rng.normal(size=n), 1e-4 * (spread @ spread.T + np.eye(n))),
+        residuals=residuals(),
         repeats=Repeats(rng.choice([0.0, 0.02, 0.05], n)) if may(0.6) else None,
     )  # fmt: skip
 
