@@ -25,6 +25,7 @@ from test_sampler_arrays import columns
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli.main import main
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.outputs import NODE, RECORDED
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, NamedVector, VerdictRecords
@@ -364,6 +365,18 @@ def test_dropped_messages_get_flags_without_a_verdict(engine, tmp_path):
     found = same_verdicts(model, verdicts, tmp_path / "out.mcap")
     assert np.isnan(found["flags"][1][1].position).all() and stamp(found["flags"][1][1]) == verdicts.transient.t_ns[0]
     assert len(found["violation"]) == made.verdicts and len(found["lower"]) == int(verdicts.judged.sum())
+
+
+def test_statistics_of_the_alarm_are_in_the_copy(engine, tmp_path):
+    folder, model = engine
+    model = model.replace(alarm=[AlarmRule(2, 3), StatisticRule("energy", 0.5, 0.5)])
+    verdicts, _ = check(model, folder / "bad.mcap", tmp_path / "out.mcap")
+    with AnyReader([tmp_path / "out.mcap"], default_typestore=None) as reader:
+        (topic,) = (c for c in reader.connections if c.topic == f"{NODE}/statistics")
+        found = [reader.deserialize(data, topic.msgtype) for _, _, data in reader.messages([topic])]
+    assert [tuple(m.name) for m in found] == [tuple(f"energy/{name}" for name in model.state_names)] * len(found)
+    rows = np.array([m.position for m in found])
+    assert rows.tobytes() == verdicts.statistics[verdicts.judged].tobytes() and (np.abs(rows) > 1).any()
 
 
 def test_records_of_many_verdicts_are_those_of_one_at_a_time():

@@ -107,6 +107,14 @@ def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end
     assert level == OK and re.fullmatch(r"the alarm is over after 0\.0\d+ s", line)
 
 
+def test_diagnostics_say_how_near_each_statistic_is_to_its_threshold() -> None:
+    rig = Rig(alarm=(AlarmRule(2, 5), StatisticRule("energy", 5 * STEP, (0.5, 4.0))))
+    rig.send(10, off=0.5)
+    values = rig.session.report(rig.now, TIMEOUT)[0].values
+    assert values["energy state"] == "a" and float(values["energy threshold"]) == 0.5
+    assert float(values["energy"]) == pytest.approx(0.25, rel=1e-6)
+
+
 def test_an_alarm_by_a_statistic_says_which_state_and_by_how_much() -> None:
     """Every sample lies within its bounds; their mean does not."""
     rig = Rig([AlarmRule(2, 5), StatisticRule("mean", 5 * STEP, 0.4)])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.terms import ARRAYS
@@ -23,6 +24,15 @@ def with_horizons() -> UncertainLTI:
     return model.replace(horizons=[Horizon(h, **arrays) for h in (2, 3)])
 
 
+def with_statistics() -> UncertainLTI:
+    rules = [AlarmRule(2, 3), StatisticRule("energy", 0.2, 0.5, horizon=3), StatisticRule("cusum", 1.0, 2.0)]
+    return with_horizons().replace(alarm=rules)
+
+
+def statistics_of(model: UncertainLTI) -> tuple[str, ...]:
+    return EnvelopeMonitor(model).alarms.names
+
+
 @pytest.mark.parametrize("output", OUTPUTS, ids=[output.name for output in OUTPUTS])
 def test_every_row_is_whole(output: Output) -> None:
     """A vector carries a number that verdicts have, one by one and over a transient; a flag carries the alarm."""
@@ -31,9 +41,9 @@ def test_every_row_is_whole(output: Output) -> None:
     assert bool(output.title) == (output.view in ("states", "steps"))
     if output.position:
         assert (output.position in NUMBERS) == (output.of == "states")
-        model = with_horizons() if output.of == "horizons" else leibov2006()
+        model = leibov2006() if output.of == "states" else with_statistics()
         verdicts = EnvelopeMonitor(model).check(Transient(np.arange(3.0), np.ones((3, 5)), np.ones((3, 4))))
-        rows = names_of(model.state_names, model.steps)[output.of]
+        rows = names_of(model.state_names, model.steps, statistics_of(model))[output.of]
         assert getattr(verdicts, output.position).reshape(3, -1).shape == (3, len(rows))
         assert not output.velocity or getattr(verdicts, output.velocity).shape == (3,)
 
@@ -44,7 +54,7 @@ def test_names_are_unique_and_those_of_every_message_come_first() -> None:
     assert every == sorted(every, reverse=True)
 
 
-@pytest.mark.parametrize("make", [leibov2006, with_horizons])
+@pytest.mark.parametrize("make", [leibov2006, with_horizons, with_statistics])
 def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], UncertainLTI]) -> None:
     """Of a judged sample, one outside the domain, and one without a verdict, for every vector of the table."""
     model = make()
@@ -58,15 +68,17 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
     ]
     verdicts = [monitor.judge(step) for step in steps]
     assert [v.judged for v in verdicts] == [True, True, False] and verdicts[1].outside_domain
-    encode = VerdictMessages(names, steps=model.steps).encode
-    outputs = [o for o in RECORDED if not o.position or names_of(names, model.steps)[o.of]]
-    assert ("horizon_utilisation" in encode) == bool(model.horizons) == (len(outputs) == len(RECORDED))
+    statistics = statistics_of(model)
+    encode = VerdictMessages(names, steps=model.steps, statistics=statistics).encode
+    outputs = [o for o in RECORDED if not o.position or names_of(names, model.steps, statistics)[o.of]]
+    assert ("horizon_utilisation" in encode) == bool(model.horizons)
+    assert ("statistics" in encode) == bool(statistics) == (len(outputs) == len(RECORDED))
     numbers = {o.position: np.array([v.numbers(o.position) for v in verdicts]) for o in outputs if o.position}
     for verdict in verdicts:
         for name in numbers:
             assert verdict.packed(name) == np.array(verdict.numbers(name)).tobytes()
     numbers |= {o.velocity: np.array([getattr(v, o.velocity) for v in verdicts]) for o in RECORDED if o.velocity}
-    records = VerdictRecords(names, {output.name: i for i, output in enumerate(outputs)}, model.steps)
+    records = VerdictRecords(names, {output.name: i for i, output in enumerate(outputs)}, model.steps, statistics)
     times = np.arange(3)
     data, _ = records.encode(
         times,
@@ -89,4 +101,4 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
 def test_the_numbers_of_horizons_are_named_by_state_and_steps() -> None:
     every = names_of(["speed", "pressure"], [5, 40])
     assert every["horizons"] == ("speed@1", "pressure@1", "speed@5", "pressure@5", "speed@40", "pressure@40")
-    assert names_of(["speed"], [])["horizons"] == ()
+    assert names_of(["speed"])["horizons"] == names_of(["speed"])["statistics"] == ()

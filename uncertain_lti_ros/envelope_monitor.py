@@ -168,6 +168,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             if candidate == self.session.rule:
                 return
             self.session.follow(candidate)
+            self.outputs.prepare(self.session)
             self._event_log.turned(self.session, (), time.monotonic(), ", as its rule has changed")
             self.get_logger().info(self.session.whole_rule_text())
             if self.active:
@@ -184,7 +185,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._take_all(self.session, self.session.release(now, all_of_them=True), now)
             session.go_on_from(self.session)
         self.session = session
-        self.outputs.prepare(self.session.model.state_names, self.session.model.steps)
+        self.outputs.prepare(self.session)
         self.snapshots.clear()
         if self.active:
             self.subscribe()
@@ -247,7 +248,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         self.reason = ""
         self.outputs.open(self.settings.real("heartbeat"))
-        self.outputs.prepare(self.session.model.state_names, self.session.model.steps)
+        self.outputs.prepare(self.session)
         self.get_logger().info(f"configured with {Path(path).name}: {self.session.model}")
         if self.session.model.sampling.dt_median is None:
             self.get_logger().info("the model has no median step, so nothing is predicted")

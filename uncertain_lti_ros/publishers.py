@@ -107,17 +107,16 @@ class Outputs:
             self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered)
         self._violation = self.publishers[VIOLATION.name]
 
-    def prepare(self, names: Sequence[str], steps: Sequence[int] = ()) -> None:
-        """Lay out the messages of a model.
+    def prepare(self, session: Session) -> None:
+        """Lay out the messages of a model and its alarm.
 
         Parameters
         ----------
-        names : sequence of str
-            Of its states.
-        steps : sequence of int
-            Of its horizons.
+        session : Session
+            Has both.
         """
-        encode = VerdictMessages(names, sendable, steps).encode
+        model = session.model
+        encode = VerdictMessages(model.state_names, sendable, model.steps, session.monitor.alarms.names).encode
 
         def vectors(*when: str) -> list[_Vector]:
             chosen = [output.name for output in OUTPUTS if output.name in encode and output.when in when]

@@ -166,6 +166,7 @@ class Snapshots:
             },
             definition,
             session.model.steps,
+            session.monitor.alarms.names,
         )
 
     @property

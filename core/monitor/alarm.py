@@ -6,7 +6,7 @@ from array import array
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,24 @@ class Raised:
         if self.kind == "containment":
             return f"containment{state}{over}"
         return f"{self.kind}{state}{over} at {abs(self.value):.3g} times its threshold"
+
+
+class Nearest(NamedTuple):
+    """The statistic of a rule that is nearest to its threshold.
+
+    Parameters
+    ----------
+    state : str
+        Of which it is; `EVERY_STATE` for all together.
+    value : float
+        The statistic.
+    threshold : float
+        What raises the alarm if it is exceeded.
+    """
+
+    state: str
+    value: float
+    threshold: float
 
 
 class AlarmStatistic(Protocol):
@@ -387,7 +405,9 @@ class Alarm:
         self.rules, self.labels, self.alarm = tuple(rules), labels(rules), False
         self._model, self._counted = model, counted
         n, parts, names = model.n, list[AlarmStatistic](), list[str]()
+        self._begins: list[int] = []  # of each rule, where its numbers begin in `values`
         for rule, label in zip(self.rules, self.labels, strict=True):
+            self._begins.append(len(names))
             if isinstance(rule, AlarmRule):
                 begin = row_of(rule, model) * n
                 parts.append(AlarmWindow(rule, (begin + np.flatnonzero(counted)).tolist() if begin else ()))
@@ -443,6 +463,31 @@ class Alarm:
             found.extend(part.values())
         return found
 
+    def nearest(self, values: Sequence[float]) -> dict[str, Nearest]:
+        """Of each rule with a statistic the one that is nearest to its threshold.
+
+        Parameters
+        ----------
+        values : sequence of float
+            Of `values`.
+
+        Returns
+        -------
+        dict of str to Nearest
+            By the label of the rule; none of a rule of which all is NaN.
+        """
+        found, n = {}, self._model.n
+        for rule, label, begin in zip(self.rules, self.labels, self._begins, strict=True):
+            if isinstance(rule, AlarmRule):
+                continue
+            limits = rule.thresholds(n)
+            names = (EVERY_STATE,) if rule.kind in JOINT else self._model.state_names
+            part = zip(values[begin : begin + len(limits)], limits, names, strict=True)
+            known = [Nearest(name, value * limit, limit) for value, limit, name in part if value == value]
+            if known:
+                found[label] = max(known, key=lambda nearest: abs(nearest.value) / nearest.threshold)
+        return found
+
     def raised(self) -> tuple[int, ...]:
         """Rules that raise the alarm.
 
@@ -473,7 +518,7 @@ class Alarm:
             Each state that a rule blames; of a rule that blames none now, one without a state.
         """
         found = []
-        n, names = self._model.n, self._model.state_names
+        names = self._model.state_names
         for i in rules:
             rule, label = self.rules[i], self.labels[i]
             if isinstance(rule, AlarmRule):
@@ -481,7 +526,7 @@ class Alarm:
                 blamed = [names[j] for j in np.flatnonzero(left & self._counted)]
                 found += [Raised(label, rule.kind, rule.horizon, name, 1.0) for name in blamed or [""]]
                 continue
-            begin = sum(1 if r.kind in JOINT else n for r in self.rules[:i] if not isinstance(r, AlarmRule))
+            begin = self._begins[i]
             if rule.kind in JOINT:
                 found.append(Raised(label, rule.kind, rule.horizon, "", float(values[begin])))
                 continue

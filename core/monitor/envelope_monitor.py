@@ -183,7 +183,7 @@ class Verdict:
         Parameters
         ----------
         name : str
-            One of `NUMBERS`, or horizon_utilisation, row by row.
+            One of `NUMBERS`, horizon_utilisation, row by row, or statistics.
 
         Returns
         -------
@@ -194,6 +194,8 @@ class Verdict:
             return list(self._after)
         if name == "horizon_utilisation":
             return [*self.numbers("utilisation"), *(() if self._longer is None else self._longer)]
+        if name == "statistics":
+            return list[float](self.statistics.tolist())
         if self._judgement is None:
             return [math.nan] * len(self._after)
         return list[float](self._judgement.numbers(_OF_JUDGEMENT[name]).tolist())
@@ -204,7 +206,7 @@ class Verdict:
         Parameters
         ----------
         name : str
-            One of `NUMBERS`, or horizon_utilisation, row by row.
+            One of `NUMBERS`, horizon_utilisation, row by row, or statistics.
 
         Returns
         -------
@@ -212,6 +214,8 @@ class Verdict:
             Little-endian doubles.
         """
         found = self._after
+        if name == "statistics":
+            return self.statistics.tobytes() if self._statistics is None else self._statistics.tobytes()
         if name == "horizon_utilisation":
             return self.packed("utilisation") + (b"" if self._longer is None else bytes(self._longer.tobytes()))
         if name != "state":

@@ -39,9 +39,9 @@ class Output:
         Title of its plot, for the views "states" and "steps".
     limits : tuple of (str, float)
         Constant lines of its plot, for the view "states".
-    of : {"states", "horizons"}
-        What its numbers are of: the states, or the states at one step and at each horizon of the model. A model without
-        horizons does not have the latter.
+    of : {"states", "horizons", "statistics"}
+        What its numbers are of: the states, the states at one step and at each horizon of the model, or the statistics
+        of the alarm. A model without horizons, or an alarm without statistics, does not have the output.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Output:
     view: Literal["", "bound", "sample", "states", "steps", "alarm"] = ""
     title: str = ""
     limits: tuple[tuple[str, float], ...] = ()
-    of: Literal["states", "horizons"] = "states"
+    of: Literal["states", "horizons", "statistics"] = "states"
 
 
 FLAGS = Output(
@@ -101,6 +101,15 @@ OUTPUTS = (
         of="horizons",
     ),
     Output(
+        "statistics",
+        VECTOR_TYPE,
+        "judged",
+        "of an alarm with statistics, each over its threshold: beyond 1 and -1 it raises the alarm; `name` is "
+        "`kind/state`, `kind@steps/state` at a horizon, and `chi2/joint` of all states together",
+        position="statistics",
+        of="statistics",
+    ),
+    Output(
         "predicted_lower",
         VECTOR_TYPE,
         "predicted",
@@ -118,7 +127,9 @@ JUDGED = tuple(output for output in OUTPUTS if output.when == "judged")
 """The outputs that only a verdict has."""
 
 
-def names_of(states: Sequence[str], steps: Sequence[int]) -> dict[str, tuple[str, ...]]:
+def names_of(
+    states: Sequence[str], steps: Sequence[int] = (), statistics: Sequence[str] = ()
+) -> dict[str, tuple[str, ...]]:
     """Names of the numbers that outputs carry, by what they are of.
 
     Parameters
@@ -127,6 +138,8 @@ def names_of(states: Sequence[str], steps: Sequence[int]) -> dict[str, tuple[str
         Of the model.
     steps : sequence of int
         Of its horizons.
+    statistics : sequence of str
+        Of the alarm, of `Alarm.names`.
 
     Returns
     -------
@@ -134,4 +147,5 @@ def names_of(states: Sequence[str], steps: Sequence[int]) -> dict[str, tuple[str
         `state@steps` for horizons, one step first; none without horizons.
     """
     over = [1, *steps] if steps else []
-    return {"states": tuple(states), "horizons": tuple(f"{name}@{h}" for h in over for name in states)}
+    horizons = tuple(f"{name}@{h}" for h in over for name in states)
+    return {"states": tuple(states), "horizons": horizons, "statistics": tuple(statistics)}

@@ -936,6 +936,8 @@ class Session:
     def counts(self, now: float) -> dict[str, str]:
         """Counters by name: what was received, judged, dropped, late and missing, and how old each topic is.
 
+        Of each statistic of the alarm also the value of the state that is nearest to its threshold, and both.
+
         Parameters
         ----------
         now : float
@@ -962,6 +964,10 @@ class Session:
             "put in order": str(self.reordered),
             "dropped": str(sum(counters[status.value] for status in Status if status.dropped)),
         }
+        if self.last is not None:
+            for label, nearest in self.monitor.alarms.nearest(self.last.statistics.tolist()).items():
+                counts[label], counts[f"{label} threshold"] = repr(nearest.value), repr(nearest.threshold)
+                counts[f"{label} state"] = nearest.state
         for name in ("samples", "gaps", "resets", "missing"):
             counts[name] = str(counters[name])
         for name, count in sorted(counters.items()):

@@ -122,6 +122,8 @@ class Scene:
         Type name -> text of its definition.
     steps : sequence of int
         Of the horizons of the model.
+    statistics : sequence of str
+        Names of the statistics of the alarm.
     """
 
     entries: Sequence[Entry]
@@ -131,6 +133,7 @@ class Scene:
     notes: Mapping[str, str]
     definition: Callable[[str], str]
     steps: Sequence[int] = ()
+    statistics: Sequence[str] = ()
 
     def write(self, path: Path) -> int:
         """Write an MCAP file.
@@ -151,7 +154,7 @@ class Scene:
             The file cannot be written.
         """
         count = 0
-        encode = VerdictMessages(self.names, steps=self.steps).encode
+        encode = VerdictMessages(self.names, steps=self.steps, statistics=self.statistics).encode
         with open(path, "xb") as stream:
             writer = McapWriter(stream, "uncertain-lti")
             writer.metadata("uncertain_lti", self.notes)
@@ -169,7 +172,8 @@ class Scene:
                 writer.message(inputs[entry.topic], log_time, entry.data)
                 count += 1
                 for verdict in entry.verdicts:
-                    if (verdict.n, verdict.horizons) != (len(self.names), len(self.steps)):
+                    has = verdict.n, verdict.horizons, verdict.statistic_names
+                    if has != (len(self.names), len(self.steps), tuple(self.statistics)):
                         continue
                     for output, channel in outputs.items():
                         if output.when == "judged" and not verdict.judged:

@@ -101,6 +101,10 @@ class AnyVerdict(Protocol):
         """Number of horizons of the model."""
 
     @property
+    def statistic_names(self) -> tuple[str, ...]:
+        """Names of the statistics of the alarm."""
+
+    @property
     def judged(self) -> bool:
         """Whether there is a verdict."""
 
@@ -114,7 +118,7 @@ class AnyVerdict(Protocol):
         Parameters
         ----------
         name : str
-            One of `NUMBERS`, or horizon_utilisation.
+            One of `NUMBERS`, horizon_utilisation or statistics.
 
         Returns
         -------
@@ -134,11 +138,13 @@ class VerdictMessages:
         Makes the messages from names and `velocities`; raises ModelError.
     steps : sequence of int
         Of the model's horizons.
+    statistics : sequence of str
+        Names of the statistics of the alarm.
 
     Attributes
     ----------
     encode : dict
-        Of each vector of `OUTPUTS` that the model has, by name, the function that makes the message of a verdict.
+        By name the function that makes the message of a verdict, of each vector of `OUTPUTS` that model and alarm have.
     """
 
     def __init__(
@@ -146,9 +152,10 @@ class VerdictMessages:
         names: Sequence[str],
         make_vector: Callable[[Sequence[str], bool], NamedVector] = NamedVector,
         steps: Sequence[int] = (),
+        statistics: Sequence[str] = (),
     ) -> None:
-        every = names_of(names, steps)
-        self._over = make_vector(every["horizons"], False) if every["horizons"] else None
+        every = names_of(names, steps, statistics)
+        self._other = {of: make_vector(every[of], False) for of in ("horizons", "statistics") if every[of]}
         self._plain, self._marked = make_vector(names, False), make_vector(names, True)  # shared: their stamps repeat
         n = len(names)
         self._marks = {mark: struct.pack(f"<{n}d", *[mark] * n) for mark in (False, True)}
@@ -158,9 +165,9 @@ class VerdictMessages:
     def _encoder(self, output: Output) -> Callable[[AnyVerdict], bytes]:
         plain, marked, marks, no_mark = self._plain, self._marked, self._marks, self._no_mark
         position, velocity = output.position, output.velocity
-        if output.of == "horizons":
-            assert self._over is not None and not velocity
-            plain = self._over
+        if output.of != "states":
+            assert not velocity
+            plain = self._other[output.of]
 
         def encode(verdict: AnyVerdict) -> bytes:
             return plain(verdict.t_ns, verdict.packed(position))
@@ -183,10 +190,18 @@ class VerdictRecords:
         Number of the channel of each of `RECORDED` that is to be there, by name.
     steps : sequence of int
         Of the model's horizons.
+    statistics : sequence of str
+        Names of the statistics of the alarm.
     """
 
-    def __init__(self, names: Sequence[str], channels: Mapping[str, int], steps: Sequence[int] = ()) -> None:
-        self._n, every = len(names), names_of(names, steps)
+    def __init__(
+        self,
+        names: Sequence[str],
+        channels: Mapping[str, int],
+        steps: Sequence[int] = (),
+        statistics: Sequence[str] = (),
+    ) -> None:
+        self._n, every = len(names), names_of(names, steps, statistics)
         self._outputs = [o for o in RECORDED if o.name in channels and (not o.position or every[o.of])]
         self._channels = [channels[output.name] for output in self._outputs]
         self._count = [0] * len(self._outputs)

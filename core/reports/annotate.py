@@ -183,14 +183,14 @@ def annotate(
             copier = Copier(writer)
             numbers = [copier.declare(part) for part in contents]
             base = _base({c.topic for part in contents for c in part.channels.values()})
-            there = names_of(model.state_names, model.steps)
+            there = names_of(model.state_names, model.steps, verdicts.statistic_names)
             channels = {
                 output.name: copier.channel(_schema(copier, contents, output.type), f"{base}/{output.name}", "cdr", {})
                 for output in RECORDED
                 if there[output.of]
             }
             writer.metadata(METADATA, _about(contents, base, model, model_file, rule))
-            records = VerdictRecords(model.state_names, channels, model.steps)
+            records = VerdictRecords(model.state_names, channels, model.steps, verdicts.statistic_names)
             verdict_stream = _VerdictStream(writer, records, verdicts, decisions)
             total = sum(part.count for part in contents)
             counted: Iterable[object] = _weave(copier, contents, numbers, verdict_stream)
