@@ -28,6 +28,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.outputs import NODE, RECORDED
+from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, NamedVector, VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag
@@ -40,6 +41,7 @@ from uncertain_lti.sampling.sampler_arrays import Decisions, decided
 BAGS = Path(__file__).resolve().parents[1] / "bags"
 JUDGED = [output for output in outputs.JUDGED if output.of == "states"]
 TOPICS = {output.name: output.type for output in RECORDED if output.of == "states"}
+VERDICTS = [output.name for output in RECORDED if output.of == "states" and output.when != "changed"]
 SIGNALS_FOLDER = BAGS.parent / "config" / "signals"
 
 
@@ -119,7 +121,7 @@ def same_verdicts(model, verdicts, path, base=NODE):
     """The bits of the check, in what rosbags reads."""
     found, transient = by_rosbags(path, base), verdicts.transient
     judged = verdicts.judged
-    rows = {name: np.array([m.position for _, m in found[name]]) for name in TOPICS if name != "violation"}
+    rows = {name: np.array([m.position for _, m in found[name]]) for name in VERDICTS if name != "violation"}
     stamps = {name: np.array([stamp(m) for _, m in found[name]]) for name in rows}
     for name in rows:
         assert all(list(m.name) == list(model.state_names) for _, m in found[name])
@@ -134,6 +136,10 @@ def same_verdicts(model, verdicts, path, base=NODE):
     told = np.isfinite(flags).all(axis=1)
     assert np.array_equal(marks[told], np.repeat(verdicts.outside_domain[judged, None], model.n, axis=1))
     assert np.isnan(marks[~told]).all()
+    said, alarms = [(time, m.data) for time, m in found["reason"]], [(time, m.data) for time, m in found["violation"]]
+    assert all(a != b for (_, a), (_, b) in zip(said, said[1:], strict=False)) and len(said) >= 1
+    for time, text in said:
+        assert ("alarm: " in text) in {alarm for at, alarm in alarms if at == time}
     alarm = np.array([m.data for _, m in found["violation"]])
     assert len(alarm) == len(flags)
     if kept.all() and len(alarm) == len(transient):
@@ -274,7 +280,10 @@ def test_everything_recorded_is_in_the_copy(engine, tmp_path, compression, chunk
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
         assert summary.statistics.message_count == (
-            made.messages + 2 * made.verdicts + len(JUDGED) * int(verdicts.judged.sum())
+            made.messages
+            + 2 * made.verdicts
+            + len(JUDGED) * int(verdicts.judged.sum())
+            + len(list(over_recording(verdicts, model)))
         )
         assert len(summary.attachment_indexes) == 1 and len(summary.metadata_indexes) == 3
         assert [a.data for a in reader.iter_attachments()] == [b"\x00\x01" * 700_000]
@@ -383,7 +392,7 @@ def test_records_of_many_verdicts_are_those_of_one_at_a_time():
     rng = np.random.default_rng(3)
     for n in (1, 2, 5):
         names = [f"{'x' * i}é" for i in range(1, n + 1)]
-        records = VerdictRecords(names, {name: i for i, name in enumerate(TOPICS)})
+        records = VerdictRecords(names, {name: i for i, name in enumerate(VERDICTS)})
         plain, marked = NamedVector(names), NamedVector(names, velocities=True)
         for _ in range(2):
             count = 40

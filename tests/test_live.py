@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_writer import Layout, Message, Topic, cdr, float64, header, write
+from rosbags.highlevel import AnyReader
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.envelope_monitor import Verdict
+from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.sampling.reading import read_as_fitted
@@ -36,7 +38,7 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_processes import Diagnostics, World, open_world, until
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64
+from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import Trigger
 
 JUDGED = [output for output in outputs.JUDGED if output.of == "states"]  # the models here have no horizons
@@ -272,6 +274,40 @@ def test_header_time_gives_live_what_it_gives_offline(world: World, tmp_path: Pa
     status = world.status()
     assert status["verdicts"] == sum(v.judged for v in verdicts)
     assert sum(status["lost"].values()) == 0 and status["received"].keys() == {STATE, CONTROL}
+
+
+def test_statistics_and_the_reason_are_those_of_the_recording_and_of_a_snapshot(world: World, tmp_path: Path) -> None:
+    """A reader that joins after the last message still gets the last reason."""
+    model = by_hand(alarm=[AlarmRule(2, 5), StatisticRule("energy", 0.05, 0.5)])
+    path = saved(model, tmp_path)
+    bag = header_bag(model, tmp_path / "run.mcap", 200)
+    verdicts = [v for v in offline(path, bag) if v.judged]
+    loaded = UncertainLTI.load(path)
+    checked = EnvelopeMonitor(loaded).check(read_as_fitted(bag, loaded.signals))
+    said = [text for _, text in over_recording(checked, loaded)]
+    assert any("mean square of the utilisation over 0.05 s above 0.5: a" in text for text in said)
+    world.monitor(path, **{"snapshot.folder": str(tmp_path / "snapshots"), "state_timeout": 60.0})
+    kept = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    outputs = Outputs.of(world, "statistics")
+    reason = world.listen(String, "/envelope_monitor/reason", kept).connected()
+    reason.count(1)
+    world.command("play", bag, "--rate", 2.0).succeed(60)
+    got = outputs.topics["statistics"].count(len(verdicts))
+    assert {tuple(m.name) for m in got} == {("energy/a", "energy/b")}
+    assert [bits(m.position) for m in got] == [bits(v.statistics) for v in verdicts]
+    until(lambda: reason.messages[-1].data == said[-1], "the last reason")
+    expected = iter(["no verdict yet", *said])  # the publisher keeps one: of several at once a reader may miss some
+    assert all(any(text == m.data for text in expected) for m in reason.messages) and len(reason.messages) > 3
+    assert world.listen(String, "/envelope_monitor/reason", kept).count(1)[0].data == said[-1]
+    assert world.call(Trigger, "/envelope_monitor/snapshot", Trigger.Request()).success
+    until(lambda: list((tmp_path / "snapshots").glob("*.mcap")), "the snapshot")
+    (snapshot,) = (tmp_path / "snapshots").glob("*.mcap")
+    with AnyReader([snapshot], default_typestore=None) as reader:
+        found: dict[str, list[Any]] = {}
+        for connection, _, data in reader.messages():
+            found.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
+    assert [m.data for m in found["/envelope_monitor/reason"]] == said
+    assert [bits(m.position) for m in found["/envelope_monitor/statistics"]] == [bits(m.position) for m in got]
 
 
 def test_memories_limits_and_a_constant_step_give_live_what_they_give_offline(world: World, tmp_path: Path) -> None:

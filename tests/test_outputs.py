@@ -11,7 +11,7 @@ from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor.envelope_monitor import NUMBERS
-from uncertain_lti.monitor.outputs import FLAG_TYPE, OUTPUTS, RECORDED, VECTOR_TYPE, VIOLATION, Output, names_of
+from uncertain_lti.monitor.outputs import OUTPUTS, REASON, RECORDED, VECTOR_TYPE, VIOLATION, Output, names_of
 from uncertain_lti.monitor.verdict_messages import NamedVector, VerdictMessages, VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.sampler import Step
@@ -36,8 +36,7 @@ def statistics_of(model: UncertainLTI) -> tuple[str, ...]:
 @pytest.mark.parametrize("output", OUTPUTS, ids=[output.name for output in OUTPUTS])
 def test_every_row_is_whole(output: Output) -> None:
     """A vector carries a number that verdicts have, one by one and over a transient; a flag carries the alarm."""
-    assert output.text and output.type in (VECTOR_TYPE, FLAG_TYPE)
-    assert bool(output.position) == (output.type == VECTOR_TYPE) == (output is not VIOLATION)
+    assert output.text and bool(output.position) == (output.type == VECTOR_TYPE) == (output not in (VIOLATION, REASON))
     assert bool(output.title) == (output.view in ("states", "steps"))
     if output.position:
         assert (output.position in NUMBERS) == (output.of == "states")
@@ -71,8 +70,9 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
     statistics = statistics_of(model)
     encode = VerdictMessages(names, steps=model.steps, statistics=statistics).encode
     outputs = [o for o in RECORDED if not o.position or names_of(names, model.steps, statistics)[o.of]]
+    outputs.remove(REASON)
     assert ("horizon_utilisation" in encode) == bool(model.horizons)
-    assert ("statistics" in encode) == bool(statistics) == (len(outputs) == len(RECORDED))
+    assert ("statistics" in encode) == bool(statistics) == (len(outputs) == len(RECORDED) - 1)
     numbers = {o.position: np.array([v.numbers(o.position) for v in verdicts]) for o in outputs if o.position}
     for verdict in verdicts:
         for name in numbers:

@@ -465,7 +465,10 @@ class EnvelopeMonitorNode(LifecycleNode):
     def tick(self) -> None:
         """Run the periodic tasks: heartbeat, graph, diagnostics, snapshots and log."""
         self._look_at_clock()
-        tasks = self._keep_beating, self._look_around, self._keep_reporting, self._keep_snapshots, self._log_events
+        tasks = (
+            self._keep_beating, self._keep_reason, self._look_around, self._keep_reporting, self._keep_snapshots,
+            self._log_events,
+        )  # fmt: skip
         for task in tasks:
             try:
                 task()
@@ -512,6 +515,11 @@ class EnvelopeMonitorNode(LifecycleNode):
                 return
             self.subscribe()
         self._enable_problem = ""
+
+    def _keep_reason(self) -> None:
+        """Publish ~/reason also while nobody subscribes, for whoever will, and where nothing comes any more."""
+        if self.active and self.session is not None:
+            self.outputs.send_reason(self.session.reason(time.monotonic(), self.settings.real("state_timeout")))
 
     def _keep_reporting(self) -> None:
         now = time.monotonic()

@@ -8,12 +8,12 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from uncertain_lti.monitor.envelope_monitor import Verdict
-from uncertain_lti.monitor.outputs import OUTPUTS, VIOLATION
+from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION
 from uncertain_lti.monitor.session import Session
-from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
+from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages, text_message
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.polled_events import PolledEvents
@@ -90,6 +90,7 @@ class Outputs:
         self._node = node
         self.publishers: dict[str, OutputPublisher] = {}
         self.alarm_sent = now
+        self._reason_sent = ""
 
     def open(self, heartbeat: float) -> None:
         """Make the publishers.
@@ -101,11 +102,14 @@ class Outputs:
         """
         qos = QoSProfile(depth=_OUTPUT_DEPTH)
         beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=heartbeat))
+        kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        offers = {VIOLATION: beat, REASON: kept}
         for output in OUTPUTS:
-            offered = beat if output is VIOLATION else qos
+            offered = offers.get(output, qos)
             kind = message_class(output.type)
             self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered)
-        self._violation = self.publishers[VIOLATION.name]
+        self._violation, self._reason = self.publishers[VIOLATION.name], self.publishers[REASON.name]
+        self._reason_sent = ""
 
     def prepare(self, session: Session) -> None:
         """Lay out the messages of a model and its alarm.
@@ -166,6 +170,8 @@ class Outputs:
             messages.append((self._violation.send, TRUE if session.alarm else FALSE))
         for send, message in messages:
             send(message)
+        if self._reason.listeners:
+            self.send_reason(session.reasons.text)
 
     def send_alarm(self, alarm: bool, now: float) -> None:
         """Publish ~/violation.
@@ -179,6 +185,18 @@ class Outputs:
         """
         self.alarm_sent = now
         self._violation.send(TRUE if alarm else FALSE)
+
+    def send_reason(self, text: str) -> None:
+        """Publish ~/reason if it has changed.
+
+        Parameters
+        ----------
+        text : str
+            What is said now.
+        """
+        if text != self._reason_sent:
+            self._reason_sent = text
+            self._reason.send(text_message(text))
 
     def close(self) -> None:
         """Stop publishing."""

@@ -167,6 +167,7 @@ class Snapshots:
             definition,
             session.model.steps,
             session.monitor.alarms.names,
+            session.reasons.fresh(),
         )
 
     @property

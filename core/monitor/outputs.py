@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-VECTOR_TYPE, FLAG_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
+VECTOR_TYPE, FLAG_TYPE, TEXT_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool", "std_msgs/msg/String"
 NODE = "/envelope_monitor"
 """Name of the node unless it is given another."""
 
@@ -23,9 +23,9 @@ class Output:
     name : str
         Last part of the topic's name.
     type : str
-        Message type: `VECTOR_TYPE` with one number per state, or `FLAG_TYPE` with the alarm.
-    when : {"message", "judged", "predicted"}
-        For every clock message, for those with a verdict, or for the prediction after an open sample.
+        Message type: `VECTOR_TYPE` with one number per state, `FLAG_TYPE` with the alarm, or `TEXT_TYPE` in words.
+    when : {"message", "judged", "changed", "predicted"}
+        For every clock message, for those with a verdict, on a change, or for the prediction after an open sample.
     text : str
         Its meaning, for the reference (Markdown).
     position : str
@@ -46,7 +46,7 @@ class Output:
 
     name: str
     type: str
-    when: Literal["message", "judged", "predicted"]
+    when: Literal["message", "judged", "changed", "predicted"]
     text: str
     position: str = ""
     velocity: str = ""
@@ -74,6 +74,13 @@ VIOLATION = Output(
     "the alarm: m of the last n verdicts violated; false also while nothing is known; every verdict, and at least "
     "every `heartbeat`, with a deadline offered",
     view="alarm",
+)
+REASON = Output(
+    "reason",
+    TEXT_TYPE,
+    "changed",
+    "in words, which rule, state and horizon hold the alarm, or why there is no verdict; when it changes, and once to "
+    "whoever subscribes later (transient local)",
 )
 OUTPUTS = (
     FLAGS,
@@ -109,6 +116,7 @@ OUTPUTS = (
         position="statistics",
         of="statistics",
     ),
+    REASON,
     Output(
         "predicted_lower",
         VECTOR_TYPE,

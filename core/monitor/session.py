@@ -18,6 +18,7 @@ from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
 from uncertain_lti.monitor.frozen import frozen_words, repeat_words
 from uncertain_lti.monitor.likeness import Explainer, Likeness
 from uncertain_lti.monitor.outputs import JUDGED
+from uncertain_lti.monitor.reason import QUIET, WHY, Reasons
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
 from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
 from uncertain_lti.sampling.instants import to_ns
@@ -358,6 +359,7 @@ class Session:
         monitor, condition, enable_type, reader = self._prepared(rule)
         self.monitor, self.rule = monitor, rule
         self.explainer = Explainer(self.model)
+        self.reasons = Reasons(self.model, monitor.alarms.rules)
         self.enable_type, self._reads_condition = enable_type, reader
         self.arming = Arming(condition, to_ns(rule.grace), self.arming.said_on(condition))
         self.enable_topic = condition.topic if condition else ""
@@ -470,6 +472,7 @@ class Session:
         """End a latched alarm, and forget the verdicts in its window."""
         self.monitor.reset()
         self.latched = False
+        self.reasons.reset()
 
     def failed(self) -> None:
         """Start over after an unexpected error: what was half done must not be joined to what follows."""
@@ -628,6 +631,8 @@ class Session:
             period.frozen |= {moved.state: moved for moved in verdict.frozen}
             period.repeating |= {moved.state: moved for moved in verdict.repeating}
         alarm = self.alarm
+        if alarm or not verdict.judged or verdict.unknown_regime or self.reasons.text != QUIET:
+            self.reasons.take(verdict, alarm)
         self.alarms += alarm and not alarm_before
         period.alarm |= alarm
         if not verdict.judged:
@@ -664,6 +669,29 @@ class Session:
             return None
         t_ns, z = latest
         return self.monitor.expect(t_ns + round(dt * 1e9), z, dt) if all_finite(z) else None
+
+    def reason(self, now: float, timeout: float) -> str:
+        """What holds the alarm, or why there is no verdict, as published on ~/reason.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+        timeout : float
+            Time without a verdict, s, after which that is said.
+
+        Returns
+        -------
+        str
+            In words that change only with the cause.
+        """
+        text = self.reasons.text
+        if self.without_verdict(now) <= timeout or "no verdict:" in text:
+            return text
+        silent = self.silent_for(now) > timeout
+        why = f"no message on {self.sampler.clock}" if silent else "no sample could be judged"
+        said = f"no verdict for more than {timeout:g} s: {why}"
+        return f"{text}; {said}" if self.alarm else said
 
     @property
     def late(self) -> int:
@@ -981,13 +1009,3 @@ class Session:
             if topic in self._heard:
                 counts[f"age {topic}"] = repr(round(now - self._heard[topic], 3))
         return counts
-
-
-WHY = {
-    Status.GAP: "the step is longer than max_gap",
-    Status.RESET: "time stepped back",
-    Status.MISSING: "a signal is missing, stale or not finite",
-    Status.MODE: "the scheduling signal has a value that the model does not list",
-    Status.STEP: "the step is shorter or longer than those that the model was fitted to",
-    Status.FROZEN: "a state is frozen",
-}

@@ -13,8 +13,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.monitor.outputs import FLAG_TYPE, RECORDED
-from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages
+from uncertain_lti.monitor.envelope_monitor import Verdict
+from uncertain_lti.monitor.outputs import FLAG_TYPE, REASON, RECORDED
+from uncertain_lti.monitor.reason import Reasons
+from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, VerdictMessages, text_message
 from uncertain_lti.recordings.mcap_writer import McapWriter
 
 _OVERHEAD = 800  # bytes that one kept message takes besides its data, a verdict on it included
@@ -35,7 +37,7 @@ class Entry:
         Its topic.
     data : bytes
         Serialised message.
-    verdicts : sequence of AnyVerdict
+    verdicts : sequence of Verdict
         On the clock messages that it decided.
     alarm : bool
         The alarm after it.
@@ -45,7 +47,7 @@ class Entry:
     arrival_ns: int
     topic: str
     data: bytes
-    verdicts: Sequence[AnyVerdict]
+    verdicts: Sequence[Verdict]
     alarm: bool
 
 
@@ -124,6 +126,8 @@ class Scene:
         Of the horizons of the model.
     statistics : sequence of str
         Names of the statistics of the alarm.
+    reasons : Reasons, optional
+        Without any sample; default none are written.
     """
 
     entries: Sequence[Entry]
@@ -134,6 +138,7 @@ class Scene:
     definition: Callable[[str], str]
     steps: Sequence[int] = ()
     statistics: Sequence[str] = ()
+    reasons: Reasons | None = None
 
     def write(self, path: Path) -> int:
         """Write an MCAP file.
@@ -164,7 +169,8 @@ class Scene:
                 for output in RECORDED
                 if output.name in self.outputs and (not output.position or output.name in encode)
             }
-            log_time = 0
+            reason = outputs.pop(REASON, None)
+            log_time, said = 0, ""
             for entry in self.entries:
                 log_time = max(log_time, entry.arrival_ns)  # a clock that is set back must not reorder messages
                 if entry.topic not in inputs:
@@ -182,6 +188,12 @@ class Scene:
                         data = alarm if output.type == FLAG_TYPE else encode[output.name](verdict)
                         writer.message(channel, log_time, data)
                         count += 1
+                    if reason is None or self.reasons is None:
+                        continue
+                    text = self.reasons.take(verdict, entry.alarm)
+                    if text != said:
+                        writer.message(reason, log_time, text_message(text))
+                        count, said = count + 1, text
             writer.finish()
             stream.flush()
             os.fsync(stream.fileno())

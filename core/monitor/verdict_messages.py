@@ -20,6 +20,7 @@ _ENCAPSULATION = 4
 TRUE, FALSE = b"\x00\x01\x00\x00\x01", b"\x00\x01\x00\x00\x00"
 """std_msgs/Bool."""
 _STAMP = struct.Struct("<iI")
+_CDR = b"\x00\x01\x00\x00"
 _FIRST_S, _LAST_S = -(2**31), 2**31 - 1  # seconds that a stamp holds
 _MESSAGE = 5  # opcode
 _NAN = float("nan")
@@ -83,6 +84,23 @@ class NamedVector:
         """Everything before the numbers."""
         seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
         return self._start + _STAMP.pack(max(_FIRST_S, min(seconds, _LAST_S)), nanoseconds) + self._names
+
+
+def text_message(text: str) -> bytes:
+    """std_msgs/String in serialised form.
+
+    Parameters
+    ----------
+    text : str
+        Its data.
+
+    Returns
+    -------
+    bytes
+        The message.
+    """
+    data = text.encode(errors="replace") + b"\x00"
+    return _CDR + struct.pack("<I", len(data)) + data
 
 
 class AnyVerdict(Protocol):
@@ -202,7 +220,8 @@ class VerdictRecords:
         statistics: Sequence[str] = (),
     ) -> None:
         self._n, every = len(names), names_of(names, steps, statistics)
-        self._outputs = [o for o in RECORDED if o.name in channels and (not o.position or every[o.of])]
+        chosen = [o for o in RECORDED if o.name in channels and o.when != "changed"]
+        self._outputs = [o for o in chosen if not o.position or every[o.of]]
         self._channels = [channels[output.name] for output in self._outputs]
         self._count = [0] * len(self._outputs)
         self._vectors = {o.name: NamedVector(every[o.of], bool(o.velocity)) for o in self._outputs if o.position}

@@ -26,8 +26,9 @@ from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
-from uncertain_lti.monitor.outputs import NODE, RECORDED, names_of
-from uncertain_lti.monitor.verdict_messages import VerdictRecords
+from uncertain_lti.monitor.outputs import NODE, REASON, RECORDED, names_of
+from uncertain_lti.monitor.reason import over_recording
+from uncertain_lti.monitor.verdict_messages import VerdictRecords, text_message
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.containers import scan
 from uncertain_lti.recordings.mcap_copy import Copier, profile_of
@@ -191,7 +192,8 @@ def annotate(
             }
             writer.metadata(METADATA, _about(contents, base, model, model_file, rule))
             records = VerdictRecords(model.state_names, channels, model.steps, verdicts.statistic_names)
-            verdict_stream = _VerdictStream(writer, records, verdicts, decisions)
+            reasons = over_recording(verdicts, model)
+            verdict_stream = _VerdictStream(writer, records, verdicts, decisions, reasons, channels[REASON.name])
             total = sum(part.count for part in contents)
             counted: Iterable[object] = _weave(copier, contents, numbers, verdict_stream)
             if progress is not None:
@@ -228,7 +230,15 @@ def _weave(
 class _VerdictStream:
     """The verdicts on the clock messages, in the order of their decisions, written as the copy goes on."""
 
-    def __init__(self, writer: McapWriter, records: VerdictRecords, verdicts: Verdicts, decisions: Decisions) -> None:
+    def __init__(
+        self,
+        writer: McapWriter,
+        records: VerdictRecords,
+        verdicts: Verdicts,
+        decisions: Decisions,
+        reasons: Iterator[tuple[int, str]],
+        reason_channel: int,
+    ) -> None:
         self._writer, self._records, self._verdicts = writer, records, verdicts
         self._log_time = np.maximum.accumulate(decisions.arrival)
         self._t_ns = decisions.t_ns
@@ -238,6 +248,8 @@ class _VerdictStream:
         self._next = 0
         self._step = max(1, _CHUNK // records.size)
         self._least = max(1, _SMALL // records.size)
+        self._decided = np.flatnonzero(self._kept)  # of each row of the verdicts
+        self._reasons, self._reason_channel, self._reason = reasons, reason_channel, next(reasons, None)
 
     def __len__(self) -> int:
         return len(self._t_ns)
@@ -273,6 +285,9 @@ class _VerdictStream:
             {name: _rows(getattr(v, name), at) for name in names},
         )
         self._writer.chunk(records, index, (int(times[0]), int(times[-1])))
+        while self._reason is not None and (at_row := int(self._decided[self._reason[0]])) < chosen.stop:
+            self._writer.message(self._reason_channel, int(self._log_time[at_row]), text_message(self._reason[1]))
+            self._reason = next(self._reasons, None)
 
 
 def _rows(values: NDArray[Any], at: Integers) -> NDArray[Any]:

@@ -1,0 +1,235 @@
+"""Reasons: what holds the alarm, and why there is no verdict, in words that change only with the cause."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.model.alarm_rule import AlarmRule, Rule, labels
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.alarm import Raised, row_of
+from uncertain_lti.monitor.envelope_monitor import Verdict, Verdicts
+from uncertain_lti.sampling.status import Status
+
+WHY = {
+    Status.FIRST: "there is no sample before",
+    Status.GAP: "the step is longer than max_gap",
+    Status.RESET: "time stepped back",
+    Status.MISSING: "a signal is missing, stale or not finite",
+    Status.MODE: "the scheduling signal has a value that the model does not list",
+    Status.STEP: "the step is shorter or longer than those that the model was fitted to",
+    Status.FROZEN: "a state is frozen",
+    Status.UNASKED: "outside the time asked for",
+}
+"""Why a sample has no verdict."""
+QUIET = "no alarm"
+"""What is said of a verdict without an alarm."""
+
+
+class Facts(NamedTuple):
+    """What the words on one sample are made of.
+
+    Parameters
+    ----------
+    alarm : bool
+        The alarm after it.
+    status : Status
+        OK with a verdict.
+    unknown_regime : bool
+        The verdict is on a regime that was not fitted.
+    raised : sequence of Raised
+        Which rules raise the alarm; empty without a verdict.
+    frozen : sequence of str
+        States that are frozen.
+    lacking : sequence of str
+        Signals without a value at either end of the transition; looked at if the status is MISSING.
+    """
+
+    alarm: bool
+    status: Status
+    unknown_regime: bool
+    raised: Sequence[Raised] = ()
+    frozen: Sequence[str] = ()
+    lacking: Sequence[str] = ()
+
+
+class Reasons:
+    """What is said of one sample after another.
+
+    While the same rules hold the alarm, the states that any of its verdicts blamed stay named: which of them is outside
+    its bounds may change with every sample.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Names the signals.
+    rules : sequence of Rule
+        Of the alarm.
+
+    Attributes
+    ----------
+    text : str
+        On the last sample.
+    """
+
+    def __init__(self, model: UncertainLTI, rules: Sequence[Rule]) -> None:
+        self._model, self._rules = model, rules
+        self._words = {label: rule.words for label, rule in zip(labels(rules), rules, strict=True)}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every sample."""
+        self.text = "no verdict yet"
+        self._blamed: dict[str, list[str]] = {}
+        self._by = ""  # what holds the alarm, or held it last
+
+    def fresh(self) -> Reasons:
+        """The same without any sample.
+
+        Returns
+        -------
+        Reasons
+            For other samples.
+        """
+        return Reasons(self._model, self._rules)
+
+    def take(self, verdict: Verdict, alarm: bool) -> str:
+        """`push` of a verdict of the monitor.
+
+        Parameters
+        ----------
+        verdict : Verdict
+            On the sample.
+        alarm : bool
+            The alarm after it, one that is latched included.
+
+        Returns
+        -------
+        str
+            As `push`.
+        """
+        if verdict.status.dropped:
+            return self.text
+        if verdict.judged and not alarm:
+            return self.push(Facts(False, Status.OK, verdict.unknown_regime))
+        names = self._model.state_names
+        lacking: Sequence[str] = ()
+        if verdict.status is Status.MISSING:
+            lacking = self._lacking([*verdict.before, *verdict.numbers("state")])
+        frozen = [names[moved.state] for moved in verdict.frozen]
+        return self.push(Facts(alarm, verdict.status, verdict.unknown_regime, verdict.raised, frozen, lacking))
+
+    def _lacking(self, values: Sequence[float]) -> list[str]:
+        """Names of signals of which some value, of [x; u; s] before and x after, is no number."""
+        every = [signal.name for signal in self._model.signals]
+        of = [*every, *self._model.state_names]
+        return list(dict.fromkeys(name for name, value in zip(of, values, strict=True) if value != value))
+
+    def push(self, facts: Facts) -> str:
+        """Take one sample that was not dropped.
+
+        Parameters
+        ----------
+        facts : Facts
+            Of the sample.
+
+        Returns
+        -------
+        str
+            `text` after it.
+        """
+        judged = facts.status is Status.OK
+        if not facts.alarm:
+            self._blamed, self._by = {}, ""
+        elif facts.frozen:
+            self._by = f"frozen: {', '.join(facts.frozen)}"
+        elif judged and facts.raised:
+            self._by = self._rules_that(facts.raised)
+        elif judged and not self._by.startswith("latched"):
+            self._by = "latched until ~/reset" + (f", raised by {self._by}" if self._by else "")
+        said = [f"alarm: {self._by}" if self._by else "alarm"] if facts.alarm else []
+        if not judged:
+            said.append(f"no verdict: {self._why(facts)}")
+        elif not facts.alarm:
+            said.append(QUIET)
+        if judged and facts.unknown_regime:
+            said.append("a regime that was not fitted")
+        self.text = "; ".join(said)
+        return self.text
+
+    def _rules_that(self, raised: Sequence[Raised]) -> str:
+        """The rules that hold the alarm, with the states blamed since these do."""
+        held = dict.fromkeys(reason.label for reason in raised)
+        if held.keys() != self._blamed.keys():
+            self._blamed = {label: [] for label in held}
+        for reason in raised:
+            if reason.state and reason.state not in self._blamed[reason.label]:
+                self._blamed[reason.label].append(reason.state)
+        return "; ".join(
+            self._words[label] + (f": {', '.join(states)}" if states else "") for label, states in self._blamed.items()
+        )
+
+    def _why(self, facts: Facts) -> str:
+        if facts.status is Status.MISSING and facts.lacking:
+            return f"{', '.join(facts.lacking)} missing, stale, not valid or not finite"
+        return WHY[facts.status]
+
+
+def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[int, str]]:
+    """What is said of the samples of a recording, as far as it changes.
+
+    Parameters
+    ----------
+    verdicts : Verdicts
+        Of `EnvelopeMonitor.check`.
+    model : UncertainLTI
+        What judged.
+
+    Yields
+    ------
+    int
+        The sample.
+    str
+        What is said from there on.
+    """
+    reasons, said = Reasons(model, verdicts.alarms.rules), ""
+    transient, statuses = verdicts.transient, verdicts.statuses()
+    names = model.state_names
+    for k in np.flatnonzero(_may_change(verdicts, model, statuses)).tolist():
+        status, alarm = statuses[k], bool(verdicts.alarm[k])
+        raised = verdicts.raised(k) if alarm else ()
+        frozen = [names[i] for i in np.flatnonzero(verdicts.frozen[k])]
+        lacking: Sequence[str] = ()
+        if status is Status.MISSING:
+            ends: list[Array] = [transient.x[k - 1], transient.u[k - 1], transient.s[k - 1], transient.x[k]]
+            lacking = reasons._lacking(np.concatenate(ends).tolist())
+        text = reasons.push(Facts(alarm, status, bool(verdicts.unknown_regime[k]), raised, frozen, lacking))
+        if text != said:
+            yield k, text
+            said = text
+
+
+def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Status]) -> NDArray[np.bool_]:
+    """Samples of which something else may be said than of the one before."""
+    rows: list[NDArray[Any]] = [verdicts.alarm, verdicts.unknown_regime, verdicts.rule_alarms, verdicts.frozen]
+    if verdicts.alarm.any():
+        rows += [verdicts.flags == 1.0, np.abs(verdicts.statistics) > 1.0]
+        table = np.abs(verdicts.horizon_utilisation)
+        rows += [
+            table[:, row_of(rule, model)] > rule.margin
+            for rule in verdicts.alarms.rules
+            if isinstance(rule, AlarmRule) and rule.horizon > 1
+        ]
+    number = {status: i for i, status in enumerate(Status)}
+    transient = verdicts.transient
+    unknown = np.isnan(np.column_stack([transient.x, transient.u, transient.s]))
+    rows += [np.array([number[status] for status in statuses], dtype=np.int64), unknown]
+    facts = np.column_stack(rows)
+    changes = np.ones(len(facts), dtype=bool)
+    changes[1:] = (facts[1:] != facts[:-1]).any(axis=1)
+    changes[2:] |= changes[1:-1]  # of the transition that follows a change is the begin
+    return changes

@@ -1,0 +1,88 @@
+"""Reasons in words: what holds the alarm and why there is no verdict, live as over a recording."""
+
+import numpy as np
+import pytest
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule
+from uncertain_lti.model.repeats import Repeats
+from uncertain_lti.monitor.alarm import Raised
+from uncertain_lti.monitor.reason import Facts, Reasons, over_recording
+from uncertain_lti.sampling.sampler import Step
+from uncertain_lti.sampling.status import Status
+
+DT = 0.1
+RULES: dict[str, tuple[Rule, ...]] = {
+    "containment": (AlarmRule(2, 3),),
+    "statistics": (AlarmRule(3, 3, 2.0), StatisticRule("energy", 3 * DT, 0.5), StatisticRule("mean", 5 * DT, 0.6)),
+}
+
+
+def model_with(rules: tuple[Rule, ...]) -> UncertainLTI:
+    """Two states that keep their value, and a control that moves the first."""
+    return UncertainLTI(
+        A=np.zeros((2, 2)), B=[[1.0], [0.0]], dA=np.zeros((2, 2)), dB=np.zeros((2, 1)), v=[0.1, 0.1],
+        alarm=rules, repeats=Repeats([0.0, 0.0], [0.0, 0.0], [0.0, 0.0]),
+    )  # fmt: skip
+
+
+def recording(seed: int, count: int = 300) -> Transient:
+    """Noise with jumps, spells without a value, a state that stands still, and a pause."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(count, 1))
+    x = np.zeros((count, 2))
+    x[1:, 0] = np.cumsum(DT * u[:-1, 0])
+    x += rng.uniform(-0.08, 0.08, x.shape)
+    x[rng.random(count) < 0.05, 1] += 0.5
+    x[40:60, 1] += np.linspace(0.0, 4.0, 20)
+    x[100:104, 0], u[130, 0] = np.nan, np.nan
+    x[150:170, 0], u[150:170] = x[150, 0], 3.0
+    t = np.arange(count) * round(DT * 1e9)
+    t[200:] += 10**10
+    return Transient(t, x, u, max_gap=1.0)
+
+
+def live(monitor: EnvelopeMonitor, transient: Transient) -> list[str]:
+    reasons, said = Reasons(monitor.model, monitor.alarms.rules), []
+    statuses = transient.statuses()
+    for k, status in enumerate(statuses):
+        before = np.full(3, np.nan) if status.opens_segment else [*transient.x[k - 1], *transient.u[k - 1]]
+        dt = 1e-9 * float(transient.t_ns[k] - transient.t_ns[k - 1]) if k else np.nan
+        step = Step(status, int(transient.t_ns[k]), 0, dt, list(before), transient.x[k].tolist())
+        verdict = monitor.judge(step)
+        said.append(reasons.take(verdict, monitor.alarm))
+    return said
+
+
+@pytest.mark.parametrize("rules", RULES.values(), ids=list(RULES))
+@pytest.mark.parametrize("seed", range(4))
+def test_live_and_over_a_recording_the_words_are_the_same(rules: tuple[Rule, ...], seed: int) -> None:
+    monitor, transient = EnvelopeMonitor(model_with(rules)), recording(seed)
+    changes = list(over_recording(monitor.check(transient), monitor.model))
+    expected = live(monitor, transient)
+    assert changes == [(k, text) for k, text in enumerate(expected) if k == 0 or text != expected[k - 1]]
+    every = "\n".join(expected)
+    assert "alarm: frozen: x1; no verdict: a state is frozen" in every
+    assert "no verdict: x1 missing, stale, not valid or not finite" in every
+    assert "no verdict: u1 missing, stale, not valid or not finite" in every
+    assert "no verdict: the step is longer than max_gap" in every and "no alarm" in every
+    assert f"alarm: {rules[0].words}: " in every or f"alarm: {rules[-1].words}: x2" in every
+
+
+def test_the_states_blamed_stay_named_while_the_same_rules_hold_the_alarm() -> None:
+    reasons = Reasons(model_with(RULES["statistics"]), RULES["statistics"])
+    facts = Facts(True, Status.OK, False, [Raised("energy", "energy", 1, "x2", 2.0)])
+    energy = "mean square of the utilisation over 0.3 s above 0.5"
+    assert reasons.push(facts) == f"alarm: {energy}: x2"
+    assert reasons.push(facts._replace(raised=[Raised("energy", "energy", 1, "x1", 3.0)])) == f"alarm: {energy}: x2, x1"
+    assert reasons.push(facts._replace(raised=[Raised("energy", "energy", 1, "x1", 4.0)])) == f"alarm: {energy}: x2, x1"
+    both = facts._replace(raised=[Raised("containment", "containment", 1, "", 1.0), *facts.raised])
+    assert reasons.push(both) == f"alarm: at least 3 of 3 verdicts violated; {energy}: x2"
+    gap = Facts(True, Status.GAP, False)
+    assert reasons.push(gap) == f"alarm: at least 3 of 3 verdicts violated; {energy}: x2; no verdict: " + (
+        "the step is longer than max_gap"
+    )
+    latched = Facts(True, Status.OK, False)
+    assert reasons.push(latched).startswith("alarm: latched until ~/reset, raised by at least 3 of 3 verdicts violated")
+    assert reasons.push(latched) == reasons.push(latched)
+    assert reasons.push(Facts(False, Status.OK, True)) == "no alarm; a regime that was not fitted"
