@@ -9,7 +9,7 @@ from engine_bag import joint_state
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.cli.main import main
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor.arming import Arming, Condition
 from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
@@ -111,6 +111,31 @@ def test_a_recording_is_judged_as_the_session_judges_its_messages(machine, optio
     assert report["rule"]["conditions"] == data["deployed"]
 
 
+@pytest.mark.parametrize("whole_model", [True, False])
+def test_rules_of_a_file_are_judged_by_as_if_they_were_the_model_s(machine, whole_model, tmp_path, capsys):
+    model, folder = machine
+    other = model.replace(alarm=[AlarmRule(3, 4, 1.5), StatisticRule("energy", 0.5, 0.3)])
+    other.save(tmp_path / "other.model.json")
+    if whole_model:
+        given = tmp_path / "other.model.json"
+    else:
+        given = tmp_path / "rules.json"
+        given.write_text(json.dumps({"rules": [rule.to_dict() for rule in other.alarm]}))
+    before = (folder / "m.model.json").read_bytes()
+    run = [str(folder / "run.mcap"), "--json"]
+    said = []
+    for words in (["other.model.json"], ["m.model.json", "--rules", str(given)], ["m.model.json"]):
+        place = tmp_path if words[0].startswith("other") else folder
+        status = main(["check", str(place / words[0]), *run, *words[1:]])
+        data = json.loads(capsys.readouterr().out)
+        said.append((status, data["recordings"]))
+    assert said[0] == said[1] != said[2]
+    assert (folder / "m.model.json").read_bytes() == before
+    assert main(["report", str(folder / "m.model.json"), *run, "--rules", str(given)]) == said[0][0]
+    report = json.loads(capsys.readouterr().out)
+    assert report["recordings"][0]["alarms"] == said[0][1][0]["alarms"]
+
+
 def test_from_and_to_judge_that_time_alone(machine, capsys):
     model, folder = machine
     name = [str(folder / "m.model.json"), str(folder / "run.mcap")]
@@ -150,12 +175,20 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
         (["--grace", "nan"], "grace is nan"),
         (["--from", "5", "--to", "4"], "leaves nothing to judge"),
         (["--from", "1e6"], "no sample lies between"),
+        (["--rules", "nowhere.json"], "nowhere.json: there is no such"),
+        (["--rules", "empty.json"], "empty.json: no rules of an alarm; give a model file"),
+        (["--rules", "far.json"], "far.json: does not fit the model: "),
+        (["--rules", "odd.json"], "odd.json: field 'alarm.rules[0].kind' is 'median'"),
     ],
 )
 @pytest.mark.parametrize("command", ["check", "report"])
 def test_what_cannot_be_deployed_is_refused(machine, command, options, words, capsys, tmp_path, monkeypatch):
     _, folder = machine
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.json").write_text("[]")
+    (tmp_path / "odd.json").write_text('{"rules": [{"kind": "median", "window_s": 1.0, "threshold": 1.0}]}')
+    far = {"kind": "mean", "window_s": 1.0, "threshold": 1.0, "horizon": 50}
+    (tmp_path / "far.json").write_text(json.dumps({"rules": [far]}))
     assert main([command, str(folder / "m.model.json"), str(folder / "run.mcap"), *options]) == 2
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1, said

@@ -67,6 +67,7 @@ def run(options: argparse.Namespace) -> int:
 
     model = load_model(options.model)
     deployed = deployed_monitor(options, model)
+    model = deployed.monitor.model  # with the rules that are judged by
     bags = group_recordings(options.bags, layout=model.signals.table)
     copies: Sequence[Path | None] = [None] * len(bags)
     if options.write is not None:

@@ -24,6 +24,11 @@ def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
+    parser.add_argument(
+        "--rules",
+        metavar="FILE",
+        help="alarm: the rules of another model file, or of JSON as its field alarm has them (default: the model's)",
+    )
     parser.add_argument("--violations", type=int, help="alarm: number of violations (default: the model's)")
     parser.add_argument(
         "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"
@@ -75,10 +80,18 @@ def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> Deploy
         An option does not fit the model, or is out of range.
     """
     from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.base.errors import ModelError
+    from uncertain_lti.model.file import read_rules
     from uncertain_lti.monitor.arming import Condition
     from uncertain_lti.monitor.deployed import DeployedMonitor
     from uncertain_lti.monitor.session import listed_states
 
+    if options.rules is not None:
+        rules = read_rules(options.rules)
+        try:
+            model = model.replace(alarm=rules)
+        except ModelError as error:
+            raise ModelError(f"{options.rules}: does not fit the model: {error}") from None
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin, listed_states(options.masked))
     return DeployedMonitor(
         monitor, Condition.parse(options.enable), options.grace, options.latch, options.start, options.stop

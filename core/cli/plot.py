@@ -137,6 +137,7 @@ def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Rec
     if not page and len(bags) > 1:
         raise BagError(f"{output}: an image shows one recording; name one, or end the name in .html")
     deployed = deployed_monitor(options, model)
+    model = deployed.monitor.model  # with the rules that are judged by
     plotted, alarm, checked = [], False, 0
     for bag in bags:
         found = check_or_complain("plot", deployed, bag, len(bags) > 1, options.progress.iterate("reading"))

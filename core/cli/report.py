@@ -62,6 +62,7 @@ def run(options: argparse.Namespace) -> int:
     bags = group_recordings(options.bags, layout=model.signals.table)
     output = page_target(options.output or (None if options.json else "report.html"), options.model, bags)
     deployed = deployed_monitor(options, model)
+    model = deployed.monitor.model  # with the rules that are judged by
     checked = []
     refused: list[dict[str, str]] = []
     for bag in bags:

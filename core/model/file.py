@@ -335,6 +335,35 @@ def read(path: str | os.PathLike[str]) -> Any:
         raise ModelError(f"{path}: is not JSON ({detail}); write one with `uncertain-lti fit`") from None
 
 
+def read_rules(path: str | os.PathLike[str]) -> tuple[Rule, ...]:
+    """Read the rules of an alarm from a file.
+
+    Parameters
+    ----------
+    path : path
+        A model file, or JSON as its field `alarm` has it: `{"rules": [{"kind": "energy", "window_s": 2.0, ...}, ...]}`.
+
+    Returns
+    -------
+    tuple of Rule
+        At least one.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read, or holds no rules; names file and field.
+    """
+    data = read(path)
+    if isinstance(data, dict):
+        data = data.get("alarm", data)
+    try:
+        if not (isinstance(data, dict) and data.keys() & {"rules", "violations", "window", "margin"}):
+            raise ModelError("no rules of an alarm; give a model file, or JSON as its field 'alarm' has it")
+        return _alarm(data, newer=True)
+    except ModelError as error:
+        raise ModelError(f"{os.fspath(path)}: {error}") from None
+
+
 def _object(value: Any, name: str, known: set[str] | None = None) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ModelError(f"field '{name}' is not an object")
