@@ -13,7 +13,8 @@ from test_live import CONTROL, STATE, joint_state, vector
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.repeats import Repeats
+from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.model.repeats import Repeats, repeats_of
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.monitor.session import ERROR, WARN
 from uncertain_lti.reports.check_data import check_data
@@ -101,6 +102,7 @@ def test_a_fit_learns_the_longest_repeat_of_each_state(model: UncertainLTI, tmp_
         "longest_repeat_s",
         "largest_run",
         "largest_sum",
+        "active_beyond",
     ]
     again = UncertainLTI.load(tmp_path / "m.model.json")
     assert again.to_dict() == model.to_dict()
@@ -226,6 +228,44 @@ def test_a_masked_state_is_not_watched(model: UncertainLTI) -> None:
 def test_a_model_without_repeats_judges_as_ever(model: UncertainLTI) -> None:
     frozen = held(run(12), 0, 200, 350)
     assert EnvelopeMonitor(model.replace(repeats=None)).check(frozen).judged[1:].all()
+
+
+def test_a_machine_that_is_active_is_not_parked() -> None:
+    """The control goes to and fro, so the model never moves the state by its wide half-width; three steps tell."""
+    u = np.repeat([1.0, -1.0] * 40, 2)
+    x = np.zeros((len(u), 1))
+    x[:40, 0] = 0.01 * np.arange(40)  # fresh values first
+    x[40:, 0] = x[40, 0]
+    transient = Transient(0.1 * np.arange(len(u)), x, u[:, None])
+    for beyond, told in ((0.3, True), (0.5, False)):
+        repeats = Repeats([60.0], [0.4], [0.4], [beyond])  # of a machine that was parked for a minute
+        model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
+        frozen = EnvelopeMonitor(model).check(transient).frozen[:, 0]
+        assert np.flatnonzero(frozen).tolist() == (list(range(43, len(u))) if told else [])
+        same_as_live(model, transient)
+    parked = Transient(transient.t_ns, np.zeros_like(x), np.ones_like(transient.u))
+    assert not EnvelopeMonitor(model.replace(repeats=Repeats([60.0], [40.0], [40.0], [0.0]))).check(parked).frozen.any()
+
+
+def test_a_fit_learns_how_active_a_machine_is_whose_state_changes(model: UncertainLTI) -> None:
+    """The median over seconds, or twice what there is of activity in repeats; nothing of less than 20 seconds."""
+    few = [run(1), run(2, rest=(3.0, 4.0))]
+    many = [*few, run(3), run(4)]
+    assert model.repeats is not None and (model.repeats.active_beyond == LARGEST).all()
+    found = []
+    for transient in many:
+        steps = transient.transitions()
+        z = model.normalised_columns(steps)
+        centre, half = model.centre_and_half(steps.x, steps.u, DT)
+        rate, width = (centre - steps.x) / DT - model.own_rates(z).T * steps.x, half / DT
+        for second in range(8):
+            part = slice(100 * second, 100 * second + 100)
+            if (steps.x[part] != steps.x_next[part]).all():
+                found.append(np.ptp(rate[part], axis=0) / width[part].max(axis=0))
+    learnt = repeats_of(model, many).active_beyond
+    assert 20 <= len(found) < 32 and learnt == pytest.approx(np.median(found, axis=0), rel=1e-6)
+    held_once = repeats_of(model, [*many, held(run(5), 0, 200, 350)]).active_beyond
+    assert held_once[0] > learnt[0] and held_once[1] == pytest.approx(learnt[1], rel=0.2)
 
 
 def test_a_slow_sensor_repeats_regularly() -> None:

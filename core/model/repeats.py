@@ -7,6 +7,10 @@ A repeat of state i is a run of transitions over which its recorded value stays 
 
 both from 0 at the last fresh sample: the run is the state's own equation followed freely, with every other state as it
 was recorded, and the sum holds the state where it was read. Both are given in half-widths, the largest of the repeat.
+
+The activity of the machine, as it concerns state i, is the range of (\\hat x_j - r) / Δt_j over the repeat, in
+half-widths: as r stays, it changes with the controls and the other states alone. The fit learns how active the machine
+is in the median second in which the state changes, and while it repeated.
 """
 
 from __future__ import annotations
@@ -19,12 +23,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.bounds import lower_of, upper_of
 from uncertain_lti.model.terms import checked
 
-_KEYS = ("longest_repeat_s", "largest_run", "largest_sum")
+_KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond")
+WINDOW_S = 1.0
+"""Length of the windows of which the median activity is taken, s."""
+WINDOWS = 20
+"""Windows that the median needs."""
+_BLOCK = 1 << 16  # transitions that are looked at together
+MORE_ACTIVE = 2.0
+"""How much more active than during any repeat of the fit the machine must be."""
 
 
 class Repeats:
@@ -38,6 +50,8 @@ class Repeats:
         The farthest that the nominal model ran over any of them, in half-widths; default unknown, infinite.
     largest_sum : array (n,), optional
         The largest sum of its one-step movements, likewise.
+    active_beyond : array (n,), optional
+        Activity beyond which the state always changed, in half-widths; default unknown, infinite.
 
     Raises
     ------
@@ -46,7 +60,11 @@ class Repeats:
     """
 
     def __init__(
-        self, longest_repeat_s: ArrayLike, largest_run: ArrayLike | None = None, largest_sum: ArrayLike | None = None
+        self,
+        longest_repeat_s: ArrayLike,
+        largest_run: ArrayLike | None = None,
+        largest_sum: ArrayLike | None = None,
+        active_beyond: ArrayLike | None = None,
     ) -> None:
         self.longest_repeat_s = checked(longest_repeat_s, "frozen.longest_repeat_s", None)
         if self.longest_repeat_s.ndim != 1:
@@ -55,6 +73,7 @@ class Repeats:
         unknown = np.full(shape, np.inf)
         self.largest_run = unknown if largest_run is None else checked(largest_run, "frozen.largest_run", shape)
         self.largest_sum = unknown if largest_sum is None else checked(largest_sum, "frozen.largest_sum", shape)
+        self.active_beyond = unknown if active_beyond is None else checked(active_beyond, "frozen.active_beyond", shape)
         for name in _KEYS:
             array = getattr(self, name)
             array.flags.writeable = False
@@ -117,6 +136,10 @@ class Moved(NamedTuple):
         Sum of its one-step movements, in half-widths, likewise without a sign.
     start : sequence of float (n,)
         The states at the last fresh sample, recorded units.
+    steps : int
+        Transitions of the repeat.
+    activity : float
+        Range of the rates at which the nominal model would move it, in half-widths.
     """
 
     state: int
@@ -124,6 +147,8 @@ class Moved(NamedTuple):
     run: float
     sum: float
     start: Sequence[float]
+    steps: int
+    activity: float
 
 
 class Repeating:
@@ -141,7 +166,8 @@ class Repeating:
 
     def __init__(self, n: int, margin: float = 1.0) -> None:
         self._margin = margin
-        # of each state: None, or [begin in ns, run, sum, largest half-width, the states then]
+        # of each state: None, or [begin in ns, run, sum, largest half-width, the states then, steps,
+        # lowest and highest rate, largest half-width per second]
         self._of: list[list[Any] | None] = [None] * n
 
     def forget(self) -> None:
@@ -185,14 +211,19 @@ class Repeating:
                 continue
             repeat = self._of[i]
             if repeat is None:
-                repeat = self._of[i] = [t_ns - round(dt * 1e9), 0.0, 0.0, 0.0, before[: len(after)]]
+                since = t_ns - round(dt * 1e9)
+                repeat = self._of[i] = [since, 0.0, 0.0, 0.0, before[: len(after)], 0, math.inf, -math.inf, 0.0]
             low, high = lower[i], upper[i]
             movement, half = 0.5 * (low + high) - value, 0.5 * (high - low) / self._margin
             repeat[1] += dt * own[i] * repeat[1] + movement
             repeat[2] += movement
             repeat[3] = half = max(repeat[3], half)
-            seconds = (t_ns - repeat[0]) * 1e-9
-            found.append(Moved(i, seconds, _over(abs(repeat[1]), half), _over(abs(repeat[2]), half), repeat[4]))
+            repeat[5] += 1
+            repeat[6], repeat[7] = min(repeat[6], movement / dt), max(repeat[7], movement / dt)
+            repeat[8] = max(repeat[8], 0.5 * (high - low) / self._margin / dt)
+            seconds, activity = (t_ns - repeat[0]) * 1e-9, _over(repeat[7] - repeat[6], repeat[8])
+            run, total = _over(abs(repeat[1]), half), _over(abs(repeat[2]), half)
+            found.append(Moved(i, seconds, run, total, repeat[4], repeat[5], activity))
         return found
 
 
@@ -216,10 +247,12 @@ def repeats_of(model: Any, transients: Sequence[Any]) -> Repeats:
     Repeats
         Over all of them.
     """
-    longest, run, total = (np.zeros(model.n) for _ in range(3))
+    longest, run, total, active = (np.zeros(model.n) for _ in range(4))
     point = model.operating_point
+    windows = []
     for transient in transients:
         steps = transient.transitions()
+        windows.append(_activity(model, transient, steps))
         rows = np.flatnonzero((steps.x == steps.x_next).any(axis=1))
         if not len(rows):
             continue
@@ -243,4 +276,44 @@ def repeats_of(model: Any, transients: Sequence[Any]) -> Repeats:
                 i = moved.state
                 longest[i] = max(longest[i], moved.seconds)
                 run[i], total[i] = max(run[i], moved.run), max(total[i], moved.sum)
-    return Repeats(longest, np.minimum(run, LARGEST), np.minimum(total, LARGEST))
+                active[i] = max(active[i], moved.activity)
+    beyond = np.maximum(_median(np.concatenate([np.zeros((0, model.n)), *windows])), MORE_ACTIVE * active)
+    return Repeats(longest, *(np.minimum(values, LARGEST) for values in (run, total, beyond)))
+
+
+def _activity(model: Any, transient: Any, steps: Any) -> Array:
+    """Activity in each unbroken window (windows, n); NaN for a state that repeats in half of it or more."""
+    found: list[Array] = []
+    t = transient.t_ns[steps.k]
+    for a in range(0, len(t), _BLOCK):
+        chosen = np.zeros(len(t), dtype=bool)
+        chosen[a : a + _BLOCK] = True
+        part, at = steps.take(chosen), t[a : a + _BLOCK]
+        with np.errstate(over="ignore", invalid="ignore"):
+            centre, half = np.empty((model.n, len(at))), np.empty((model.n, len(at)))
+            z = model.normalised_columns(part)
+            model.columns_centre_and_half(z, part.dt, centre, half)
+            own = model.own_rates(z).T * part.x  # does not change in a repeat, and must not count here
+            rate = (model.operating_point.recorded_x(centre.T) - part.x) / part.dt[:, None] - own
+            width = half.T * model.operating_point.X / part.dt[:, None]
+            number = (at - at[0]) // round(WINDOW_S * 1e9)
+            begins = np.flatnonzero(np.diff(number, prepend=-1))
+            ends = np.append(begins[1:], len(at))
+            spread = np.maximum.reduceat(rate, begins) - np.minimum.reduceat(rate, begins)
+            activity = spread / np.maximum.reduceat(width, begins)
+        repeats = np.add.reduceat((part.x == part.x_next).astype(np.float64), begins)
+        counts = ends - begins
+        whole = (counts >= 3) & (part.k[ends - 1] - part.k[begins] == counts - 1)
+        activity[(2 * repeats >= counts[:, None]) | ~np.isfinite(activity)] = np.nan
+        found.append(activity[whole])
+    return np.concatenate([np.zeros((0, model.n)), *found])
+
+
+def _median(windows: Array) -> Array:
+    """Of each column the median of its numbers; infinite where these are few."""
+    found = np.full(windows.shape[1], np.inf)
+    for i, column in enumerate(windows.T):
+        known = column[~np.isnan(column)]
+        if len(known) >= WINDOWS:
+            found[i] = np.median(known)
+    return found

@@ -3,7 +3,8 @@
 A parked machine repeats too, so a repeat alone is a warning. A state is frozen if the nominal model, run over the
 repeat, moves it by more than its half-width, and farther than over any repeat of the fit; twice as far if the fit has
 repeats as long. Where another state has left the place that it had when the repeat began, the machine is not
-parked: there the sum of the model's one-step movements counts like its run.
+parked: there the sum of the model's one-step movements counts like its run. Nor is it parked while it is as active
+as in the recordings, and twice as active as over any repeat of theirs: then three repeats are enough.
 """
 
 from __future__ import annotations
@@ -18,6 +19,9 @@ from uncertain_lti.model.repeats import Moved, Repeating, Repeats
 
 FARTHER = 2.0
 """How much farther than over any repeat of the fit the model must move a state whose repeat is no longer than those."""
+
+LEAST = 3
+"""Steps that a repeat must have while the machine is active."""
 
 Bounds = tuple[Sequence[float], Sequence[float], Sequence[float]]
 """Of one transition: lower and upper bound (n,) each, recorded units, and the elements a_ii of the nominal model."""
@@ -62,7 +66,18 @@ class FrozenWatch:
         States to look at: one that is masked is never frozen.
     """
 
-    __slots__ = ("_counted", "_follow", "_frozen", "_longest", "_margin", "_on", "_run", "_run_within", "_sum")
+    __slots__ = (
+        "_counted",
+        "_follow",
+        "_frozen",
+        "_longest",
+        "_margin",
+        "_on",
+        "_run",
+        "_run_within",
+        "_sum",
+        "_active",
+    )
 
     def __init__(self, repeats: Repeats, margin: float, counted: Sequence[bool]) -> None:
         self._longest: list[float] = repeats.longest_repeat_s.tolist()
@@ -72,6 +87,7 @@ class FrozenWatch:
         self._run_within: list[float] = np.maximum(1.0, FARTHER * run).tolist()
         self._run: list[float] = np.maximum(1.0, np.where(np.isfinite(run), run, 0.0)).tolist()
         self._sum: list[float] = np.maximum(1.0, np.where(np.isfinite(total), total, 0.0)).tolist()
+        self._active: list[float] = repeats.active_beyond.tolist()
         self._counted, self._margin = list(counted), margin
         self._follow = Repeating(len(self._longest), margin)
         self.forget()
@@ -128,6 +144,8 @@ class FrozenWatch:
 
     def _is_frozen(self, moved: Moved, after: Sequence[float], lower: Sequence[float], upper: Sequence[float]) -> bool:
         i = moved.state
+        if moved.steps >= LEAST and moved.activity > self._active[i]:
+            return True
         if moved.seconds <= self._longest[i]:
             return moved.run > self._run_within[i]
         if moved.run > self._run[i]:
@@ -155,10 +173,14 @@ def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
     str
         Without a full stop.
     """
-    return (
-        f"{name} {repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])}, while the model moves it by "
-        f"{max(moved.run, moved.sum):.3g} half-widths"
-    )
+    what = repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])
+    size = max(moved.run, moved.sum)
+    if size <= 1.0 and moved.activity > repeats.active_beyond[moved.state]:
+        return (
+            f"{name} {what}, while the machine is active: its rate by the model changes by {moved.activity:.3g} "
+            f"half-widths, and beyond {repeats.active_beyond[moved.state]:.3g} it always changed"
+        )
+    return f"{name} {what}, while the model moves it by {size:.3g} half-widths"
 
 
 def repeat_words(seconds: float, longest: float) -> str:
