@@ -262,3 +262,19 @@ def test_windows_are_those_of_the_rules_worked_out_naively(case: tuple[Uncertain
             half = [r * total + float(a) for r, a in zip(spread, part["v"], strict=True)]
             expected = [float((z[end, i] - centre[i]) / half[i]) for i in range(n)]
             assert table[end, j].tolist() == expected
+
+
+def test_what_is_foreseen_is_judged_when_the_longest_horizon_ends() -> None:
+    rng = np.random.default_rng(4)
+    model = with_horizons(rng, (2, 5))
+    monitor, dt = EnvelopeMonitor(model, margin=1.5), 0.05
+    x, u = 0.1 * np.cumsum(rng.normal(size=(9, model.n)), axis=0), np.full((9, model.m), 0.3)
+    transient = Transient(np.arange(9) * round(dt * 1e9), x, u)
+    judged = EnvelopeMonitor(model).check(transient).horizon_utilisation[:, -1]
+    for k in range(4):
+        found = monitor.foresee(int(transient.t_ns[k]), [*x[k], *u[k]], dt)
+        assert found is not None and found.t_ns == transient.t_ns[k + 5]
+        centre, half = (found.upper + found.lower) / 2, (found.upper - found.lower) / 2 / 1.5
+        np.testing.assert_allclose((x[k + 5] - centre) / half, judged[k + 5], rtol=1e-9)
+        assert found.packed("lower") == found.lower.tobytes() and found.packed("upper") == found.upper.tobytes()
+    assert EnvelopeMonitor(model.replace(horizons=())).foresee(0, [*x[0], *u[0]], dt) is None

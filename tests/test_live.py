@@ -18,6 +18,7 @@ from rosbags.highlevel import AnyReader
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor import outputs
@@ -831,6 +832,22 @@ def test_bounds_are_predicted_only_while_somebody_listens(world: World, tmp_path
     world.node.destroy_subscription(upper.subscription)
     world.node.destroy_subscription(lower.subscription)
     assert len(lower.messages) == 10
+
+
+def test_bounds_are_foreseen_over_the_longest_horizon_while_somebody_listens(world: World, tmp_path: Path) -> None:
+    arrays = {name: getattr(by_hand(), name) for name in ARRAYS}
+    model = by_hand(horizons=[Horizon(3, **arrays), Horizon(4, **arrays)])
+    world.monitor(saved(model, tmp_path))
+    lower = world.listen(JointState, "/envelope_monitor/horizon_predicted_lower").connected()
+    upper = world.listen(JointState, "/envelope_monitor/horizon_predicted_upper").connected()
+    state = world.listen(JointState, "/envelope_monitor/state").connected()
+    Plant(world, model).subscribed().send(6)
+    low, high, read = lower.count(6), upper.count(6), state.count(5)
+    dt = round(model.sampling.dt_median * 1e9)  # type: ignore[operator]
+    assert [stamp_of(m) for m in low] == [stamp_of(m) for m in high]
+    assert [stamp_of(m) - 4 * dt for m in low[1:]] == [stamp_of(m) for m in read]
+    for a, b in zip(low, high, strict=True):
+        assert (np.array(a.position) < np.array(b.position)).all() and tuple(a.name) == ("a", "b")
 
 
 def test_topics_follow_remapping_and_namespaces(world: World, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION
 from uncertain_lti.monitor.session import Session
-from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, AnyVerdict, VerdictMessages, text_message
+from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, VerdictMessages, text_message
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.polled_events import PolledEvents
@@ -64,8 +64,8 @@ class OutputPublisher:
         self._node.destroy_lifecycle_publisher(self._publisher)
 
 
-_Vector = tuple[OutputPublisher, Callable[[AnyVerdict], bytes]]
-"""A publisher, and what makes its message of a verdict."""
+_Vector = tuple[OutputPublisher, Callable[[Any], bytes]]
+"""A publisher, and what makes its message of a verdict, or of bounds to come."""
 
 
 class Outputs:
@@ -127,7 +127,7 @@ class Outputs:
             return [(self.publishers[name], encode[name]) for name in chosen]
 
         self._vectors = vectors("message"), vectors("message", "judged")
-        self._predicted = vectors("predicted")
+        self._predicted = vectors("predicted"), vectors("predicted over")
 
     def poll(self) -> None:
         """Update the numbers of listeners."""
@@ -160,11 +160,11 @@ class Outputs:
                 if publisher.listeners:
                     messages.append((publisher.send, encode(verdict)))
             turned |= judged and self._violation.listeners > 0
-        if opened and any(publisher.listeners for publisher, _ in self._predicted):
-            expected = session.predict()
-            for publisher, encode in self._predicted:
-                if publisher.listeners and expected is not None:
-                    messages.append((publisher.send, encode(expected)))
+        if opened:
+            for predicted, predict in zip(self._predicted, (session.predict, session.foresee), strict=True):
+                heard = [vector for vector in predicted if vector[0].listeners]
+                if heard and (expected := predict()) is not None:
+                    messages += [(publisher.send, encode(expected)) for publisher, encode in heard]
         if turned:
             self.alarm_sent = now
             messages.append((self._violation.send, TRUE if session.alarm else FALSE))

@@ -261,6 +261,38 @@ class Verdict:
         return np.concatenate([self.utilisation, longer]).reshape(-1, self.n)
 
 
+@dataclass(frozen=True)
+class Foreseen:
+    """Bounds at an instant to come.
+
+    Parameters
+    ----------
+    t_ns : int
+        The instant, ns.
+    lower, upper : array (n,)
+        The bounds, recorded units.
+    """
+
+    t_ns: int
+    lower: Array
+    upper: Array
+
+    def packed(self, name: str) -> bytes:
+        """The bounds as bytes.
+
+        Parameters
+        ----------
+        name : str
+            lower or upper.
+
+        Returns
+        -------
+        bytes
+            Little-endian doubles.
+        """
+        return bytes((self.lower if name == "lower" else self.upper).astype("<f8").tobytes())
+
+
 @cache
 def _packer(n: int) -> Callable[..., bytes]:
     return struct.Struct(f"<{n}d").pack
@@ -602,6 +634,38 @@ class EnvelopeMonitor:
             Its `lower` and `upper` are the bounds.
         """
         return self.look(Step(Status.OK, t_ns, 0, dt, z, z[: self.model.n]))
+
+    def foresee(self, t_ns: int, z: Sequence[float], dt: float) -> Foreseen | None:
+        """Bounds at the end of the longest horizon, if controls and further scheduling signals stay as they are.
+
+        Parameters
+        ----------
+        t_ns : int
+            Instant of the sample, ns.
+        z : sequence of float (n + m + q,)
+            [x; u; s] there, recorded units.
+        dt : float
+            Each step, s.
+
+        Returns
+        -------
+        Foreseen or None
+            By the margin of the one-step rule; None without horizons, and where the nominal run leaves all numbers.
+        """
+        if not self.model.horizons:
+            return None
+        steps, point = max(self.model.steps), self.model.operating_point
+        now = normalised(np.array(z, dtype=np.float64), point.steady, point.scale)
+        columns = np.repeat(now[:, None], steps, axis=1)
+        found = None
+        with np.errstate(over="ignore", invalid="ignore"):
+            for windows, centre, half in self.model.envelopes(np.arange(steps), columns, np.full(steps, dt)):
+                if len(windows.last):
+                    found = tuple(of(centre[:, 0], half[:, 0], self.rule.margin) for of in (lower_of, upper_of))
+        if found is None or not np.isfinite(found).all():
+            return None
+        lower, upper = (point.recorded_x(np.asarray(bound)) for bound in found)
+        return Foreseen(t_ns + steps * round(dt * 1e9), lower, upper)
 
     def look(self, step: Step) -> Verdict:
         """Verdict on a complete step, not counted for the alarm.

@@ -24,8 +24,9 @@ class Output:
         Last part of the topic's name.
     type : str
         Message type: `VECTOR_TYPE` with one number per state, `FLAG_TYPE` with the alarm, or `TEXT_TYPE` in words.
-    when : {"message", "judged", "changed", "predicted"}
-        For every clock message, for those with a verdict, on a change, or for the prediction after an open sample.
+    when : {"message", "judged", "changed", "predicted", "predicted over"}
+        For every clock message, for those with a verdict, on a change, or for the prediction after an open sample: of
+        one step, or over the longest horizon.
     text : str
         Its meaning, for the reference (Markdown).
     position : str
@@ -46,7 +47,7 @@ class Output:
 
     name: str
     type: str
-    when: Literal["message", "judged", "changed", "predicted"]
+    when: Literal["message", "judged", "changed", "predicted", "predicted over"]
     text: str
     position: str = ""
     velocity: str = ""
@@ -126,10 +127,19 @@ OUTPUTS = (
         position="lower",
     ),
     Output("predicted_upper", VECTOR_TYPE, "predicted", "the same for the upper bound", position="upper"),
+    Output(
+        "horizon_predicted_lower",
+        VECTOR_TYPE,
+        "predicted over",
+        "of a model with horizons, on receipt of a sample, the lower bound as many median steps on as the longest "
+        "horizon has, if the controls known so far stay; only while somebody subscribes",
+        position="lower",
+    ),
+    Output("horizon_predicted_upper", VECTOR_TYPE, "predicted over", "the same for the upper bound", position="upper"),
 )
 """Every output, those of every clock message first."""
 
-RECORDED = tuple(output for output in OUTPUTS if output.when != "predicted")
+RECORDED = tuple(output for output in OUTPUTS if not output.when.startswith("predicted"))
 """The outputs that files hold: all that depend on verdicts alone."""
 JUDGED = tuple(output for output in OUTPUTS if output.when == "judged")
 """The outputs that only a verdict has."""

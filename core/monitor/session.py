@@ -14,7 +14,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Arming, Condition
 from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Waiting
 from uncertain_lti.monitor.deployed import condition_words
-from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdict
+from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Foreseen, Verdict
 from uncertain_lti.monitor.frozen import frozen_words, repeat_words
 from uncertain_lti.monitor.likeness import Explainer, Likeness
 from uncertain_lti.monitor.outputs import JUDGED
@@ -669,6 +669,19 @@ class Session:
             return None
         t_ns, z = latest
         return self.monitor.expect(t_ns + round(dt * 1e9), z, dt) if all_finite(z) else None
+
+    def foresee(self) -> Foreseen | None:
+        """Bounds at the end of the longest horizon after the open sample, as `EnvelopeMonitor.foresee` gives them.
+
+        Returns
+        -------
+        Foreseen or None
+            None where `predict` gives None, and without horizons.
+        """
+        dt, latest = self.model.sampling.dt_median, self.sampler.latest()
+        if dt is None or latest is None or not all_finite(latest[1]):
+            return None
+        return self.monitor.foresee(*latest, dt)
 
     def reason(self, now: float, timeout: float) -> str:
         """What holds the alarm, or why there is no verdict, as published on ~/reason.
