@@ -107,6 +107,28 @@ def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end
     assert level == OK and re.fullmatch(r"the alarm is over after 0\.0\d+ s", line)
 
 
+def test_a_jump_larger_than_any_of_the_fit_is_logged_and_reported_with_its_limit() -> None:
+    rig = Rig()
+    rig.model = rig.model.replace(domain=replace(rig.model.domain, step_max=np.array([0.01, 1e3])))
+    rig.session = type(rig.session)(
+        rig.model, Rule(violations=1, window=1), rig.session.types, rig.session._type_fields,
+        rig.session._make_reader, rig.now,
+    )  # fmt: skip
+    rig.event_log.begin(rig.session, rig.now)
+    rig.send(10)
+    rig.said.clear()
+    rig.x[:] += 5.0
+    rig.send(1)
+    limit = 0.01 * rig.model.operating_point.X[0]
+    (line,) = [line for line in rig.lines if line.startswith("alarm")]
+    assert (
+        f"; a jumped by {5.0 * rig.model.operating_point.X[0]:.3g} in one step (at most {limit:.3g} in the fit)" in line
+    )
+    assert "b jumped" not in line
+    assert "a jumped by " in rig.session.report(rig.now, TIMEOUT)[0].message
+    assert "; a jumped by " in rig.session.reasons.text
+
+
 def test_diagnostics_say_how_near_each_statistic_is_to_its_threshold() -> None:
     rig = Rig(alarm=(AlarmRule(2, 5), StatisticRule("energy", 5 * STEP, (0.5, 4.0))))
     rig.send(10, off=0.5)

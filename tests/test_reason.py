@@ -1,13 +1,17 @@
 """Reasons in words: what holds the alarm and why there is no verdict, live as over a recording."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.monitor.alarm import Raised
 from uncertain_lti.monitor.reason import Facts, Reasons, over_recording
+from uncertain_lti.reports.check_data import check_data
+from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
 
@@ -86,3 +90,33 @@ def test_the_states_blamed_stay_named_while_the_same_rules_hold_the_alarm() -> N
     assert reasons.push(latched).startswith("alarm: latched until ~/reset, raised by at least 3 of 3 verdicts violated")
     assert reasons.push(latched) == reasons.push(latched)
     assert reasons.push(Facts(False, Status.OK, True)) == "no alarm; a regime that was not fitted"
+
+
+def test_a_jump_larger_than_any_of_the_fit_is_named_with_its_limit() -> None:
+    """Live, over a recording, and in `check`; not one that stays within what was recorded."""
+    rng = np.random.default_rng(5)
+    u = rng.uniform(-1.0, 1.0, (400, 1))
+    x = np.zeros((400, 1))
+    for k in range(399):
+        x[k + 1] = 0.9 * x[k] + 0.1 * u[k]
+    model = fit([Transient(0.1 * np.arange(400), x, u)], additive="noise")
+    largest = float(np.abs(np.diff(x[:, 0])).max())
+    assert model.domain.step_max == pytest.approx([largest])
+    assert UncertainLTI.from_dict(model.to_dict()).domain.step_max == pytest.approx([largest])
+    spiked = x[:100].copy()
+    spiked[60] += 2.0
+    transient = Transient(round(1e8) * np.arange(100), spiked, u[:100])
+    monitor = EnvelopeMonitor(model)
+    verdicts = monitor.check(transient)
+    said = list(over_recording(verdicts, model))
+    expected = live(monitor, transient)
+    assert said == [(k, text) for k, text in enumerate(expected) if k == 0 or text != expected[k - 1]]
+    jumped = f"x1 jumped by {spiked[60, 0] - spiked[59, 0]:.3g} in one step (at most {largest:.3g} in the fit)"
+    assert dict(said)[60] == f"alarm: at least 1 of 1 verdicts violated: x1; {jumped}"
+    data = check_data(model, verdicts, samples=False)
+    assert data["states"]["x1"]["jump"]["largest_in_fit"] == pytest.approx(largest)
+    assert " jumped by " in check_text(data) and f"(at most {largest:.3g} in the fit) at 6.0000 s" in check_text(data)
+    for quiet in (Transient(round(1e8) * np.arange(100), x[:100], u[:100]), transient.replace(slice(0, 60))):
+        assert check_data(model, EnvelopeMonitor(model).check(quiet), samples=False)["states"]["x1"]["jump"] is None
+    drifting = model.replace(domain=replace(model.domain, step_max=None))
+    assert "jumped" not in check_text(check_data(drifting, EnvelopeMonitor(drifting).check(transient), samples=False))

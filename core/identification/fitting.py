@@ -28,6 +28,7 @@ from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
+from uncertain_lti.model.jumps import largest_steps
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.repeats import repeats_of
 from uncertain_lti.model.schedule import Schedule
@@ -219,7 +220,8 @@ def fit(
         facts["with_discarded"] = {
             key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
         }
-    model = model.replace(repeats=repeats_of(model, transients))
+    domain = replace(model.domain, step_max=largest_steps(model, transients))
+    model = model.replace(repeats=repeats_of(model, transients), domain=domain)
     if not horizons:
         return model.replace(fit_summary=facts)
     lengths = [int(h) for h in horizons]

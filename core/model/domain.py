@@ -195,6 +195,8 @@ class Domain:
         Greatest controls.
     measure : Occupancy, optional
         Combinations within the box.
+    step_max : array (n,), optional
+        Largest change of each state in one step, normalised; default unknown.
     """
 
     x_min: Array
@@ -202,6 +204,7 @@ class Domain:
     u_min: Array
     u_max: Array
     measure: Occupancy | None = None
+    step_max: Array | None = None
 
     @property
     def least(self) -> Array:

@@ -58,7 +58,13 @@ def structure(model: Any) -> dict[str, Any]:
     arrays = [name for name in ARRAYS if name in _IN_EVERY_FILE or getattr(model, name).any()]
     scheduled = model.schedule is not None
     one_rule = model.alarm == (model.alarm_rule,)
-    newer = scheduled or model.domain.measure is not None or model.signals.table is not None or bool(model.horizons)
+    newer = (
+        scheduled
+        or model.domain.measure is not None
+        or model.domain.step_max is not None
+        or model.signals.table is not None
+        or bool(model.horizons)
+    )
     newer = newer or not one_rule or model.residuals is not None or model.run is not None
     newer |= s.step is not None or any(g.memory or g.valid is not None or g.ignore for g in model.signals)
     newer = newer or model.repeats is not None or bool(model.signatures)
@@ -96,7 +102,8 @@ def structure(model: Any) -> dict[str, Any]:
             name: [v if math.isfinite(v) else None for v in getattr(model.domain, name).tolist()]
             for name in ("x_min", "x_max", "u_min", "u_max")
         }
-        | ({} if model.domain.measure is None else {"measure": model.domain.measure.to_dict()}),
+        | ({} if model.domain.measure is None else {"measure": model.domain.measure.to_dict()})
+        | ({} if model.domain.step_max is None else {"step_max": model.domain.step_max.tolist()}),
         **({} if model.residuals is None else {"residuals": model.residuals.to_dict()}),
         "alarm": {
             "violations": model.alarm_rule.violations,
@@ -204,14 +211,17 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     domain = None
     if "domain" in data:
         sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
-        newer = {"measure"} if data["format"] != FORMATS[0] else set()
+        newer = {"measure", "step_max"} if data["format"] != FORMATS[0] else set()
         box = _object(data["domain"], "domain", set(sizes) | newer)
         for name in sizes:
             if name not in box:
                 raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
         limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
         measure = Occupancy.from_dict(box["measure"], n + m) if box.get("measure") is not None else None
-        domain = Domain(**limits, measure=measure)
+        step_max = checked(box["step_max"], "domain.step_max", (n,)) if box.get("step_max") is not None else None
+        if step_max is not None and (step_max < 0.0).any():
+            raise ModelError("field 'domain.step_max' holds a negative number")
+        domain = Domain(**limits, measure=measure, step_max=step_max)
     return {
         **arrays,
         **regimes,

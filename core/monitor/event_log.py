@@ -109,6 +109,8 @@ class EventLog:
             raised = () if cause is None else cause.raised
             by = [reason.words for reason in raised if reason.label != CONTAINMENT]
             line = f"alarm, {', '.join(by[:_SHOWN]) if by else session.rule_text()}{left}"
+            jumped = [] if cause is None else session.jumps_of(cause)
+            line += f"; {', '.join(jumped[:_SHOWN])}" if jumped else ""
             if frozen:
                 line = f"alarm, frozen: {'; '.join(session.frozen_text(moved) for moved in frozen[:_SHOWN])}"
             line += "; it lasts until ~/reset" if session.rule.latch else ""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, labels
+from uncertain_lti.model.jumps import jumps, jumps_in_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Raised, row_of
 from uncertain_lti.monitor.envelope_monitor import Verdict, Verdicts
@@ -47,6 +48,8 @@ class Facts(NamedTuple):
         States that are frozen.
     lacking : sequence of str
         Signals without a value at either end of the transition; looked at if the status is MISSING.
+    jumps : sequence of str
+        States that left their bounds by a jump larger than any of the fit, in words.
     """
 
     alarm: bool
@@ -55,6 +58,7 @@ class Facts(NamedTuple):
     raised: Sequence[Raised] = ()
     frozen: Sequence[str] = ()
     lacking: Sequence[str] = ()
+    jumps: Sequence[str] = ()
 
 
 class Reasons:
@@ -85,6 +89,7 @@ class Reasons:
         """Forget every sample."""
         self.text = "no verdict yet"
         self._blamed: dict[str, list[str]] = {}
+        self._jumps: list[str] = []
         self._by = ""  # what holds the alarm, or held it last
 
     def fresh(self) -> Reasons:
@@ -121,7 +126,10 @@ class Reasons:
         if verdict.status is Status.MISSING:
             lacking = self._lacking([*verdict.before, *verdict.numbers("state")])
         frozen = [names[moved.state] for moved in verdict.frozen]
-        return self.push(Facts(alarm, verdict.status, verdict.unknown_regime, verdict.raised, frozen, lacking))
+        jumps: Sequence[str] = ()
+        if verdict.violated:
+            jumps = jumps_in_words(self._model, verdict.before, verdict.numbers("state"), verdict.numbers("flags"))
+        return self.push(Facts(alarm, verdict.status, verdict.unknown_regime, verdict.raised, frozen, lacking, jumps))
 
     def _lacking(self, values: Sequence[float]) -> list[str]:
         """Names of signals of which some value, of [x; u; s] before and x after, is no number."""
@@ -144,11 +152,11 @@ class Reasons:
         """
         judged = facts.status is Status.OK
         if not facts.alarm:
-            self._blamed, self._by = {}, ""
+            self._blamed, self._jumps, self._by = {}, [], ""
         elif facts.frozen:
             self._by = f"frozen: {', '.join(facts.frozen)}"
         elif judged and facts.raised:
-            self._by = self._rules_that(facts.raised)
+            self._by = self._rules_that(facts.raised, facts.jumps)
         elif judged and not self._by.startswith("latched"):
             self._by = "latched until ~/reset" + (f", raised by {self._by}" if self._by else "")
         said = [f"alarm: {self._by}" if self._by else "alarm"] if facts.alarm else []
@@ -161,17 +169,20 @@ class Reasons:
         self.text = "; ".join(said)
         return self.text
 
-    def _rules_that(self, raised: Sequence[Raised]) -> str:
-        """The rules that hold the alarm, with the states blamed since these do."""
+    def _rules_that(self, raised: Sequence[Raised], jumps: Sequence[str]) -> str:
+        """The rules that hold the alarm, with the states blamed and the first jump since these do."""
         held = dict.fromkeys(reason.label for reason in raised)
         if held.keys() != self._blamed.keys():
-            self._blamed = {label: [] for label in held}
+            self._blamed, self._jumps = {label: [] for label in held}, []
+        if jumps and not self._jumps:
+            self._jumps = list(jumps)
         for reason in raised:
             if reason.state and reason.state not in self._blamed[reason.label]:
                 self._blamed[reason.label].append(reason.state)
-        return "; ".join(
+        by = [
             self._words[label] + (f": {', '.join(states)}" if states else "") for label, states in self._blamed.items()
-        )
+        ]
+        return "; ".join([*by, *self._jumps])
 
     def _why(self, facts: Facts) -> str:
         if facts.status is Status.MISSING and facts.lacking:
@@ -207,7 +218,11 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
         if status is Status.MISSING:
             ends: list[Array] = [transient.x[k - 1], transient.u[k - 1], transient.s[k - 1], transient.x[k]]
             lacking = reasons._lacking(np.concatenate(ends).tolist())
-        text = reasons.push(Facts(alarm, status, bool(verdicts.unknown_regime[k]), raised, frozen, lacking))
+        jumps: Sequence[str] = ()
+        if alarm and status is Status.OK:
+            flags = verdicts.flags[k].tolist()
+            jumps = jumps_in_words(model, transient.x[k - 1].tolist(), transient.x[k].tolist(), flags)
+        text = reasons.push(Facts(alarm, status, bool(verdicts.unknown_regime[k]), raised, frozen, lacking, jumps))
         if text != said:
             yield k, text
             said = text
@@ -218,6 +233,8 @@ def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Stat
     rows: list[NDArray[Any]] = [verdicts.alarm, verdicts.unknown_regime, verdicts.rule_alarms, verdicts.frozen]
     if verdicts.alarm.any():
         rows += [verdicts.flags == 1.0, np.abs(verdicts.statistics) > 1.0]
+        before = np.concatenate([np.full((1, model.n), np.nan), verdicts.transient.x[:-1]])
+        rows.append((jumps(model, before, verdicts.transient.x)[0] != 0.0) & (verdicts.flags == 1.0))
         table = np.abs(verdicts.horizon_utilisation)
         rows += [
             table[:, row_of(rule, model)] > rule.margin

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.jumps import jumps_in_words
 from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Arming, Condition
@@ -157,6 +158,8 @@ class Period:
         ever in the fit.
     violations : Counter of int
         By number of the state.
+    jumps : list of str
+        The first jumps larger than any of the fit, in words.
     statuses : Counter of Status
         Of the samples in it.
     counters : Counter of str
@@ -178,6 +181,7 @@ class Period:
     frozen: dict[int, Moved] = field(default_factory=dict)
     repeating: dict[int, Moved] = field(default_factory=dict)
     violations: Counter[int] = field(default_factory=Counter)
+    jumps: list[str] = field(default_factory=list)
     statuses: Counter[Status] = field(default_factory=Counter)
     counters: Counter[str] = field(default_factory=Counter)
     late: int = 0
@@ -649,6 +653,8 @@ class Session:
             period.unknown += 1
             period.last_unknown = verdict
         if verdict.violated:
+            if len(period.jumps) < _SHOWN:
+                period.jumps += self.jumps_of(verdict)
             for i, flag in enumerate(verdict.numbers("flags")):
                 if flag == 1.0:
                     self.violations[i] += 1
@@ -845,6 +851,7 @@ class Session:
             complaints.append(f"{self.future.total() - period.future} stamps lie over {FUTURE:g} s in the future")
         if off := self.arming.why_off():
             (complaints if self.arming.on is None else calm).append(off)
+        complaints += period.jumps[:_SHOWN]
         if self.monitor.masked:
             calm.append(f"masked: {', '.join(self.monitor.masked)}")
         if self.latched and not self.monitor.alarm:
@@ -901,6 +908,25 @@ class Session:
         """
         assert self.model.repeats is not None
         return frozen_words(self.model.state_names[moved.state], moved, self.model.repeats)
+
+    def jumps_of(self, verdict: Verdict) -> list[str]:
+        """What is said of states that left their bounds by a jump larger than any of the fit.
+
+        Parameters
+        ----------
+        verdict : Verdict
+            On a sample.
+
+        Returns
+        -------
+        list of str
+            Names the states; empty if none did.
+        """
+        if not verdict.violated:
+            return []
+        flags = zip(self.model.state_names, verdict.numbers("flags"), strict=True)
+        counted = [0.0 if name in self.monitor.masked else flag for name, flag in flags]
+        return jumps_in_words(self.model, verdict.before, verdict.numbers("state"), counted)
 
     def lacking(self, before: Counter[str]) -> list[str]:
         """Signals that samples had no value of since some counters.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.model.jumps import jump_words, jumps
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.monitor.frozen import repeat_words
@@ -62,6 +63,8 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         odd.append((int((~verdicts.asked).sum()), Status.UNASKED))
     width = np.where(verdicts.judged[:, None], verdicts.upper - verdicts.lower, np.nan)
     states = {}
+    before = np.concatenate([np.full((1, model.n), np.nan), transient.x[:-1]])
+    change, largest = jumps(model, before, transient.x)
     for i, name in enumerate(model.state_names):
         flags = verdicts.flags[:, i]
         bad = flags == 1.0
@@ -77,6 +80,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
             "mean_width": float(np.nanmean(width[:, i])) if judged else None,
             "max_width": float(np.nanmax(width[:, i])) if judged else None,
             "unit": model.signals.states[i].unit,
+            "jump": _jump(model, verdicts, i, change[:, i], float(largest[i])),
         }
     alarms = _runs(verdicts.alarm)
     data: dict[str, Any] = {
@@ -245,6 +249,16 @@ def outcome(recordings: Sequence[dict[str, Any]]) -> str:
         One of OUTCOMES.
     """
     return next(o for o in OUTCOMES if o == OUTCOMES[-1] or any(r["outcome"] == o for r in recordings))
+
+
+def _jump(model: UncertainLTI, verdicts: Verdicts, i: int, change: Array, largest: float) -> dict[str, Any] | None:
+    """The largest jump with which a state left its bounds, if it is larger than any of the fit."""
+    size = np.where(verdicts.flags[:, i] == 1.0, np.abs(change), 0.0)
+    k = int(np.nanargmax(size)) if len(size) else 0
+    if not len(size) or not size[k] > 0.0:
+        return None
+    text = jump_words(model.state_names[i], float(change[k]), largest)
+    return {**_instant(verdicts.transient, k), "change": float(change[k]), "largest_in_fit": largest, "text": text}
 
 
 def _raised(verdicts: Verdicts, k: int) -> list[dict[str, Any]]:

@@ -62,6 +62,7 @@ def check_text(data: dict[str, Any]) -> str:
             share = data["unknown_regime"] / data["verdicts"]
             lines.append(f"unknown regime: {share:.2%} of the verdicts, which nothing vouches for")
     lines += [f"  {text}" for text in data["unknown"]]
+    lines += [f"{j['text']} at {j['t']:.4f} s" for s in data["states"].values() if (j := s["jump"]) is not None]
     lines += [*repeats_text(data), *likeness_text(data)]
     if data["alarm"]:
         first = data["alarms"][0]

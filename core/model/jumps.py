@@ -1,0 +1,106 @@
+"""Jumps: the largest change of each state in one step of the recordings, and what is said of a larger one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.limits import LARGEST
+
+
+def largest_steps(model: Any, transients: Iterable[Any]) -> Array:
+    """The largest change of each state in one transition of recordings.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Its scales normalise.
+    transients : iterable of Transient
+        The recordings.
+
+    Returns
+    -------
+    array (n,)
+        Normalised.
+    """
+    largest = np.zeros(model.n)
+    for transient in transients:
+        steps = transient.transitions()
+        with np.errstate(over="ignore", invalid="ignore"):
+            largest = np.maximum(largest, np.abs(steps.x_next - steps.x).max(axis=0, initial=0.0))
+    return np.asarray(np.minimum(largest / model.operating_point.X, LARGEST))
+
+
+def jumps(model: Any, before: ArrayLike, after: ArrayLike) -> tuple[Array, Array]:
+    """How far states moved in one step, where that is farther than ever in the fit.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Knows the largest steps, or does not.
+    before, after : array (..., n)
+        The states at the ends of a transition, recorded units.
+
+    Returns
+    -------
+    array (..., n)
+        The change, recorded units; 0 where it is none larger than in the fit.
+    array (n,)
+        The largest of the fit, recorded units; infinite where that is not known.
+    """
+    known = model.domain.step_max
+    limit = np.full(model.n, np.inf) if known is None else known * model.operating_point.X
+    with np.errstate(over="ignore", invalid="ignore"):
+        change = np.asarray(after, dtype=np.float64) - np.asarray(before, dtype=np.float64)
+    # the product with the scale rounds: what is as large as the largest of the fit is not larger
+    return np.where(np.abs(change) > limit * (1.0 + 1e-9), change, 0.0), limit
+
+
+def jump_words(name: str, change: float, largest: float) -> str:
+    """What is said of a jump.
+
+    Parameters
+    ----------
+    name : str
+        Of the state.
+    change : float
+        By how much it moved in one step.
+    largest : float
+        The largest in one step of the fit.
+
+    Returns
+    -------
+    str
+        Without a full stop.
+    """
+    return f"{name} jumped by {change:.3g} in one step (at most {largest:.3g} in the fit)"
+
+
+def jumps_in_words(model: Any, before: Sequence[float], after: Sequence[float], flags: Sequence[float]) -> list[str]:
+    """What is said of the states that jumped out of their bounds.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        Knows the largest steps, or does not.
+    before : sequence of float, at least (n,)
+        The states at the begin of a transition, and what follows them, recorded units.
+    after : sequence of float (n,)
+        Those at its end.
+    flags : sequence of float (n,)
+        1 for a state that left its bounds.
+
+    Returns
+    -------
+    list of str
+        One for each; empty if the largest steps are not known.
+    """
+    if model.domain.step_max is None:
+        return []
+    change, limit = jumps(model, before[: model.n], after)
+    rows = zip(model.state_names, change.tolist(), limit.tolist(), flags, strict=True)
+    return [jump_words(name, by, most) for name, by, most, flag in rows if by and flag == 1.0]
