@@ -1,4 +1,4 @@
-"""Detectors of scikit-learn and MAPIE, asked by arrays in files: they may live in an environment of their own.
+"""Detectors of scikit-learn, MAPIE and SENTIL, asked by arrays in files: they may live in an environment of their own.
 
 Usage: python detection_peers.py IN.npz OUT.npz. In: for each set NAME of recordings x_NAME (R, T, n), u_NAME (R, T, m),
 dt_NAME (R, T-1); sets whose names begin with `fitted` are learnt from. Out: for each detector D and set D|NAME: (R, T)
@@ -11,6 +11,7 @@ import sys
 import warnings
 
 import numpy as np
+import sentil
 from mapie.regression import SplitConformalRegressor
 from numpy.lib.stride_tricks import sliding_window_view
 from sklearn.ensemble import IsolationForest
@@ -59,6 +60,23 @@ def conformal(fitted: list[Set], sets: dict[str, Set]) -> dict[str, Array]:
     return found
 
 
+def ranges(fitted: list[Set], sets: dict[str, Set]) -> dict[str, Array]:
+    """1 - robustness of the formula that one writes by hand: every state and control in its recorded range."""
+    z = np.concatenate([np.concatenate([x, u], axis=2).reshape(-1, x.shape[2] + u.shape[2]) for x, u, _ in fitted])
+    middle, half = 0.5 * (z.max(axis=0) + z.min(axis=0)), 0.5 * np.ptp(z, axis=0)
+    names = [f"z{i}" for i in range(len(half)) if half[i] > 0]
+    formula = sentil.Formula.parse(
+        " & ".join(f"abs(({name} - ({middle[int(name[1:])]:.17g})) / {half[int(name[1:])]:.17g}) < 1" for name in names)
+    )
+    found = {}
+    for name, (x, u, dt) in sets.items():
+        t = np.concatenate([np.zeros((len(dt), 1)), np.cumsum(dt, axis=1)], axis=1)
+        z = np.concatenate([x, u], axis=2)
+        traces = ({n: np.ascontiguousarray(z[i, :, int(n[1:])]) for n in names} for i in range(len(z)))
+        found[name] = np.stack([1.0 - formula.robustness_signal(sentil.Trace(t[i], s)) for i, s in enumerate(traces)])
+    return found
+
+
 def main() -> None:
     """Read, learn, score, write."""
     warnings.simplefilter("ignore")
@@ -67,6 +85,7 @@ def main() -> None:
         sets: dict[str, Set] = {n: (data[f"x_{n}"], data[f"u_{n}"], data[f"dt_{n}"]) for n in names}
     fitted = [sets[n] for n in names if n.startswith("fitted")]
     out = {f"split conformal|{n}": s for n, s in conformal(fitted, sets).items()}
+    out |= {f"SENTIL, recorded ranges|{n}": s for n, s in ranges(fitted, sets).items()}
     z = np.concatenate([np.concatenate([x, u], axis=2).reshape(-1, x.shape[2] + u.shape[2]) for x, u, _ in fitted])
     mean, deviation = z.mean(axis=0), z.std(axis=0)
 

@@ -8,9 +8,11 @@ pytest.importorskip("scipy", reason="scipy, which the benchmark needs, is not in
 from detection import Case, Faulty, Kind, Recorded, evaluate, from_whole_degrees, our_rules, profile, threshold_of
 from detectors import Kalman, LeastSquares, Runs, Statistic, cusum, of_window, residual_detectors
 from tanks import Tanks
+from temporal_logic import arrivals, formula_of, gathered, verdicts
 
 from uncertain_lti import EnvelopeMonitor, OperatingPoint, fit
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.plants.leibov import transient
 
 POINT = OperatingPoint(np.zeros(3), np.zeros(1), np.ones(3), np.ones(1))
 KINDS = (
@@ -93,6 +95,33 @@ def test_least_squares_and_the_filter_find_a_linear_plant():
     noisy = [Runs(read, u, steps)]
     filtered = Kalman.likeliest(noisy, exact)(noisy[0])
     assert (filtered.std(axis=(0, 1)) < 0.85 * exact(noisy[0]).std(axis=(0, 1))).all()  # it averages the sensors' noise
+
+
+def test_what_is_gathered_from_messages_in_order_is_what_was_recorded():
+    run = transient(200, 1)
+    z, t = np.hstack([run.x, run.u]).tolist(), [round(value, 6) for value in run.t.tolist()]
+    n, count = run.x.shape[1], len(run) - 1
+    in_order, late = arrivals(count, ""), arrivals(count, "control", seed=2)
+    assert in_order[1] == [] and late[1]
+    assert gathered(z, t, n, in_order[0]) == {t[k]: z[k] for k in range(count)}
+    disturbed = gathered(z, t, n, late[0])
+    for k in range(count - 1):
+        there = [i for topic, i in late[0][: late[0].index(("state", k + 1))] if topic == "control"]
+        assert disturbed[t[k]] == z[k][:n] + z[there[-1] if k in late[1] else k][n:]
+    model = fit([run])
+    for order, behind in (in_order, late):
+        found, counters = verdicts(model, run, order)
+        assert sorted(found) == t[2:count]  # the first sample is there before any control
+        for k in range(2, count):
+            _, start, values = found[t[k]]
+            held = k - 1 in behind
+            assert start == t[k - 1] and values == z[k - 1][:n] + z[k - 1 - held][n:]
+        assert sum(count for key, count in counters.items() if key.startswith("late")) == len(behind)
+
+
+def test_a_range_is_left_where_it_ends():
+    assert formula_of([-1.0, 2.0], [1.0, 4.0]) == "abs((z0 - (0)) / 1.01) < 1 & abs((z1 - (3)) / 1.01) < 1"
+    assert formula_of([0.0], [1.0], "H[0, 1] ({})").startswith("H[0, 1] (abs((z0 - (0.5)) / 0.505")
 
 
 def test_levers_start_from_whole_angles_and_differ_by_seed():
