@@ -278,3 +278,37 @@ def test_what_is_foreseen_is_judged_when_the_longest_horizon_ends() -> None:
         np.testing.assert_allclose((x[k + 5] - centre) / half, judged[k + 5], rtol=1e-9)
         assert found.packed("lower") == found.lower.tobytes() and found.packed("upper") == found.upper.tobytes()
     assert EnvelopeMonitor(model.replace(horizons=())).foresee(0, [*x[0], *u[0]], dt) is None
+
+
+@pytest.mark.parametrize("schedule", [None, SPEED])
+def test_on_the_edge_of_an_envelope_the_comparison_decides_not_the_quotient(schedule: Schedule | None) -> None:
+    """|utilisation| is at most 1 exactly where lower <= x <= upper; the quotient alone is off by a rounding there."""
+    rng = np.random.default_rng(11)
+    model = with_horizons(rng, (2,), schedule)
+    x, t = rng.normal(size=(600, 2)), np.repeat(np.arange(200) * 1.0, 3) + np.tile([0.0, 0.01, 0.02], 200)
+    run = Transient(t, x, rng.normal(size=(600, 1)), max_gap=0.1)
+    steps = run.transitions()
+    ((windows, centre, half),) = model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)
+    assert len(windows.start) == 200
+    last = steps.k[windows.last] + 1
+    edges = [(centre - half).T, (centre + half).T]
+    beyond = [np.nextafter(edges[0], -np.inf), np.nextafter(edges[1], np.inf)]
+    off = 0
+    for edge, inside in [*zip(edges, (True, True), strict=True), *zip(beyond, (False, False), strict=True)]:
+        moved = x.copy()
+        moved[last] = edge
+        there = Transient(t, moved, run.u, max_gap=0.1)
+        found = EnvelopeMonitor(model).check(there).longer_utilisation[last, 0]
+        assert np.array_equal(np.abs(found) <= 1.0, np.full((200, 2), inside))
+        off += int((np.abs((edge - centre.T) / half.T) <= 1.0).sum() != 400 * inside)
+        steps = [
+            Step(status, int(t_ns), 0, there.dt[k - 1] if k else np.nan, [*moved[k - 1], *run.u[k - 1]], [*moved[k]])
+            for k, (status, t_ns) in enumerate(zip(there.statuses(), there.t_ns, strict=True))
+        ]
+        assert live(model, steps)[last, 1].tobytes() == found.tobytes()
+        patch = pure()
+        try:
+            assert live(model, steps)[last, 1].tobytes() == found.tobytes()
+        finally:
+            patch.undo()
+    assert off, "no quotient is off here, so this shows nothing"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.problem import Block, Columns, Partition, scaled_eigenvalues
-from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of, utilisation_of
+from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of
 
 
 @dataclass
@@ -672,9 +672,6 @@ def _inside_and_half(model: Envelope, block: Block) -> tuple[NDArray[np.bool_], 
     """The verdict on each row of each transition, and its half-width, both (n, K)."""
     centre, half = _centre_and_half(model, block)
     inside: NDArray[np.bool_] = centre - half <= block.x_next
-    if block.base is not None:  # of a horizon the verdict is the utilisation
-        with np.errstate(over="ignore", invalid="ignore"):
-            inside &= np.abs(utilisation_of(block.x_next - centre, half)) <= 1.0
     centre += half
     inside &= block.x_next <= centre
     return inside, half

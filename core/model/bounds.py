@@ -242,6 +242,33 @@ def utilisation_of(difference: cython.double, half: cython.double) -> cython.dou
 @cython.cfunc
 @cython.inline
 @cython.exceptval(check=False)
+def settled(utilisation: cython.double, inside: cython.bint) -> cython.double:
+    """Utilisation whose size is at most 1 exactly where the sample is contained: on the edge rounding decides.
+
+    Parameters
+    ----------
+    utilisation : float or array
+        Of `utilisation_of`.
+    inside : bool or array of bool
+        Of `contained`, at margin 1.
+
+    Returns
+    -------
+    float or array
+        Moved by the rounding on the edge, if at all.
+    """
+    above = 1.0000000000000002  # the next number after 1
+    if cython.compiled:
+        if inside:
+            return 1.0 if utilisation > 1.0 else -1.0 if utilisation < -1.0 else utilisation
+        return above if 0.0 <= utilisation <= 1.0 else -above if -1.0 <= utilisation < 0.0 else utilisation
+    edge = np.where(utilisation < 0.0, -above, above)
+    return np.where(inside, np.clip(utilisation, -1.0, 1.0), np.where(np.abs(utilisation) <= 1.0, edge, utilisation))
+
+
+@cython.cfunc
+@cython.inline
+@cython.exceptval(check=False)
 def cell_of(z: cython.double, least: cython.double, per_unit: cython.double, last: cython.int) -> cython.int:
     """Cell of its range that a value lies in.
 
@@ -1222,7 +1249,8 @@ class Runs:
         Returns
         -------
         buffer of doubles (horizons n,)
-            Utilisation of each state by each horizon, horizon after horizon; NaN where no run has gone so far.
+            Utilisation of each state by each horizon (`settled`), horizon after horizon; NaN where no run has gone so
+            far.
         """
         if cython.compiled:
             return self._one(after, dt)
@@ -1257,8 +1285,9 @@ class Runs:
             phi = np.concatenate([self._start[:, run], self._control[:, run] / time, ones])
             places, weights = (None, None) if schedule is None else schedule.corners(self._vectors[:, run])
             centre, half = centre_and_half(theta, delta, v, phi, time, places, weights, self._x[:, run])
+            lower, upper = lower_of(centre, half, 1.0)[:, 0], upper_of(centre, half, 1.0)[:, 0]
             residual[:] = x_next - centre[:, 0]
-            values[:] = utilisation_of(residual, half[:, 0])
+            values[:] = settled(utilisation_of(residual, half[:, 0]), contained(lower, x_next, upper))
         self.residuals = array("d", left.tobytes())
         return array("d", found.tobytes())
 
@@ -1281,6 +1310,7 @@ class Runs:
         value: cython.double
         size: cython.double
         x_next: cython.double
+        inside: cython.bint
         theta: cython.p_double
         delta: cython.p_double
         v: cython.p_double
@@ -1352,8 +1382,9 @@ class Runs:
                 x_next = normalised(x_next, judge._steady[i], judge._scale[i])
                 value = centre_of(self._x[i * longest + k], time, self._rate[i])
                 size = half_of(time, self._spread[i], v[i])
+                inside = contained(lower_of(value, size, 1.0), x_next, upper_of(value, size, 1.0))
                 self._residual[h * n + i] = x_next - value
-                values[h * n + i] = utilisation_of(x_next - value, size)
+                values[h * n + i] = settled(utilisation_of(x_next - value, size), inside)
         return blank
 
     @cython.cfunc

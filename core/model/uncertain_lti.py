@@ -30,8 +30,10 @@ from uncertain_lti.model.bounds import (
     Runs,
     blended,
     centre_and_half,
+    contained,
     lower_of,
     normalised,
+    settled,
     upper_of,
     utilisation_of,
 )
@@ -738,7 +740,8 @@ class UncertainLTI:
         Returns
         -------
         array (N, horizons, n)
-            (x - centre) / half; NaN where the window of the horizon is broken.
+            (x - centre) / half, of a size of at most 1 exactly where contained; NaN where the window of the horizon is
+            broken.
         array (N, horizons, n)
             x - centre, normalised; NaN likewise.
         """
@@ -746,8 +749,10 @@ class UncertainLTI:
         utilisation, residual = found
         for j, (windows, centre, half) in enumerate(self.envelopes(k, z, dt)):
             with np.errstate(over="ignore", invalid="ignore"):
-                left = x_next[windows.last].T - centre
-                residual[windows.last, j], utilisation[windows.last, j] = left.T, utilisation_of(left, half).T
+                x = x_next[windows.last].T
+                left, inside = x - centre, contained(lower_of(centre, half, 1.0), x, upper_of(centre, half, 1.0))
+                residual[windows.last, j] = left.T
+                utilisation[windows.last, j] = np.asarray(settled(utilisation_of(left, half), inside)).T
         return utilisation, residual
 
     def envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:

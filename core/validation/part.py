@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.bounds import settled
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient, Transitions
@@ -202,12 +203,10 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
     n = model.n
     empty = not len(width)
     utilisation = verdicts.utilisation[judged]
-    # what lies on the edge is judged by the flags: there rounding decides
-    size = np.where(flags, np.maximum(np.abs(utilisation), np.nextafter(1.0, 2.0)), np.minimum(np.abs(utilisation), 1))
     return Part(
         name,
         steps.dt,
-        np.copysign(size, utilisation),
+        np.asarray(settled(utilisation, ~flags)),
         np.ones(width.shape) if empty else width.mean(axis=0) / np.maximum(width, 1e-300),
         tuple(starts),
         flags.sum(axis=0),
