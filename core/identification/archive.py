@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.cache import CacheWriter
@@ -23,12 +24,14 @@ from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.repeats import repeats_in, together
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.sampling.reading import load_signals, sample, time_source
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.streams import read_stream
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -192,7 +195,14 @@ def fit_archive(
         "transients": len(recordings),
         "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
-    return model.replace(fit_summary=facts)
+    found = visit("repeats in", repeats, model)
+    return model.replace(fit_summary=facts, repeats=together(model.n, found))
+
+
+def _sampled(recording: Recording, signals: SignalMap) -> Transient:
+    return sample(
+        read_stream(open_recording(recording[0], recording[1], indexed=True, layout=signals.table), signals), signals
+    )
 
 
 def survey(recording: Recording, signals: SignalMap) -> Survey:
@@ -269,11 +279,31 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     Problem
         Weights are ones; empty where no transition is usable.
     """
-    transient = sample(
-        read_stream(open_recording(recording[0], recording[1], indexed=True, layout=signals.table), signals), signals
-    )
     point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
-    return replace(assemble([transient], point, None, "none", empty=True, regimes=columns.regimes), columns=columns)
+    return replace(
+        assemble([_sampled(recording, signals)], point, None, "none", empty=True, regimes=columns.regimes),
+        columns=columns,
+    )
+
+
+def repeats(recording: Recording, model: UncertainLTI) -> tuple[Array, Array]:
+    """What one recording has of exact repeats.
+
+    Parameters
+    ----------
+    recording : (str, tuple of str)
+        Path and files, as `open_recording` takes them.
+    model : UncertainLTI
+        Fitted to it and others.
+
+    Returns
+    -------
+    array (4, n)
+        As of `repeats_in`.
+    array (windows, n)
+        Likewise.
+    """
+    return repeats_in(model, _sampled(recording, model.signals))
 
 
 def _constant_dt(recording: Recording, signals: SignalMap) -> bool:

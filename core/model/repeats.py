@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -232,14 +232,14 @@ def _over(size: float, half: float) -> float:
     return size / half if half > 0.0 else math.inf if size > 0.0 else 0.0
 
 
-def repeats_of(model: Any, transients: Sequence[Any]) -> Repeats:
+def repeats_of(model: Any, transients: Iterable[Any]) -> Repeats:
     """What recordings of a healthy machine have of exact repeats.
 
     Parameters
     ----------
     model : UncertainLTI
         Fitted to them; its nominal part is what runs over the repeats.
-    transients : sequence of Transient
+    transients : iterable of Transient
         The recordings.
 
     Returns
@@ -247,37 +247,74 @@ def repeats_of(model: Any, transients: Sequence[Any]) -> Repeats:
     Repeats
         Over all of them.
     """
-    longest, run, total, active = (np.zeros(model.n) for _ in range(4))
-    point = model.operating_point
-    windows = []
-    for transient in transients:
-        steps = transient.transitions()
-        windows.append(_activity(model, transient, steps))
-        rows = np.flatnonzero((steps.x == steps.x_next).any(axis=1))
-        if not len(rows):
-            continue
-        chosen = np.zeros(len(steps.k), dtype=bool)
-        chosen[rows] = True
-        some = steps.take(chosen)
-        with np.errstate(over="ignore", invalid="ignore"):
-            z = model.normalised_columns(some)
-            centre, half = np.empty((model.n, len(rows))), np.empty((model.n, len(rows)))
-            model.columns_centre_and_half(z, some.dt, centre, half)
-            lower, upper = (point.recorded_x(np.asarray(of(centre, half, 1.0)).T) for of in (lower_of, upper_of))
-        values = (some.dt, some.x, some.x_next, lower, upper, model.own_rates(z).T)
-        follow, last = Repeating(model.n), -2
-        for k, t_ns, *each in zip(
-            some.k.tolist(), transient.t_ns[some.k + 1].tolist(), *(a.tolist() for a in values), strict=True
-        ):
-            if k != last + 1:
-                follow.forget()
-            last = k
-            for moved in follow.push(t_ns, *each):
-                i = moved.state
-                longest[i] = max(longest[i], moved.seconds)
-                run[i], total[i] = max(run[i], moved.run), max(total[i], moved.sum)
-                active[i] = max(active[i], moved.activity)
-    beyond = np.maximum(_median(np.concatenate([np.zeros((0, model.n)), *windows])), MORE_ACTIVE * active)
+    return together(model.n, [repeats_in(model, transient) for transient in transients])
+
+
+def repeats_in(model: Any, transient: Any) -> tuple[Array, Array]:
+    """What one recording has of them.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        As for `repeats_of`.
+    transient : Transient
+        The recording.
+
+    Returns
+    -------
+    array (4, n)
+        Of each state the longest repeat, the farthest run, the largest sum and the greatest activity of a repeat.
+    array (windows, n)
+        Activity in each window of WINDOW_S; NaN for a state that repeats in half of it or more.
+    """
+    longest, run, total, active = most = np.zeros((4, model.n))
+    point, steps = model.operating_point, transient.transitions()
+    windows = _activity(model, transient, steps)
+    rows = np.flatnonzero((steps.x == steps.x_next).any(axis=1))
+    if not len(rows):
+        return most, windows
+    chosen = np.zeros(len(steps.k), dtype=bool)
+    chosen[rows] = True
+    some = steps.take(chosen)
+    with np.errstate(over="ignore", invalid="ignore"):
+        z = model.normalised_columns(some)
+        centre, half = np.empty((model.n, len(rows))), np.empty((model.n, len(rows)))
+        model.columns_centre_and_half(z, some.dt, centre, half)
+        lower, upper = (point.recorded_x(np.asarray(of(centre, half, 1.0)).T) for of in (lower_of, upper_of))
+    values = (some.dt, some.x, some.x_next, lower, upper, model.own_rates(z).T)
+    follow, last = Repeating(model.n), -2
+    for k, t_ns, *each in zip(
+        some.k.tolist(), transient.t_ns[some.k + 1].tolist(), *(a.tolist() for a in values), strict=True
+    ):
+        if k != last + 1:
+            follow.forget()
+        last = k
+        for moved in follow.push(t_ns, *each):
+            i = moved.state
+            longest[i] = max(longest[i], moved.seconds)
+            run[i], total[i] = max(run[i], moved.run), max(total[i], moved.sum)
+            active[i] = max(active[i], moved.activity)
+    return most, windows
+
+
+def together(n: int, found: Sequence[tuple[Array, Array]]) -> Repeats:
+    """What recordings have of exact repeats, from what each of them has.
+
+    Parameters
+    ----------
+    n : int
+        Number of states.
+    found : sequence of (array, array)
+        Of `repeats_in`.
+
+    Returns
+    -------
+    Repeats
+        Over all of them.
+    """
+    longest, run, total, active = np.max([np.zeros((4, n)), *(most for most, _ in found)], axis=0)
+    median = _median(np.concatenate([np.zeros((0, n)), *(windows for _, windows in found)]))
+    beyond = np.maximum(median, MORE_ACTIVE * active)
     return Repeats(longest, *(np.minimum(values, LARGEST) for values in (run, total, beyond)))
 
 
