@@ -108,6 +108,16 @@ def test_statistics_at_a_horizon_take_the_residuals_of_the_model_fitted_without(
         np.testing.assert_array_equal(np.concatenate(values, axis=1), np.nan_to_num(expected))
 
 
+def test_a_choice_says_which_horizons_are_useless(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("uncertain_lti.identification.horizons.WIDER", 0.0)
+    model = fit(RUNS[:2], additive="noise", horizons={"longest": 0.1}, widths="constant")
+    assert model.steps == ()
+    (said,) = [text for text in model.fit_summary["messages"] if "worth having" in text]
+    assert (
+        said.startswith("no horizons: none has an envelope") and said.count("steps: its envelope is wider than if") == 2
+    )
+
+
 def test_horizons_that_lose_are_refused() -> None:
     """Every recording has a bias of its own in the rate: what is left out drifts off, and longer horizons show it."""
     rng = np.random.default_rng(5)

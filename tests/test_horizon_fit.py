@@ -15,6 +15,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.horizons import better_run, fit_horizons, run_of
 from uncertain_lti.identification.problem import Regimes, assemble
 from uncertain_lti.identification.regimes import Modes
+from uncertain_lti.model.horizon import Run
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
@@ -254,3 +255,19 @@ def test_what_is_no_number_of_steps_is_refused(bad: Any) -> None:
 def test_the_problem_as_written_has_one_step() -> None:
     with pytest.raises(FitError, match="cvxpy states one step"):
         fit(runs(count=1), horizons=[3], method="cvxpy")
+
+
+def test_a_horizon_whose_run_blows_up_is_dropped_and_said() -> None:
+    """Its envelope would be wider than what any state ever moved over as many steps."""
+    transients = runs(bend=0.0)
+    problem = assemble(transients, fit(transients).operating_point, None, "noise")
+    model = fit(transients, additive="noise")
+    away = model.replace(run=Run(model.A + 30.0 * np.eye(2), model.B, model.c))
+    found, facts, messages = fit_horizons(away, problem, [2, 60], "constant")
+    assert [h.steps for h in found] == [2] == [f["steps"] for f in facts]
+    assert len(messages) == 1
+    assert messages[0].startswith(
+        "no horizon of 60 steps: its envelope is wider than if every state stayed where it was"
+    )
+    kept, _, none = fit_horizons(model, problem, [2, 60], "constant")
+    assert [h.steps for h in kept] == [2, 60] and not none

@@ -28,7 +28,11 @@ from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 _UNKNOWN = frozenset({"c", "v"})
-_COMPARED = 100_000  # transitions at most on which two runs are compared
+_COMPARED = 20_000  # transitions, about, on which two runs are compared
+_LOOKED_AT = 100_000  # windows, about, that mean and covariance of the residuals are taken from
+WIDER = 1.1
+"""An envelope whose mean half-width is this many times the largest move of a state over as many steps is useless: that
+the state stays where it is, give or take what it ever moved, says more."""
 
 
 @dataclass(frozen=True)
@@ -210,6 +214,14 @@ def fit_horizons(
         kind = widths[windows.steps] if isinstance(widths, Mapping) else widths
         structure = Structure(n, p - n, fixed=zeros) if kind == "constant" else None
         horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
+        move = np.abs(part.next_columns - part.z_columns[:n]).max(axis=1)
+        if (0.5 * fact["mean_width"] > WIDER * move).all():
+            messages.append(
+                f"no horizon of {windows.steps} steps: its envelope is wider than if every state stayed where it was "
+                f"(half-widths x {float((0.5 * fact['mean_width'] / np.maximum(move, 1e-300)).min()):.3g} of the "
+                f"largest move, or more): the nominal model runs away over so many steps; give shorter horizons"
+            )
+            continue
         found.append(horizon)
         facts.append(fact)
     return tuple(found), facts, messages
@@ -249,7 +261,8 @@ def _fitted(
         raise FitError(f"horizon of {steps} steps: {error}") from None
     mean_width = 2.0 * (sums.width_sum @ d) / sums.count
     X = model.operating_point.X
-    return envelope.horizon.with_residuals(engine.fleet.residuals(envelope)), {
+    some = part if part.N <= 2 * _LOOKED_AT else part.subset(slice(None, None, part.N // _LOOKED_AT))
+    return envelope.horizon.with_residuals(Fleet.of(some).residuals(envelope)), {
         "steps": steps,
         "seconds": float(np.median(part.dt)),
         "widths": widths,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -14,6 +14,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.scheduling import EXCESS, FOLDS, PAYS, SLACK, WORSE, fold_of, jackknife
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.horizon_rule import HorizonRule
@@ -216,6 +217,7 @@ def choose_horizons(
     FitError
         No model can be fitted.
     """
+    dropped: dict[int, str] = {}
     kinds: tuple[Widths, ...] = get_args(Widths) if rule.widths == "auto" else (rule.widths,)
     asked = bool(rule.steps or rule.seconds)
     base: HorizonCandidate | None = None
@@ -225,6 +227,7 @@ def choose_horizons(
         if progress is not None:
             progress(f"{kind} half-widths over {', '.join(map(str, lengths))} steps")
         model = fit(transients, describe_data=False, horizons=lengths, widths=kind, **options)
+        dropped |= _dropped(model, lengths)
         try:
             fold = fold_of(transients, groups, model, FOLDS)
             left = validate(
@@ -255,11 +258,26 @@ def choose_horizons(
                 float(np.mean(logs)) if logs else math.nan,
             )
     assert base is not None
-    return _decided(found, base, asked, what, units)
+    return _decided(found, base, asked, what, units, dropped)
+
+
+def _dropped(model: UncertainLTI, lengths: Sequence[int]) -> dict[int, str]:
+    """Of each horizon that was asked for and is not in the model what its fit says."""
+    found = {}
+    for steps in set(lengths) - set(model.steps):
+        begin = f"no horizon of {steps} steps: "
+        said = [text for text in model.fit_summary.get("messages", []) if text.startswith(begin)]
+        found[steps] = said[0].removeprefix(begin) if said else ""
+    return found
 
 
 def _decided(
-    found: dict[int, dict[str, HorizonCandidate]], base: HorizonCandidate, asked: bool, what: str, units: int
+    found: dict[int, dict[str, HorizonCandidate]],
+    base: HorizonCandidate,
+    asked: bool,
+    what: str,
+    units: int,
+    dropped: Mapping[int, str],
 ) -> HorizonChoice:
     """The table and what it says."""
     rows: list[dict[str, Any]] = []
@@ -299,7 +317,7 @@ def _decided(
                 }
             )
     if not found:
-        reason = "no recording is long enough for a horizon"
+        reason = "none has an envelope that is worth having" if dropped else "no recording is long enough for a horizon"
     elif not chosen:
         reason = "none holds on left-out data as well as one step and sees slower changes"
     else:
@@ -309,4 +327,5 @@ def _decided(
             f"{plural(last, 'step')}, {row['widths']} half-widths: {1 - row['outside']:.2%} of the left-out windows "
             f"are inside, and the half-width is x {row['width']:.3g} of one step's"
         )
+    reason += "".join(f"; no horizon of {steps} steps: {why}" for steps, why in sorted(dropped.items()) if why)
     return HorizonChoice(chosen, tuple(rows), what, units, reason)
