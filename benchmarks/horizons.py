@@ -2,6 +2,8 @@
 
 ./run python benchmarks/horizons.py turbofan      # manoeuvres and faults that were not fitted
 ./run python benchmarks/horizons.py live          # CPU time of a verdict with horizons, against one step
+./run python benchmarks/horizons.py node          # CPU time of the node for a sample, through DDS
+./run python benchmarks/horizons.py fit           # CPU time of a fit of ten horizons, against one step
 """
 
 from __future__ import annotations
@@ -13,13 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from live_monitor import TOPICS, Child, Run, save_model
 from measure import table
 from regimes import FAULTY_MOVES, LONG, ONSET, SHORT_RUN, moved
 from turbofan_fleet import simulate_fleet
 
-from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.identification import fit
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Horizon
+from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.terms import ARRAYS, SHAPES
 from uncertain_lti.plants.turbofan_faults import Fault
 from uncertain_lti.plants.turbofan_runs import DT, lever_moves, turbofan_signals
@@ -143,7 +148,90 @@ def live() -> None:
     table("CPU time of a verdict", ["n", "m", "one step", f"with horizons of {HORIZONS} steps"], rows)
 
 
-CLAIMS = {"turbofan": turbofan, "bags": bags, "live": live}
+class HorizonRun(Run):
+    """A monitor with horizons of 10, 20 and 40 steps, and chi2 and the mean of the longest in its alarm."""
+
+    longer = False
+
+    def monitor(self, folder: str, which: str = "") -> Child:
+        """The node of this checkout."""
+        path = Path(folder) / "bench.model.json"
+        save_model(path, self.n, self.rate)
+        if self.longer:
+            plain = UncertainLTI.load(path)
+            arrays = {name: 0.1 * np.abs(getattr(plain, name)) + 1e-3 for name in ARRAYS}
+            known = Residuals(np.zeros(self.n), np.eye(self.n))
+            rules = [StatisticRule("chi2", 0.0, 1e6, HORIZONS[-1]), StatisticRule("mean", 2.0, 1e3, HORIZONS[-1])]
+            plain.replace(
+                horizons=[Horizon(h, **arrays, residuals=known) for h in HORIZONS], alarm=[AlarmRule(), *rules]
+            ).save(path)
+        code = "import sys; from uncertain_lti_ros.envelope_monitor import main; sys.exit(main())"
+        return self.child("-P", "-c", code, "--ros-args", "-p", f"model:={path}", "-p", "violations:=1")
+
+
+class LongerRun(HorizonRun):
+    """As above, with the horizons."""
+
+    longer = True
+
+
+def node() -> None:
+    """A sample at 500 Hz through the node: CPU time with horizons and two statistics over that with one step."""
+    rows = []
+    for n in (5, 50):
+        for heard in (["violation"], TOPICS):
+            turns = []
+            for _ in range(5):
+                found = [
+                    kind(n, 500.0, 8.0).measure("monitor", "", list(heard))["cpu"] for kind in (HorizonRun, LongerRun)
+                ]
+                turns.append(found)
+                print(n, len(heard), found, file=sys.stderr, flush=True)
+            one, more = np.median(np.array(turns), axis=0)
+            ratio = float(np.median([b / a for a, b in turns]))
+            what = "~/violation" if len(heard) == 1 else "all outputs"
+            rows.append([str(n), what, f"{one:.0f} µs", f"{more:.0f} µs", f"{ratio:.2f}"])
+    header = ["n", "heard", "one step", f"horizons of {HORIZONS} steps, chi2 and mean", "ratio"]
+    table("CPU time of the node for a sample at 500 Hz, medians of five turns", header, rows)
+
+
+TEN = (2, 3, 4, 6, 8, 12, 16, 24, 32, 40)
+
+
+def fit_times(count: int = 1_000_000) -> None:
+    """A fit of ten horizons over one million transitions: CPU time over that of one step, in turns."""
+    rng = np.random.default_rng(0)
+    n, m, dt = 5, 4, 0.0025
+    A = np.diag([-1.6, -2.0, -14.0, -15.0, -15.0]) + 0.5 * rng.normal(size=(n, n))
+    B, x = rng.normal(size=(n, m)), np.zeros((count + 1, n))
+    u = 0.1 * rng.normal(size=(count // 40 + 1, m)).repeat(40, axis=0)[:count]
+    pushes = dt * (u @ B.T) + 1e-3 * dt * rng.normal(size=(count, n))
+    step = np.eye(n) + dt * A
+    for k in range(count):
+        x[k + 1] = step @ x[k] + pushes[k]
+    x += 1e-4 * rng.normal(size=x.shape)
+    run = Transient(np.arange(count + 1) * dt, x, np.vstack([u, u[-1:]]))
+    rows = []
+    for criterion in ("qp", "lp"):
+        turns = []
+        for _ in range(3):
+            found = []
+            for horizons in ((), TEN):
+                began = time.process_time()
+                fit(run, criterion, additive="noise", horizons=horizons, describe_data=False)  # type: ignore[arg-type]
+                found.append(time.process_time() - began)
+            turns.append(found)
+            print(criterion, found, file=sys.stderr, flush=True)
+        one, more = np.median(np.array(turns), axis=0)
+        rows.append([criterion, f"{one:.2f} s", f"{more:.1f} s", f"{float(np.median([b / a for a, b in turns])):.1f}"])
+    table(
+        f"CPU time of a fit, {count:,} transitions, n = 5, m = 4",
+        ["criterion", "one step", "ten horizons", "ratio"],
+        rows,
+    )
+
+
+CLAIMS = {"turbofan": turbofan, "bags": bags, "live": live, "node": node, "fit": fit_times}
 
 
 def main() -> None:
