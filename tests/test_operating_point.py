@@ -208,3 +208,57 @@ def test_what_is_said_stays_and_what_is_resolved_can_be_used(recordings: list[np
     alone, _, _ = resolve_auto(signals(*[AUTO] * len(said)), recordings)
     for (said_steady, _), s, a in zip(said, steady, alone, strict=True):
         assert said_steady != "auto" or s == a  # what one signal says does not move another
+
+
+# --- end stops -----------------------------------------------------------------------------------------------
+
+
+def driven(limit: float, held: int, rests: int) -> np.ndarray:
+    """A joint that goes to its stop at one speed, is held there, comes back and rests."""
+    there = np.linspace(0.3, limit, 40)[:, None]
+    return np.vstack([rest(0.3, rests), there, rest(limit, held), there[::-1], rest(0.3, rests)])
+
+
+@pytest.mark.parametrize("limit", [1.2, -0.9])
+def test_a_signal_held_at_its_end_stop_is_no_steady_state(limit: float) -> None:
+    values = driven(limit, held=300, rests=40)
+    steady, scale, words = resolve_auto(signals(AUTO), [values])
+    assert steady == [0.3] and scale == [abs(limit)]
+    assert words.endswith("still samples (every signal within 5% of its range), not the 304 with s0 at an end stop")
+
+
+def test_a_noisy_signal_beside_one_at_its_end_stop_does_not_hide_it() -> None:
+    joint = driven(1.2, held=300, rests=40)
+    other = 5.0 + 0.01 * np.sin(np.arange(len(joint)) * 1.7)[:, None]
+    other[:5] = 9.0
+    steady, _, _ = resolve_auto(signals(AUTO, AUTO), [np.hstack([other, joint])])
+    assert steady[1] == 0.3 and steady[0] == pytest.approx(5.0, abs=0.01)
+
+
+def test_what_settles_by_itself_at_its_least_value_is_steady() -> None:
+    heated = np.concatenate([np.linspace(20.0, 80.0, 60), 20.0 + 60.0 * np.exp(-np.arange(400) / 40.0)])
+    cooling = np.round(np.concatenate([heated, np.full(300, 20.0)]), 1)[:, None]
+    steady, _, words = resolve_auto(signals(AUTO), [cooling])
+    assert steady == [20.0] and "end stop" not in words
+
+
+def test_a_machine_at_rest_is_no_end_stop() -> None:
+    throttle = np.concatenate(
+        [np.zeros(300), np.linspace(0, 1, 40), np.full(60, 0.7), np.linspace(1, 0, 40), np.zeros(300)]
+    )
+    steady, _, words = resolve_auto(signals(AUTO), [throttle[:, None]])
+    assert steady == [0.0] and "end stop" not in words
+
+
+def test_rectangular_steps_between_levels_are_commands_and_no_end_stops() -> None:
+    levels = np.repeat(np.r_[1.0, np.linspace(2.0, 5.0, 12), 6.0], [200] + [12] * 12 + [50])[:, None]
+    steady, _, words = resolve_auto(signals(AUTO), [levels])
+    assert steady == [1.0] and "end stop" not in words
+
+
+def test_where_nothing_is_still_but_at_an_end_stop_it_is_said() -> None:
+    swing = 0.3 + 0.9 * np.abs(np.sin(np.arange(400) / 9.0))
+    values = np.minimum(np.concatenate([swing, np.linspace(swing[-1], 2.0, 30), np.full(200, 1.2)]), 1.15)[:, None]
+    steady, _, words = resolve_auto(signals(AUTO), [values])
+    assert steady == [1.15]
+    assert words.endswith("all of them with s0 at an end stop: give `steady` yourself")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -14,6 +14,9 @@ STILL_SAMPLES = 10
 """A still stretch has at least this many samples."""
 STILL_BAND = 0.05
 """In a still stretch every signal stays within this share of its own range; doubled until there is one."""
+STOP_OTHERS, STOP_SHARE, STOP_SPEED = 20, 0.5, 0.5
+"""What makes a signal's extreme value an end stop: so many other values that it takes, the share of a stretch that is
+there, and the speed at which it arrives, relative to its usual one."""
 
 
 def still_stretches(values: Array, span: Array, band: float = STILL_BAND) -> list[tuple[int, int]]:
@@ -58,13 +61,66 @@ def still_stretches(values: Array, span: Array, band: float = STILL_BAND) -> lis
     return stretches
 
 
+def end_stops(recordings: Sequence[Array]) -> list[list[float]]:
+    """Values at which signals are held by a limit: saturated sensors, joints at their stops, clipped commands.
+
+    The least or the greatest value of a signal is one if the signal takes STOP_OTHERS other values, is held there
+    exactly for STILL_SAMPLES samples, and arrives at it at STOP_SPEED of its usual speed: what settles by itself slows
+    down first, as the temperature of a machine that cools does. 0 is none; it is where machines rest.
+
+    Parameters
+    ----------
+    recordings : sequence of array (samples, signals)
+        In recorded units; NaN where there is none.
+
+    Returns
+    -------
+    list of list of float
+        At most two values per signal.
+    """
+    found: list[list[float]] = []
+    for j in range(recordings[0].shape[1] if recordings else 0):
+        columns = [r[:, j] for r in recordings]
+        pooled = np.concatenate(columns)
+        pooled = pooled[np.isfinite(pooled)]
+        ends = {float(pooled.min()), float(pooled.max())} - {0.0} if len(pooled) else set()
+        moving = np.concatenate([np.abs(np.diff(c)) for c in columns])
+        moving = moving[moving > 0]  # NaN compares false
+        stops = []
+        for end in sorted(ends):
+            if np.count_nonzero(pooled == end) < STILL_SAMPLES or len(np.unique(pooled)) <= STOP_OTHERS:
+                continue
+            speeds = [speed for c in columns for speed in _arrivals(c, end)]
+            if speeds and np.median(speeds) >= STOP_SPEED * np.median(moving):
+                stops.append(end)
+        found.append(stops)
+    return found
+
+
+def _at(values: Array, stops: Iterable[float]) -> bool:
+    """Whether a signal (samples,) is at an end stop for most of a stretch."""
+    return any(np.mean(values == stop) >= STOP_SHARE for stop in stops)
+
+
+def _arrivals(column: Array, end: float) -> list[float]:
+    """Mean step over the samples before each time that a signal comes to be held at a value."""
+    there = np.concatenate([[False], column == end, [False]])
+    starts, ends = np.flatnonzero(there[1:] & ~there[:-1]), np.flatnonzero(~there[1:] & there[:-1])
+    speeds = []
+    for start, stop in zip(starts, ends, strict=True):
+        before = column[max(start - STILL_SAMPLES, 0) : start]
+        if stop - start >= STILL_SAMPLES and len(before) > 1 and np.isfinite(before).all():
+            speeds.append(float(np.abs(np.diff(before)).mean()))
+    return speeds
+
+
 def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tuple[list[float], list[float], str]:
     """Numbers for steady and scale where a signal says auto, and the rule applied, in words.
 
-    steady: median over the longest still stretch (see `still_stretches`; the band is doubled until a stretch
-    is found), without `codes`. scale: the largest magnitude of the medians over all still stretches of all
-    recordings, measured in recorded units, or the range (largest less least value) where that is 0, or 1 where the
-    range is 0 too.
+    steady: median over the longest still stretch (see `still_stretches`; the band is doubled until a stretch is found),
+    without `codes`, and if there is another one without those at `end_stops`. scale: the largest magnitude of the
+    medians over all still stretches of all recordings, measured in recorded units, or the range (largest less least
+    value) where that is 0, or 1 where the range is 0 too.
 
     Parameters
     ----------
@@ -101,9 +157,27 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
         band *= 2.0
     if found:
         medians = np.array([np.median(part, axis=0) for part, _ in found])
-        longest = int(np.argmax([length for _, length in found]))
-        still = medians[longest]
-        words = f"{found[longest][1]} still samples (every signal within {band:.0%} of its range)"
+        stops = end_stops(finite)
+        first = [{float(r[0, j]) for r in finite if len(r)} for j in range(len(signals))]
+        held = [[j for j, _ in enumerate(signals) if _at(part[:, j], stops[j])] for part, _ in found]
+        lengths = [length for _, length in found]
+        longest = int(np.argmax(lengths))
+
+        def rank(k: int) -> tuple[int, int]:
+            """Away from end stops; else at none but those at which a recording begins, as machines do at rest."""
+            begins = all(_at(found[k][0][:, j], first[j] & set(stops[j])) for j in held[k])
+            return 2 if not held[k] else int(begins), lengths[k]
+
+        chosen = max(range(len(found)), key=rank)
+        still = medians[chosen]
+        words = f"{lengths[chosen]} still samples (every signal within {band:.0%} of its range)"
+        if held[longest]:
+            names = ", ".join(signals[j].name for j in held[longest])
+            words += (
+                f", not the {lengths[longest]} with {names} at an end stop"
+                if chosen != longest
+                else f", all of them with {names} at an end stop: give `steady` yourself"
+            )
     else:  # fewer than STILL_SAMPLES finite samples in a row
         still = np.zeros(len(signals))
         still[seen] = np.nanmedian(pooled[:, seen], axis=0)
