@@ -7,6 +7,7 @@ import re
 import signal
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,7 +37,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Empty, Float64, Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout, String
 from std_srvs.srv import Trigger
 
-from uncertain_lti_ros import player
+from uncertain_lti_ros import demo, player
 from uncertain_lti_ros.messages import definition, live_fields, message_class
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -450,6 +451,33 @@ def test_quiet_says_nothing_but_errors(world: World, tmp_path: Path) -> None:
     assert Bag(output).topics["/x"].count > 5
     again = world.command("record", "/x", "--output", output, "--quiet")
     assert again.wait(20) != 0 and "is there already" in again.output
+
+
+def test_json_is_all_that_is_printed_where_it_is_asked_for(world: World, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 2 * 10**9, 10**8))).save(tmp_path / "in.mcap")
+    process = world.command("record", "/x", "--output", output, "--duration", "1", "--quiet", "--json")
+    player = world.command("play", bag, "--quiet", "--json")
+    played, recorded = json.loads(player.succeed(20)), json.loads(process.succeed(20))
+    assert (played["bag"], played["messages"], played["topics"]) == (str(bag), 20, {"/x": 20})
+    assert played["interrupted"] is False and played["unconfirmed"] == [] and played["seconds"] > 1.5
+    number = Bag(output).topics["/x"].count
+    assert recorded["bag"] == str(output) and recorded["topics"] == {"/x": number} and recorded["lost"] == 0
+    assert number == recorded["messages"] > 5 and 0.5 < recorded["span_s"] < 2.0
+
+
+def test_the_demo_prints_its_numbers_as_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without its processes: of a monitor that says nothing, no verdict is equal."""
+    monkeypatch.setattr(demo, "living", lambda _: nullcontext(SimpleNamespace(node=None, alive=True)))
+    monkeypatch.setattr(demo, "_watch", lambda *_: {})
+    monkeypatch.setattr(demo, "save", lambda *_: None)
+    status = demo.run(SimpleNamespace(output=str(tmp_path / "out"), rate=4.0, json=True))  # type: ignore[arg-type]
+    data = json.loads(capsys.readouterr().out)
+    assert status == 2 and (data["verdicts"], data["equal_live_and_offline"]) == (1400, 0)
+    assert data["fault"]["t"] == 24.0 and data["first_alarm_t"] == pytest.approx(24.05)
+    assert data["violated_before"] < 10 < 300 < data["violated_after"] and Path(data["model"]).is_file()
 
 
 # --- the plant ----------------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """The paper's experiment, and the paper's solver beside the exact one."""
 
+import io
 import json
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,8 +97,11 @@ def test_the_published_model_is_known_to_the_commands_by_name(capsys):
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reproduce")
-    assert main(["reproduce", "--output", str(folder / "new")]) == 0
-    return folder / "new", json.loads((folder / "new" / "reproduce.json").read_text())
+    with redirect_stdout(io.StringIO()) as printed:
+        assert main(["reproduce", "--output", str(folder / "new"), "--json"]) == 0
+    data = json.loads((folder / "new" / "reproduce.json").read_text())
+    assert json.loads(printed.getvalue()) == {"output": str(folder / "new"), **data}
+    return folder / "new", data
 
 
 def case(data, name, criterion="qp", additive="none"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from sensor_msgs.msg import JointState
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
+from uncertain_lti.cli.command import print_json
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.reports.check_data import check_data
@@ -47,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("--output", metavar="FOLDER", default="demo-output", help="where model and figure are written")
     parser.add_argument("--rate", type=speed, default=4.0, metavar="R", help="speed of the player (default 4)")
+    parser.add_argument("--json", action="store_true", help="print what came out as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -71,6 +74,15 @@ def run(args: argparse.Namespace) -> int:
     BagError
         The recordings are not there.
     """
+    if args.json:
+        with contextlib.redirect_stdout(io.StringIO()):
+            status, data = _demo(args)
+        print_json(data)
+        return status
+    return _demo(args)[0]
+
+
+def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     bags = _bags()
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
@@ -123,7 +135,17 @@ def run(args: argparse.Namespace) -> int:
     for name, figure in figures.items():
         save(figure, output / name)
         print(f"figure: {output / name}")
-    return 0 if same == len(expected) and len(raised) and raised[0] >= t else 2
+    data = {
+        "model": str(model_file),
+        "verdicts": len(expected),
+        "equal_live_and_offline": same,
+        "fault": {"t": t, "what": what},
+        "violated_before": int((offline.violated & ~after).sum()),
+        "violated_after": int((offline.violated & after).sum()),
+        "first_alarm_t": float(raised[0]) if len(raised) else None,
+        "figures": [str(output / name) for name in figures],
+    }
+    return (0 if same == len(expected) and len(raised) and raised[0] >= t else 2), data
 
 
 def _bags() -> Path:

@@ -22,6 +22,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
+from uncertain_lti.cli.command import print_json
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.raw_messages import RawMessage
 from uncertain_lti.signals.field_types import TypeFields
@@ -61,7 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="wait after each message until this envelope_monitor has taken it; as fast as it can, and exact also "
         "where log time is the clock (then with --clock, and the node with use_sim_time)",
     )  # fmt: skip
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    parser.add_argument("--json", action="store_true", help="print what was played as JSON")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only (and with --json the data)")
 
 
 @dataclass
@@ -117,14 +119,23 @@ def run(args: argparse.Namespace) -> int:
         else:
             _paced(life, played, clock, args.rate or 1.0, messages, _crowd(bag, played))
         took = time.monotonic() - began
-        if missed := _unconfirmed(life, played):
+        missed = _unconfirmed(life, played)
+        if missed:
             say(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     sent = sum(p.sent for p in played.values())
     ended = f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s"
+    if args.json:
+        topics = {p.topic: p.sent for p in played.values()}
+        stopped = life.signal is not None
+        print_json(
+            {"bag": str(bag.path), "messages": sent, "topics": topics, "seconds": took, "unconfirmed": missed}
+            | {"interrupted": stopped}
+        )
     if life.signal is not None:
         say(f"{ended}, then interrupted" if sent else f"{bag.path}: interrupted before a message was played")
         return _SIGNALLED + life.signal
-    tell(ended)
+    if not args.json:
+        tell(ended)
     return 0
 
 

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.cli.command import print_json
 from uncertain_lti_ros.messages import definition, message_class
 from uncertain_lti_ros.polled_events import POLL
 from uncertain_lti_ros.process import Life, living
@@ -41,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--note", action="append", default=[], type=_note, metavar="NAME=TEXT",
         help="write this to the file too, in a metadata record; may be given several times",
     )  # fmt: skip
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    parser.add_argument("--json", action="store_true", help="print what was recorded as JSON")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only (and with --json the data)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,11 +77,15 @@ def run(args: argparse.Namespace) -> int:
         types = _wait_for(life, topics, args.wait)
         subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics if topic in types]
         if subscriptions:
-            tell(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
+            (say if args.json else tell)(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
             _record(life, subscriptions, file, args.duration)
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
+    if args.json:
+        counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost}
+        print_json({"bag": str(output), **counts})
+        return 0
     tell(
         f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s"
         + (f", {lost} lost on the way" if lost else "")
@@ -147,6 +153,8 @@ class _File:
         self.path, self._notes = path, notes
         self._part = path.with_name(f"{path.name}.part")
         self.count = 0
+        self._topics: dict[int, str] = {}
+        self.counts: dict[str, int] = {}
         self.began: float | None = None
         self._first = self._last = 0
 
@@ -186,7 +194,9 @@ class _File:
     def channel(self, topic: str, type_name: str, offered: list[QoSProfile]) -> int:
         schema = self._writer.register_schema(type_name, "ros2msg", definition(type_name).encode())
         metadata = {"offered_qos_profiles": _qos_text(offered)}
-        return int(self._writer.register_channel(topic, "cdr", schema, metadata))
+        number = int(self._writer.register_channel(topic, "cdr", schema, metadata))
+        self._topics[number], self.counts[topic] = topic, 0
+        return number
 
     def write(self, channel: int, log_time: int, data: bytes) -> None:
         if self.began is None:
@@ -197,6 +207,7 @@ class _File:
         except OSError as error:
             raise BagError(f"{self._part}: cannot be written: {error.strerror}; make room") from None
         self.count += 1
+        self.counts[self._topics[channel]] += 1
 
     def flush(self) -> None:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.cli.command import DONE, Command
+from uncertain_lti.cli.command import DONE, Command, print_json, print_summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output", default="reproduce-output", metavar="FOLDER", help="for figures, models and numbers"
     )
+    parser.add_argument("--json", action="store_true", help="print the numbers as JSON")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -43,9 +44,11 @@ def run(options: argparse.Namespace) -> int:
 
     try:
         with options.progress.stage("reproducing") as step:
-            reproduce(options.output, options.progress.say, step)
+            data = reproduce(options.output, lambda text: print_summary(options, text), step)
     except OSError as error:
         raise BagError(f"{options.output}: cannot be written: {error.strerror}; choose another folder") from None
+    if options.json:
+        print_json({"output": options.output, **data})
     return DONE
 
 
