@@ -1,6 +1,7 @@
 """`init`: what it proposes can be fitted as it is, holds the signals that matter, and odd recordings get a sentence."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -596,3 +597,59 @@ def test_the_file_of_one_joint_is_that_of_all(recordings):
     assert run.usable.sum() > 6000
     with pytest.raises(BagError, match="no state and command of a member 'j55' \\(is j5 meant\\?\\)"):
         propose([path], like="j55")
+
+
+# --- recordings that mislead ---------------------------------------------------------------------------------
+
+
+def test_a_delay_that_half_of_the_recording_denies_is_none():
+    """The vanes follow the speed by a schedule, so that a late angle stands in for earlier speeds, by 4 %."""
+    proposal = propose([Path(__file__).parents[1] / "bags" / "turbofan_levels_noise.mcap"])
+    assert len(proposal.controls) == 4 and {c.delay for c in proposal.controls} == {0}
+
+
+def test_commands_that_never_move_are_a_machine_at_rest(recordings, tmp_path, capsys):
+    path = recordings / "crazyflie" / "yx4bag_0.mcap"
+    proposal = propose([path])
+    assert len(proposal.warnings) == 1 and proposal.warnings[0].startswith("no command moves (/cf_c")
+    assert "the machine is at rest" in proposal.text and "record the machine at work" in proposal.text
+    assert not propose([recordings / "crazyflie" / "rollbag_0.mcap"]).warnings
+
+
+def test_one_of_many_says_how_to_have_all(recordings):
+    proposal = propose([recordings / "go2/test_3.mcap"])
+    joint = proposal.controls[0].element
+    assert "# One of 12 that are alike (j0, j1, j2, j3, j4, j5 and 6 more). `uncertain-lti init" in proposal.text
+    assert f"BAG... --like {joint}` writes one file for all of them.\n" in proposal.text
+
+
+def trials(path, column, ids, restart=True, rows=60):
+    """A table of runs; `column` says which a row is of."""
+    lines, time, x = [f"{column},t,speed,command"], 0, 0.0
+    for number in ids:
+        for k in range(rows):
+            u = math.copysign(1.0 + 0.3 * len(lines) % 7, math.sin(len(lines) / 9))
+            lines.append(f"{number},{(k if restart else time) * 0.1:.1f},{x:.6f},{u}")
+            x += 0.1 * (u - x) + 0.003 * math.sin(11 * len(lines))
+            time += 1
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("column", "ids", "restart"),
+    [("trial", [1, 2, 3], True), ("Run No", [7, 4, 9], False), ("label", ["a", "b", "c"], True)],
+)
+def test_a_column_that_says_which_run_a_row_is_of_is_named(tmp_path, column, ids, restart):
+    path = trials(tmp_path / "trials.csv", column, ids, restart)
+    proposal = propose([path])
+    signals = SignalMap.from_dict(yaml.safe_load(proposal.text))
+    assert signals.table is not None and signals.table.runs == column.replace(" ", "_")
+    assert [s.name for s in signals.states] == ["speed"] and [c.name for c in signals.controls] == ["command"]
+    assert [t.x.shape[0] for t in read_transients([path], signals)] == [60, 60, 60]
+
+
+@pytest.mark.parametrize("ids", [[1, 2, 1], range(12)])
+def test_a_mode_or_a_counter_tells_no_runs_apart(tmp_path, ids):
+    path = trials(tmp_path / "modes.csv", "test", ids, restart=False, rows=60 if len(ids) == 3 else 10)
+    assert "table:" not in propose([path]).text

@@ -17,12 +17,13 @@ from uncertain_lti.proposal.effects import earlier, held
 from uncertain_lti.proposal.memories import choose_memories
 from uncertain_lti.proposal.naming import name_signals
 from uncertain_lti.proposal.quantities import longest_hold, set_operating_point, set_own_scale
-from uncertain_lti.proposal.reading import Iterate, read_sources
-from uncertain_lti.proposal.roles import ask_for, assign_roles
+from uncertain_lti.proposal.reading import Iterate, read_sources, run_column
+from uncertain_lti.proposal.roles import ask_for, assign_roles, at_rest
 from uncertain_lti.proposal.signals_file import entry, signals_file
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.memory import Memory
+from uncertain_lti.signals.table_layout import TableLayout
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,9 @@ def propose(
     bags = group_recordings(list(paths))
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
+    runs = run_column(bags)
+    if runs:
+        bags = group_recordings(list(paths), layout=TableLayout(runs=runs))
     sources = read_sources(bags, progress)
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
@@ -96,6 +100,7 @@ def propose(
         reasons = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])
         raise BagError(f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})")
     chosen, doubt = choose(measured, commands, like)
+    doubt = doubt or ("" if commands else at_rest(sources))
     used = [c for s in commands for c in s.free]
     if like and {c.element for c in [*chosen, *used]} != {like}:
         there = dict.fromkeys(c.element for s in sources for c in s.candidates if c.element)
@@ -111,8 +116,10 @@ def propose(
     for candidate in ready:
         set_own_scale(candidate)
     warnings = (*(warning for bag in bags for warning in bag.warnings), *([doubt] if doubt else []))
-    members = _members(chosen, used, sources, like) if like else []
-    text = signals_file(bags, sources, chosen, used, doubt, _memories(chosen, used, sources), members)
+    one = like or (used[0].element if used else "")
+    members = _members(chosen, used, sources, one) if one and {c.element for c in [*chosen, *used]} == {one} else []
+    memories = _memories(chosen, used, sources)
+    text = signals_file(bags, sources, chosen, used, doubt, memories, members, for_all=bool(like), runs=runs)
     return Proposal(tuple(chosen), tuple(used), text, warnings)
 
 

@@ -17,7 +17,7 @@ from uncertain_lti.proposal.effects import residual
 from uncertain_lti.proposal.roles import role_by_name, role_of_column
 from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.recording import Recording, TopicFacts
-from uncertain_lti.recordings.table import TYPE
+from uncertain_lti.recordings.table import TYPE, Table
 from uncertain_lti.sampling.codes import codes
 from uncertain_lti.signals.field_path import FieldPath
 
@@ -30,6 +30,12 @@ LONGEST_ARRAY = 24
 
 MOST_VALUES = 50_000_000
 """Numbers read at most; fields beyond are listed and not looked at."""
+
+
+_RUN = re.compile(
+    r"(^|_)(run|trial|episode|experiment|exp|test|group|session|rollout|flight|lap|trajectory|traj|unit)s?"
+    r"(_?(id|no|nr|num|number|index|idx))?$"
+)  # name of a column that says which run a row is of
 
 
 _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
@@ -117,6 +123,42 @@ def moving_numbers(bag: Recording, progress: Iterate | None) -> tuple[list[tuple
     left = [f"{s.topic}: {s.reason}" for s in sources if s.reason]
     left += [f"{s.topic} {c.path}: {c.reason}" for s in sources if not s.reason for c in s.candidates if c.reason]
     return found, left
+
+
+def run_column(bags: Sequence[Recording]) -> str:
+    """Column of tables that tells the runs in one file apart.
+
+    Parameters
+    ----------
+    bags : sequence of Recording
+        The recordings.
+
+    Returns
+    -------
+    str
+        Name of a column each of whose values stands in one stretch of rows, FEWEST of them on average, with a name as
+        runs have, or with a time that steps back where it changes; empty if there is none, or a recording is no table.
+    """
+    tables = [bag for bag in bags if isinstance(bag, Table)]
+    if not tables or len(tables) < len(bags):
+        return ""
+    for name in tables[0].columns_by_field:
+        if all(_tells_runs(table, name) for table in tables):
+            return name
+    return ""
+
+
+def _tells_runs(table: Table, name: str) -> bool:
+    column = table.columns_by_field.get(name)
+    if column is None or column.ndim != 1 or column.dtype.kind == "M" or len(column) < 2 * FEWEST:
+        return False
+    if column.dtype.kind == "f" and not (column == np.rint(column)).all():
+        return False
+    changes = 1 + np.flatnonzero(column[1:] != column[:-1])
+    runs = len(changes) + 1
+    if not 2 <= runs <= len(column) // FEWEST or len(set(column[[0, *changes]].tolist())) < runs:
+        return False
+    return bool(_RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] <= 0).all())
 
 
 def _of_table(fact: TopicFacts, rows: int) -> list[Source]:

@@ -104,6 +104,29 @@ def role_of_column(name: str) -> str:
     return "control" if _COMMAND.search(low) or _COLUMN.search(low) else "state"
 
 
+def at_rest(sources: Sequence[Source]) -> str:
+    """What to say of recordings in which there are commands and none of them moves.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+        All topics.
+
+    Returns
+    -------
+    str
+        A sentence without its full stop; empty if there is no command, or one moves.
+    """
+    commands = [s for s in sources if s.role == "control" and s.count and s.candidates]
+    if not commands or any(s.free for s in commands):
+        return ""
+    still = shortlist([f"{s.topic} {c.path} {c.reason}" for s in commands for c in s.candidates[:1]], 3)
+    return (
+        f"no command moves ({still}): the machine is at rest, and what is proposed drifts or is disturbed; record the "
+        "machine at work before you fit a model"
+    )
+
+
 def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
     """Give the roles that a person asks for in place of those by name.
 

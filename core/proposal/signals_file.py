@@ -17,7 +17,7 @@ _LONGEST_LINE = 1 << 20  # letters
 
 def signals_file(
     bags: Sequence[Recording], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
-    doubt: str, memories: Sequence[str] = (), members: Sequence[str] = (),
+    doubt: str, memories: Sequence[str] = (), members: Sequence[str] = (), for_all: bool = False, runs: str = "",
 ) -> str:  # fmt: skip
     """Write the text of the file.
 
@@ -36,7 +36,11 @@ def signals_file(
     memories : sequence of str, optional
         Lines to add to the states.
     members : sequence of str, optional
-        Many alike, of which the states and controls are those of one; the file is for all of them.
+        Many alike, of which the states and controls are those of one.
+    for_all : bool, default False
+        Whether the file is for all of them; else it says how to get one that is.
+    runs : str, default ""
+        Column of tables that tells the recordings in one file apart.
 
     Returns
     -------
@@ -71,6 +75,8 @@ def signals_file(
             "topics:",
         ]
         lines += [f"  {_quoted(t)}: {{time: log}}" for t in topics]
+    if runs:
+        lines += ["", "# Each value of this column is a recording of its own.", "table:", f"  runs: {_quoted(runs)}"]
     lines += ["", "# steady: median over the longest stretch in which nothing moves; scale: the largest such"]
     lines.append("# magnitude, or the range where that is small. Both in recorded units.")
     lines += [f"# Beware: {doubt}."] if doubt else []
@@ -102,7 +108,11 @@ def signals_file(
     left_out = _left_out(sources, {id(c) for c in [*states, *controls]})
     if left_out:
         lines += ["", "# Not proposed, and why:", *left_out]
-    if members:
+    if len(members) > 1 and not for_all:
+        one = _quoted(states[0].element)
+        lines += ["", f"# One of {len(members)} that are alike ({shortlist(members, 6)}). `uncertain-lti init BAG..."]
+        lines[-1] += f" --like {one}` writes one file for all of them."
+    if members and for_all:
         lines = for_members(lines, [*states, *controls], members)
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
 
