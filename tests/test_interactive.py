@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.cli.main import main
+from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.reports import interactive
 from uncertain_lti.reports.interactive import interactive_page, plotted_check, plotted_transient
 
@@ -90,6 +91,31 @@ def test_a_short_recording_is_drawn_sample_by_sample():
     marked = array(panel["values"]["marked"])[keep]
     assert np.array_equal(~np.isnan(marked), verdicts.flags[:, 0] == 1.0)
     assert page["alarms"][0] == pytest.approx([0.99, 1.01]) and page["silent"][0] == pytest.approx([1.99, 7.0])
+
+
+def test_horizons_of_the_model_are_views_of_the_plot():
+    rng = np.random.default_rng(3)
+    x = np.cumsum(0.01 + 0.1 * rng.normal(size=(200, 2)), axis=0)
+    zeros = np.zeros((2, 2))
+    further = [Horizon(h, zeros, zeros[:, :1], zeros, zeros[:, :1], v=[0.4, 0.6]) for h in (5, 20)]
+    model = by_hand().replace(horizons=further)
+    verdicts = EnvelopeMonitor(model).check(Transient(np.arange(200) * 0.1, x, np.zeros((200, 1))))
+    page = interactive_page("p", [plotted_check(model, verdicts)])
+    assert re.findall(r'<option value="(\w+)">([^<]*)', page) == [
+        ("values", "values"), ("utilisation", "utilisation, 1 step"), ("0", "utilisation, 5 steps"),
+        ("1", "utilisation, 20 steps"),
+    ]  # fmt: skip
+    (recording,) = data_of(page)
+    for i, panel in enumerate(recording["panels"][:2]):
+        for h, series in enumerate(panel["horizons"]):
+            of = verdicts.longer_utilisation[:, h, i]
+            assert np.allclose(array(series["least"]), of, atol=1e-5, equal_nan=True)
+            assert np.array_equal(~np.isnan(array(series["marked"])), np.abs(of) > 1.0)
+            assert (np.abs(of) > 1.0).any() and np.isnan(of[: (5, 20)[h]]).all()
+    assert recording["panels"][2]["horizons"] == []
+    assert "1 step" not in interactive_page(
+        "p", [plotted_check(by_hand(), EnvelopeMonitor(by_hand()).check(verdicts.transient))]
+    )
 
 
 @settings(max_examples=8)

@@ -78,6 +78,8 @@ class Panel:
         Panels with more are shown first.
     utilisation : Series, optional
         Where between the bounds it lay.
+    horizons : tuple of Series, default ()
+        The same by each of the recording's horizons.
     """
 
     title: str
@@ -87,6 +89,7 @@ class Panel:
     word: str = "recorded"
     rank: float = 0.0
     utilisation: Series | None = None
+    horizons: tuple[Series, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,8 @@ class PlottedRecording:
         Its signals.
     alarms, silent : list of (float, float)
         Begin and end of each stretch of alarm, and of each without a verdict, s.
+    horizons : tuple of str, default ()
+        What each of the model's horizons is called.
     """
 
     name: str
@@ -113,6 +118,7 @@ class PlottedRecording:
     panels: list[Panel]
     alarms: list[tuple[float, float]] = field(default_factory=list)
     silent: list[tuple[float, float]] = field(default_factory=list)
+    horizons: tuple[str, ...] = ()
 
 
 def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) -> PlottedRecording:
@@ -137,22 +143,46 @@ def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) 
     violated = verdicts.violated
     drawn = DrawnColumns.detailed(
         axis.t, transient.segment, verdicts.judged, verdicts.alarm, violated | verdicts.alarm,
-        _stretches(recordings, 8 * model.n + 2 * model.m),
+        _stretches(recordings, (8 + 3 * len(model.steps)) * model.n + 2 * model.m),
     )  # fmt: skip
     panels = []
+
+    def utilisation_series(utilisation: Array, flags: Any) -> Series:
+        clipped = np.clip(utilisation, -_FARTHEST, _FARTHEST)
+        return _series(drawn, clipped, marked=_worst(drawn, flags, clipped, clipped))
+
     for i, signal in enumerate(model.signals.states):
         x, utilisation = transient.x[:, i], np.clip(verdicts.utilisation[:, i], -_FARTHEST, _FARTHEST)
         flags = verdicts.flags[:, i] == 1.0
         values = _series(drawn, x, verdicts.lower[:, i], verdicts.upper[:, i], _worst(drawn, flags, utilisation, x))
-        shares = _series(drawn, utilisation, marked=_worst(drawn, flags, utilisation, utilisation))
-        panels.append(Panel(signal.name, signal.unit, 0, values, "recorded", float(flags.sum()), shares))
+        shares = utilisation_series(utilisation, flags)
+        longer = verdicts.longer_utilisation[:, :, i].T
+        horizons = tuple(utilisation_series(u, np.abs(u) > 1.0) for u in longer)
+        panels.append(Panel(signal.name, signal.unit, 0, values, "recorded", float(flags.sum()), shares, horizons))
     panels += _controls(drawn, transient, model.signals.controls)
     judged, bad = int(verdicts.judged.sum()), int(violated.sum())
     note = f"{plural(judged, 'verdict')}, {bad} of them violated" + _loops(axis) + _how(drawn, len(axis.t)) + "."
     return PlottedRecording(
         _name(transient.name), note, [_times(drawn)], panels,
-        _runs(drawn, drawn.alarm), _runs(drawn, ~drawn.judged, skip_first=True),
+        _runs(drawn, drawn.alarm), _runs(drawn, ~drawn.judged, skip_first=True), horizon_words(model),
     )  # fmt: skip
+
+
+def horizon_words(model: UncertainLTI) -> tuple[str, ...]:
+    """Each horizon of a model by its steps and, where the model knows its step, its time.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+
+    Returns
+    -------
+    tuple of str
+        Such as `40 steps (1 s)`.
+    """
+    step = model.sampling.dt_median
+    return tuple(f"{h} steps" + ("" if step is None else f" ({h * step:.3g} s)") for h in model.steps)
 
 
 def plotted_transient(transient: Transient, recordings: int = 1) -> PlottedRecording:
@@ -234,7 +264,9 @@ def interactive_page(title: str, recordings: Sequence[PlottedRecording]) -> str:
     str
         HTML with everything in it.
     """
+    horizons = max((recording.horizons for recording in recordings), key=len, default=())
     data = {"recordings": [_packed(recording) for recording in recordings]}
+    further = "".join(f'<option value="{k}">utilisation, {words}</option>' for k, words in enumerate(horizons))
     packed = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     uplot, own = _asset("uPlot.iife.min.js").rstrip("\n"), _asset("plot.js").rstrip("\n")
     allowed = " ".join(
@@ -256,7 +288,7 @@ def interactive_page(title: str, recordings: Sequence[PlottedRecording]) -> str:
         f"<h1>{escape(title)}</h1>\n"
         '<div id="bar"><select id="recording" aria-label="recording"></select>'
         '<select id="view" aria-label="what is drawn"><option value="values">values</option>'
-        '<option value="utilisation">utilisation</option></select>'
+        f'<option value="utilisation">utilisation{", 1 step" if horizons else ""}</option>{further}</select>'
         '<button id="whole">whole</button><button id="in" aria-label="zoom in">+</button>'
         '<button id="out" aria-label="zoom out">&minus;</button>'
         '<button id="before">&#9664; alarm</button><button id="after">alarm &#9654;</button>'
@@ -339,6 +371,7 @@ def _packed(recording: PlottedRecording) -> dict[str, Any]:
                 "rank": panel.rank,
                 "values": _packed_series(panel.values),
                 "utilisation": None if panel.utilisation is None else _packed_series(panel.utilisation),
+                "horizons": [_packed_series(series) for series in panel.horizons],
             }
             for panel in recording.panels
         ],

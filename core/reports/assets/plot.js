@@ -22,6 +22,8 @@
     };
   }
 
+  // Where between its bounds a signal lay, by the chosen horizon; none while values are drawn.
+  const shares = (panel) => (view === "values" ? null : view === "utilisation" ? panel.utilisation : panel.horizons[view]);
   const number = (v) => (v == null ? "–" : String(Number(v.toPrecision(7))));
 
   function shade(u, c) {
@@ -42,7 +44,7 @@
   function columns(panel) {
     const c = colours(), series = [{ label: "time [s]", value: (u, v) => number(v) }];
     const data = [times[recording][panel.time]];
-    const bands = [], source = view === "utilisation" && panel.utilisation ? panel.utilisation : panel.values;
+    const bands = [], source = shares(panel) ?? panel.values;
     const add = (label, a, stroke, width, more) => {
       data.push(numbers(a));
       series.push({ label, stroke, width, points: { show: false }, value: (u, v) => number(v), ...more });
@@ -72,7 +74,7 @@
     const pub = (type) => type === "mousemove" || type === "mouseleave";
     const u = new uPlot({
       width: holder.clientWidth, height: 170, series, bands,
-      scales: { x: { time: false }, y: view === "utilisation" && panel.utilisation ? { range: limited } : {} },
+      scales: { x: { time: false }, y: shares(panel) ? { range: limited } : {} },
       axes: [axis, { ...axis, size: room }],
       cursor: {
         drag: { x: true, y: false, dist: 4 },
@@ -81,7 +83,7 @@
       },
       hooks: {
         drawClear: [(self) => shade(self, c)],
-        draw: [(self) => view === "utilisation" && panel.utilisation && limits(self, c)],
+        draw: [(self) => shares(panel) && limits(self, c)],
         setScale: [(self, key) => key === "x" && follow(self)],
       },
     }, data, holder);
@@ -190,7 +192,7 @@
     holder.replaceChildren();
     $("note").textContent = now.note;
     now.panels.forEach((panel, i) => {
-      if (!shown[i] || (view === "utilisation" && !panel.utilisation)) return;
+      if (!shown[i] || (view !== "values" && !shares(panel))) return;
       const box = element("section");
       box.append(element("h2", panel.title + (view === "values" && panel.unit ? ` [${panel.unit}]` : "")));
       holder.append(box);
