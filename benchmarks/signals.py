@@ -8,7 +8,7 @@ the state's steps, the share inside its bounds, and the smallest step of its sen
 (an alarm at one violation), over the same root mean square; all on what was left out of the fit (ten blocks per
 recording, with guard intervals).
 
-`--found` is a folder of further public recordings, which are not shipped; each machine is left out whose file is absent:
+`--found` is a folder of further public recordings, which are not shipped; a machine whose file is absent is left out:
 
     SNLS80mV.csv       the Silverbox, an electronic oscillator with one measured voltage;
                        github.com/biaslab/nsi-silverbox, data/Silverbox
