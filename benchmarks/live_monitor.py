@@ -3,6 +3,7 @@
     ./run python benchmarks/live_monitor.py                        # the table: rates 500 Hz and 1 kHz, n = 5 and 50
     ./run python benchmarks/live_monitor.py --left 0.003           # the same, three in a thousand samples out of bounds
     ./run python benchmarks/live_monitor.py --soak 600             # ten minutes at 1 kHz: memory and counters
+    ./run python benchmarks/live_monitor.py --soak 600 --armed     # the same with everything armed, and live = offline
     ./run python benchmarks/live_monitor.py --before FOLDER        # beside the monitor of another checkout
 
 FOLDER is a checkout of another version, with its compiled part built in it: `git worktree add FOLDER REVISION`, then
@@ -26,6 +27,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import random
 import select
@@ -34,22 +36,27 @@ import subprocess
 import sys
 import tempfile
 import time
+import zlib
+from array import array
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from uncertain_lti.monitor.outputs import OUTPUTS
+from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED
 
 STATE, CONTROL = "/bench/state", "/bench/control"
 TYPE = "sensor_msgs/msg/JointState"
 CONTROLS = {5: 2, 50: 10}
 WARM_UP = 2.0  # s
-QUEUE = 1000
+QUEUE, QUEUE_ARMED = 1000, 5000
+STEPS = (2, 3, 5, 8, 12, 16, 20, 25, 32, 40)
+MODEL = "bench.model.json"
+LEFT = 0.001  # of the samples of an armed model
 
 
-def save_model(path: Path, n: int, rate: float) -> None:
+def save_model(path: Path, n: int, rate: float, armed: bool = False) -> None:
     from uncertain_lti import SignalMap, UncertainLTI
     from uncertain_lti.model.domain import Sampling
     from uncertain_lti.signals.signal_map import Signal
@@ -65,17 +72,68 @@ def save_model(path: Path, n: int, rate: float) -> None:
     sampling = Sampling(STATE, TYPE, dict(signals.time), dt_median=dt, max_gap=100 * dt)
     rng = np.random.default_rng(1)
     matrices = rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.full((n, n), 0.1), np.full((n, m), 0.1)
-    UncertainLTI(*matrices, v=np.full(n, 0.1), signals=replace(signals), sampling=sampling).save(path)
+    if armed:
+        parts = arms(rng, matrices, dt)
+    else:
+        parts = dict(zip(("A", "B", "dA", "dB"), matrices, strict=True)) | {"v": np.full(n, 0.1)}
+    UncertainLTI(**parts, signals=replace(signals), sampling=sampling).save(path)
+
+
+def arms(rng: np.random.Generator, matrices: tuple[Any, ...], dt: float) -> dict[str, Any]:
+    """Everything that a model may have; statistics over 50 to 400 steps."""
+    from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
+    from uncertain_lti.model.horizon import Horizon
+    from uncertain_lti.model.repeats import Repeats
+    from uncertain_lti.model.residuals import Residuals
+    from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+
+    knots = (-0.02, 0.0, 0.02)
+    blocks, n = len(knots), len(matrices[0])
+
+    def scheduled(*arrays: Any) -> list[Any]:
+        return [np.stack([a * factor for factor in rng.uniform(0.5, 1.0, blocks)]) for a in arrays]
+
+    v = np.full((blocks, n), 0.1)
+    residuals = Residuals(np.zeros(n), np.eye(n) * 2 * 0.05**2 / 3)
+    horizons = [
+        Horizon(
+            h, *scheduled(*(np.zeros_like(a) for a in matrices[:2]), *matrices[2:]), v=v * rng.uniform(1.0, 1.2, n),
+            residuals=residuals,
+        )
+        for h in STEPS
+    ]  # fmt: skip
+    rules: list[Any] = [AlarmRule(2, 5), AlarmRule(2, 5, horizon=STEPS[3])]
+    for i, kind in enumerate(KINDS):
+        threshold, allowance = 6.0 * n if kind in JOINT else 1.0, 0.1 if kind == "cusum" else 0.0
+        rules.append(StatisticRule(kind, 50 * 2.0 ** (i % 4) * dt, threshold, 1, allowance))
+        rules.append(StatisticRule(kind, 100 * dt, threshold, STEPS[-1], allowance))
+    return dict(zip(("A", "B", "dA", "dB"), scheduled(*matrices), strict=True)) | {
+        "v": v,
+        "schedule": Schedule((Axis("x0", knots=knots),)),
+        "block_data": [BlockData(1000)] * blocks,
+        "horizons": horizons,
+        "alarm": rules,
+        "residuals": residuals,
+        "repeats": Repeats(np.full(n, 3 * dt)),
+    }
+
+
+def rows_of(n: int, left: float) -> Any:
+    """What is published, over and over: states and controls (1000, n + m)."""
+    rng = np.random.default_rng(2)
+    values = rng.uniform(-0.05, 0.05, (1000, n + CONTROLS[n]))
+    values[rng.random(1000) < left, 0] = 10.0
+    return values
 
 
 # --- the processes ------------------------------------------------------------------------------------------
 
 
-def publish(n: int, rate: float, seconds: float, left: float, awaited: list[str]) -> None:
+def publish(n: int, rate: float, seconds: float, left: float, stamps: str, awaited: list[str]) -> None:
     """Prints how many samples it sent, once both topics have a subscriber; left: share of them out of bounds.
 
-    awaited: nodes that it waits for besides. Fast DDS may hold up a stream for 0.33 s when another participant comes to
-    be known in the middle of it.
+    stamps: file that gets those of the samples; empty for none. awaited: nodes that it waits for besides. Fast DDS may
+    hold up a stream for 0.33 s when another participant comes to be known in the middle of it.
     """
     import rclpy
     from rclpy.qos import QoSProfile
@@ -85,19 +143,17 @@ def publish(n: int, rate: float, seconds: float, left: float, awaited: list[str]
 
     rclpy.init()
     node = rclpy.create_node("publisher")
-    state = node.create_publisher(JointState, STATE, QoSProfile(depth=QUEUE))
-    control = node.create_publisher(JointState, CONTROL, QoSProfile(depth=QUEUE))
+    depth = QUEUE_ARMED if stamps else QUEUE
+    state = node.create_publisher(JointState, STATE, QoSProfile(depth=depth))
+    control = node.create_publisher(JointState, CONTROL, QoSProfile(depth=depth))
     while not (
         state.get_subscription_count() and control.get_subscription_count() and {*awaited} <= {*node.get_node_names()}
     ):
         time.sleep(0.05)
     time.sleep(0.5)
     x, u = NamedVector([f"x{i}" for i in range(n)]), NamedVector([f"u{j}" for j in range(CONTROLS[n])])
-    rng = np.random.default_rng(2)
-    values = rng.uniform(-0.05, 0.05, (1000, n + CONTROLS[n]))
-    values[rng.random(1000) < left, 0] = 10.0
-    rows = [(row[:n].tobytes(), row[n:].tobytes()) for row in values]
-    began, sent = time.perf_counter(), 0
+    rows = [(row[:n].tobytes(), row[n:].tobytes()) for row in rows_of(n, left)]
+    began, sent, instants = time.perf_counter(), 0, array("q")
     print("begins", flush=True)
     while (wait := began + sent / rate - time.perf_counter()) < seconds and sent < rate * seconds:
         if wait > 0:
@@ -109,6 +165,10 @@ def publish(n: int, rate: float, seconds: float, left: float, awaited: list[str]
         control.publish(u(now, command))
         state.publish(x(now, position))
         sent += 1
+        if stamps:
+            instants.append(now)
+    if stamps:
+        np.save(stamps, np.array(instants))
     print(sent, flush=True)
     time.sleep(1.0)
     rclpy.shutdown()
@@ -224,6 +284,73 @@ def hear(names: list[str]) -> None:
     listen_for_end(spinner, lambda: {"delays": delays})
 
 
+def digest(file: str) -> None:
+    """Subscribes to all outputs of the monitor, and keeps a checksum of each message that depends on verdicts alone."""
+    import rclpy
+    from rclpy.experimental import EventsExecutor
+    from rclpy.qos import QoSProfile
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Bool
+
+    rclpy.init()
+    node, idle = rclpy.create_node("hearer"), rclpy.create_node("idle_hearer")
+    sums: dict[str, array[int]] = {}
+    recorded = {output.name for output in RECORDED}
+    for output in OUTPUTS:
+        kind = Bool if output.name == "violation" else JointState
+        topic = f"/envelope_monitor/{output.name}"
+        if output.name in recorded and kind is JointState:
+            found = sums[output.name] = array("L")
+
+            def note(data: bytes, append: Any = found.append) -> None:
+                append(zlib.crc32(data))
+
+            node.create_subscription(kind, topic, note, QoSProfile(depth=QUEUE_ARMED), raw=True)
+        else:
+            idle.create_subscription(kind, topic, lambda _: None, QoSProfile(depth=1))
+    spinner = EventsExecutor()
+    spinner.add_node(node)
+
+    def say() -> dict[str, Any]:
+        np.savez(file, **{name: np.array(found, dtype=np.uint32) for name, found in sums.items()})
+        return {"delays": sums["flags"].tolist()}
+
+    listen_for_end(spinner, say)
+
+
+def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any]:
+    """The same checksums of a check of every sample sent, and how often the alarm was raised."""
+    from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+    from uncertain_lti.monitor.verdict_messages import VerdictRecords
+    from uncertain_lti.recordings.mcap_records import MESSAGE
+
+    model = UncertainLTI.load(model_path)
+    values = np.resize(rows_of(n, left), (len(stamps), n + CONTROLS[n]))
+    transient = Transient(
+        stamps, values[:, :n], values[:, n:], signals=model.signals, max_gap=model.signals.max_gap or math.inf
+    )
+    verdicts = EnvelopeMonitor(model).check(transient)
+    vectors = [output for output in RECORDED if output.position]
+    channels = {output.name: i for i, output in enumerate(vectors)}
+    records = VerdictRecords(model.state_names, channels, model.steps)
+    sums: list[array[int]] = [array("L") for _ in vectors]
+    names = {name for output in vectors for name in (output.position, output.velocity) if name}
+    for begin in range(0, len(stamps), 5000):
+        rows = slice(begin, begin + 5000)
+        numbers = {name: getattr(verdicts, name)[rows] for name in names}
+        t_ns = transient.t_ns[rows]
+        data, _ = records.encode(t_ns, t_ns, verdicts.judged[rows], verdicts.alarm[rows], numbers)
+        at, head = 0, 9 + MESSAGE.size
+        while at < len(data):
+            length = int.from_bytes(data[at + 1 : at + 9], "little")
+            channel = int.from_bytes(data[at + 9 : at + 11], "little")
+            sums[channel].append(zlib.crc32(data[at + head : at + 9 + length]))
+            at += 9 + length
+    found = {output.name: np.array(each, dtype=np.uint32) for output, each in zip(vectors, sums, strict=True)}
+    rises = np.count_nonzero(np.diff(verdicts.alarm.astype(np.int8), prepend=0) == 1)
+    return {"sums": found, "alarms": int(rises), "verdicts": int(verdicts.judged.sum())}
+
+
 def listen_for_end(spinner: Any, say: Any) -> None:
     from rclpy.task import Future
 
@@ -334,18 +461,17 @@ class Run:
     def part(self, *arguments: str) -> Child:
         return self.child(__file__, "--part", *arguments)
 
-    def monitor(self, folder: str, which: str = "") -> Child:
+    def monitor(self, folder: str, which: str = "", armed: bool = False) -> Child:
         """The monitor of this checkout, or of the other one; `which` may name "before" and "uncompiled"."""
-        path = Path(folder) / "bench.model.json"
-        save_model(path, self.n, self.rate)
+        path = Path(folder) / MODEL
+        save_model(path, self.n, self.rate, armed)
         code = "import sys; from uncertain_lti_ros.envelope_monitor import main; sys.exit(main())"
         environment = {"UNCERTAIN_LTI_PURE_PYTHON": "yes"} if "uncompiled" in which else {}
         if "before" in which:
             checkout = str(Path(self.before).resolve() / "tests" / "checkout")
             environment["PYTHONPATH"] = os.pathsep.join(filter(None, [checkout, os.environ.get("PYTHONPATH")]))
-        return self.child(
-            "-P", "-c", code, "--ros-args", "-p", f"model:={path}", "-p", "violations:=1", **environment
-        )  # fmt: skip
+        more = f"qos.depth:={QUEUE_ARMED}" if armed else "violations:=1"
+        return self.child("-P", "-c", code, "--ros-args", "-p", f"model:={path}", "-p", more, **environment)
 
     def measure(self, kind: str, executor: str, outputs: list[str], delays: bool = False) -> dict[str, Any]:
         try:
@@ -369,7 +495,7 @@ class Run:
                     subject.line()
                 length = str(self.seconds + WARM_UP)
                 awaited = ["hearer"] if hearer else []
-                publisher = self.part("publish", str(self.n), str(self.rate), length, str(self.left), *awaited)
+                publisher = self.part("publish", str(self.n), str(self.rate), length, str(self.left), "", *awaited)
                 publisher.line()
                 time.sleep(WARM_UP)
                 cpu, began = subject.cpu, time.perf_counter()
@@ -491,18 +617,24 @@ def compare_versions(before: str, rates: list[float], sizes: list[int], seconds:
     print(table(["n", "Hz", "", "before, µs/sample", "now", "ratio", "turns"], rows))
 
 
-def soak(seconds: float, rate: float, n: int, domain: int) -> dict[str, Any]:
-    """Growth of memory after warm-up, MiB, and whether every counter accounts for every sample; prints both."""
+def soak(seconds: float, rate: float, n: int, domain: int, armed: bool) -> dict[str, Any]:
+    """Growth of memory after warm-up, MiB, and whether every counter accounts for every sample; prints both.
+
+    armed: also whether what was published of each sample is what a check gives.
+    """
     run = Run(n, rate, seconds, domain=domain)
+    left = LEFT if armed else 0.0
     try:
         with tempfile.TemporaryDirectory() as folder:
-            subject = run.monitor(folder)
-            hearer = run.part("hear", *TOPICS)
+            subject = run.monitor(folder, armed=armed)
+            digests, stamps = Path(folder) / "digests.npz", Path(folder) / "stamps.npy"
+            hearer = run.part("digest", str(digests)) if armed else run.part("hear", *TOPICS)
             hearer.line()
             status(run.domain)
-            publisher = run.part("publish", str(n), str(rate), str(seconds), "0", "hearer")
+            keeps = str(stamps) if armed else ""
+            publisher = run.part("publish", str(n), str(rate), str(seconds), str(left), keeps, "hearer")
             publisher.line()
-            began, memory = time.perf_counter(), []
+            began, memory, cpu = time.perf_counter(), [], subject.cpu
             warm = min(60.0, seconds / 3)
             time.sleep(warm / 3)
             # Queues take their memory when something stands still for the first time, and never again: that is part
@@ -519,6 +651,7 @@ def soak(seconds: float, rate: float, n: int, domain: int) -> dict[str, Any]:
                     print(f"{now:6.0f} s  {memory[-1]:.2f} MiB", file=sys.stderr, flush=True)
             publisher.patient = True
             sent = int(publisher.line())
+            cpu = (subject.cpu - cpu) / sent * 1e6
             time.sleep(0.7)
             said = status(run.domain)
             counters = said["counters"]
@@ -535,9 +668,23 @@ def soak(seconds: float, rate: float, n: int, domain: int) -> dict[str, Any]:
                 + 1,
             }
             exact = set(accounted.values()) == {sent} and not any(said["lost"].values())
-            print(f"{sent} samples sent, {said['verdicts']} verdicts, {growth:+.2f} MiB from {memory[0]:.1f} MiB")
+            print(
+                f"{sent} samples sent, {said['verdicts']} verdicts, {growth:+.2f} MiB from {memory[0]:.1f} MiB, "
+                f"{cpu:.0f} µs of CPU per sample"
+            )
             print(", ".join(f"{value} {name}" for name, value in accounted.items()))
             print(f"counters {'exact' if exact else 'not exact'}: {counters}, lost {said['lost']}")
+            if armed:
+                expected = checked(Path(folder) / MODEL, n, left, np.load(stamps))
+                with np.load(digests) as heard:
+                    same = {name: np.array_equal(heard[name], sums) for name, sums in expected["sums"].items()}
+                    told = ", ".join(f"{len(heard[name])} ~/{name}" for name in same)
+                unlike = [name for name in same if not same[name]]
+                print(
+                    f"{expected['verdicts']} verdicts of a check, {expected['alarms']} alarms; messages heard: {told}"
+                )
+                print(f"live is {'not ' if unlike else ''}offline{f' in {unlike}' if unlike else ''}")
+                exact &= not unlike and expected["verdicts"] == said["verdicts"]
             return {"exact": exact, "growth": growth, "verdicts": said["verdicts"], "sent": sent}
     finally:
         for child in run.children:
@@ -552,6 +699,9 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[5, 50], choices=list(CONTROLS))
     parser.add_argument("--left", type=float, default=0.0, metavar="SHARE", help="of samples out of bounds")
     parser.add_argument("--soak", type=float, metavar="S", help="instead, run the monitor for S seconds at 1 kHz")
+    parser.add_argument(
+        "--armed", action="store_true", help="with --soak: schedule, horizons, statistics; live = offline"
+    )
     parser.add_argument("--domain", type=int, default=0, metavar="N", help="ROS domain of --soak; 0: any")
     parser.add_argument("--soak-rate", type=float, default=1000.0, metavar="HZ")
     parser.add_argument("--before", metavar="FOLDER", help="instead, beside the monitor of another checkout")
@@ -560,15 +710,17 @@ def main() -> None:
     if args.part:
         kind, *rest = args.part
         if kind == "publish":
-            publish(int(rest[0]), *map(float, rest[1:4]), rest[4:])
+            publish(int(rest[0]), *map(float, rest[1:4]), rest[4], rest[5:])
         elif kind == "hear":
             hear(rest)
+        elif kind == "digest":
+            digest(rest[0])
         elif kind == "relay":
             relay(int(rest[0]), rest[1:])
         else:
             {"take": take, "delay": bare_delay}[kind](rest[0])
     elif args.soak:
-        found = soak(args.soak, args.soak_rate, args.sizes[0], args.domain)
+        found = soak(args.soak, args.soak_rate, args.sizes[0], args.domain, args.armed)
         if not (found["exact"] and found["growth"] < 1.0):
             raise SystemExit(1)
     elif args.before:

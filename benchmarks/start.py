@@ -8,15 +8,16 @@ FOLDER is as for `live_monitor.py`.
 
 Processes publish a state and a control message per sample (sensor_msgs/JointState, stamped with the same instant, both
 topics from one process or each from its own) long before the monitor starts, and go on. The monitor notes what it
-received, in order of receipt. A sample whose control was received has to have a verdict on the next sample: those that
-have none are lost. What the middleware itself did not deliver is not among them, and is listed as `undelivered`: sent
-between the first and the last sample received, and never received. A stop is SIGSTOP to the monitor for 4 s, then
-SIGCONT.
+received, in order of receipt. A sample that was received with its control has to have a verdict on the next sample, if
+that was received: those that have none are lost. States and controls that the middleware itself did not deliver, of
+those sent between the first and the last that were received, are listed as `undelivered`. A stop is SIGSTOP to the
+monitor for 4 s, then SIGCONT.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import random
@@ -225,17 +226,22 @@ class Run:
 def losses(found: dict[str, Any], rate: float) -> dict[str, float]:
     """What one run received, judged and lost."""
     stamps = {topic: sorted({t for _, at, t in found["received"] if at == topic}) for topic in (STATE, CONTROL)}
-    first = max(stamps[STATE][0], stamps[CONTROL][0])
-    due = [t for t in stamps[STATE] if t >= first][1:]
+    first, controls, step = max(stamps[STATE][0], stamps[CONTROL][0]), {*stamps[CONTROL]}, round(1e9 / rate)
+    due = [
+        t
+        for before, t in itertools.pairwise(stamps[STATE])
+        if before >= first and before in controls and t - before == step
+    ]
     judged = {t for _, t in found["judged"]}
-    came = {t: now for now, topic, t in found["received"] if topic == STATE}
-    delays = [now - came[t] for now, t in found["judged"]]
-    step = round(1e9 / rate)
-    sent = (stamps[STATE][-1] - first) // step
+    arrival = {t: now for now, topic, t in found["received"] if topic == STATE}
+    delays = [now - arrival[t] for now, t in found["judged"]]
+    last = min(stamps[STATE][-1], stamps[CONTROL][-1])
+    sent = (last - first) // step + 1
+    came = [sum(first <= t <= last for t in stamps[topic]) for topic in stamps]
     return {
         "samples": len(due),
         "lost": sum(t not in judged for t in due),
-        "undelivered": sent - len(due),
+        "undelivered": 2 * sent - sum(came),
         "longest_wait": max(delays),
     }
 
