@@ -1,3 +1,12 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
 """Metadata and layout of the package, read by pip and by colcon; tool settings are in pyproject.toml."""
 
 import runpy
@@ -98,6 +107,7 @@ setup(
     maintainer=PACKAGE.findtext("maintainer"),
     maintainer_email=PACKAGE.find("maintainer").get("email"),
     url=PACKAGE.findtext("url"),
+    project_urls={url.get("type"): url.text for url in PACKAGE.findall("url")[1:]},
     license="Apache-2.0",
     python_requires=">=3.11",
     packages=[*CORE, NAME],

@@ -1,3 +1,12 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
 """Is a fit the optimum? Random problems, each against two independent solvers that see the whole problem at once.
 
 python benchmarks/optimum.py              # 500 problems, both criteria; about half an hour on two cores
@@ -333,8 +342,11 @@ def _piqp(H: np.ndarray, f: np.ndarray, G: np.ndarray, h: np.ndarray) -> float:
 
 @dataclass
 class Comparison:
-    """excess (rows,): objective above the optimum, relative; NaN where the solvers do not agree. gap: what was printed,
-    None where it was not. error: what `fit` refused it with."""
+    """A fit beside its optimum.
+
+    excess (rows,): objective above the optimum, relative; NaN where the solvers do not agree. gap: what was printed,
+    None where it was not. error: what `fit` refused it with.
+    """
 
     criterion: str
     seconds: float

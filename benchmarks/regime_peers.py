@@ -1,3 +1,12 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
 """PARC and jax-sysid on arrays from another process, so that they may live in a virtual environment of their own.
 
 Usage: python regime_peers.py NAME REGIONS IN.npz OUT.npz. In: Z (K, p) regressors, Y (K, q) targets, fresh_Z (L, p),

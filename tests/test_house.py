@@ -1,3 +1,12 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
 """The house: rooms that import in one direction, modules without circles, a sentence at every door."""
 
 import ast
@@ -120,3 +129,15 @@ def test_recipes_name_files_that_are_there_and_at_most_four_each():
         steps = re.findall(r"^\d+\. `([^`]+)`", recipe, re.MULTILINE)
         assert 1 <= len(steps) <= 4, recipe
         assert all("NAME" in step or (ROOT / step).is_file() for step in steps), steps
+
+
+HEADER = "".join(f"{line}\n" for line in Path(__file__).read_text().splitlines()[:8])
+
+
+def test_every_file_begins_with_the_licence():
+    """As ament_copyright asks for; what is generated, or the work of others, is no Python file of the repository."""
+    listed = subprocess.run(["git", "ls-files", "*.py"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    texts = {name: (ROOT / name).read_text() for name in listed.split() if (ROOT / name).exists()}
+    assert len(texts) > 100 and HEADER.startswith("# Copyright ") and HEADER.endswith("under the License.\n")
+    lacking = [name for name, text in texts.items() if text and not re.sub(r"\A#!.*\n", "", text).startswith(HEADER)]
+    assert not lacking, "copy the first eight lines of this file"

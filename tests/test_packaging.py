@@ -1,3 +1,12 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
 """The package that pip and colcon install is whole, says what it needs, and is light to import."""
 
 import ast
@@ -156,7 +165,9 @@ def test_package_xml_is_what_colcon_accepts(package, distribution):
     assert re.fullmatch(address, package.find("maintainer").get("email"))
     assert package.find("maintainer").get("email") == distribution.get_maintainer_email()
     assert package.findtext("maintainer") == distribution.get_maintainer()
-    assert package.findtext("url[@type='repository']") == distribution.get_url()
+    addresses = {url.get("type"): url.text for url in package.findall("url")}
+    assert addresses == {"website": distribution.get_url(), **distribution.metadata.project_urls}
+    assert addresses.keys() == {"website", "repository", "bugtracker"}
 
 
 def test_every_executable_has_its_function(distribution):

@@ -1,3 +1,12 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
 """Counted things, and names near to a misspelt one, in sentences."""
 
 from __future__ import annotations
@@ -10,7 +19,7 @@ LONGEST = 2000
 
 
 def printable(text: str, limit: int = LONGEST) -> str:
-    """A text that came from outside, for a terminal: one line, no control characters, not too long.
+    r"""A text that came from outside, for a terminal: one line, no control characters, not too long.
 
     Parameters
     ----------
@@ -22,7 +31,7 @@ def printable(text: str, limit: int = LONGEST) -> str:
     Returns
     -------
     str
-        Control characters and what is no letter at all are escaped, as `\\x1b`.
+        Control characters and what is no letter at all are escaped, as `\x1b`.
     """
     text = _shortened(text, limit)
     if text.isprintable():

@@ -1,9 +1,18 @@
-"""Repeats: how long each state repeats exactly in healthy recordings, and how far the nominal model moves it meanwhile.
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+r"""Repeats: how long each state repeats exactly in healthy recordings, and how far the model moves it meanwhile.
 
 A repeat of state i is a run of transitions over which its recorded value stays the same, to the bit. With the step
-:math:`Δt_j`, the centre of the bounds :math:`\\hat x_j` and the repeated value r, the nominal model moves the state by
+:math:`Δt_j`, the centre of the bounds :math:`\hat x_j` and the repeated value r, the nominal model moves the state by
 
-    run_{j+1} = run_j + Δt_j a_ii run_j + (\\hat x_j - r),    sum_{j+1} = sum_j + (\\hat x_j - r)
+    run_{j+1} = run_j + Δt_j a_ii run_j + (\hat x_j - r),    sum_{j+1} = sum_j + (\hat x_j - r)
 
 both from 0 at the last fresh sample: the run is the state's own equation followed freely, with every other state as it
 was recorded, and the sum holds the state where it was read. Both are given in half-widths, the largest of the repeat.
