@@ -11,6 +11,8 @@
 
     ./run python benchmarks/real_machines.py                    # the table of docs/real_machines.md (Markdown)
     ./run python benchmarks/real_machines.py --data FOLDER
+    ./run python benchmarks/real_machines.py --tune             # what `tune` chooses on them: minutes
+    ./run python benchmarks/real_machines.py --tune hunter      # on one, by the beginning of its name
 
 The recordings are public and not part of this repository; docs/real_machines.md names the machines. Without them the
 exit status is 2.
@@ -19,15 +21,21 @@ exit status is 2.
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import sys
+import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from measure import table
+from regimes import CRAZYPAD
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients, tune
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.validation.blocks import cut
 
@@ -102,14 +110,109 @@ def go2(data: Path, signals: Path) -> list[list[str]]:
     return rows
 
 
+# --- what tune chooses ---
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """A machine, its signals file, recordings of it healthy (relative to the data, or of this repository), and rate."""
+
+    machine: str
+    signals: str
+    recordings: Sequence[str]
+    rate: float
+    within: float | None = None
+
+
+TUNINGS = (
+    Tuning(
+        "turbofan, 3 noisy bags", "turbofan",
+        [f"bags/turbofan_{name}_noise.mcap" for name in ("pulses_up_large", "pulses_down_large", "levels")], 10.0, 0.5,
+    ),
+    Tuning(
+        "micro gas turbine, ex_1, ex_20, ex_24", "micro_gas_turbine",
+        [f"micro_gas_turbine/ex_{k}.mcap" for k in (1, 20, 24)], 1.0,
+    ),
+    Tuning(
+        "Hunter SE, 4 runs", "hunter_se",
+        [f"hunter_se/straight_{name}_run_0{k}.mcap" for name in ("even_t_0_2", "odd_t_0_5") for k in (1, 2)], 20.0,
+    ),
+    Tuning("Neato, 2 recordings", "neato", ["neato/person_follower.mcap", "neato/draw_square.mcap"], 20.0),
+    Tuning("Go2 joint, test_3, ten blocks", "go2_joint", ["go2/test_3.mcap"], 60.0),
+    Tuning("CrazyPAD, 4 healthy flights, airborne", "crazypad", ["crazypad/labels.json"], 60.0),
+)  # fmt: skip
+
+
+def airborne(data: Path) -> tuple[list[Transient], list[str]]:
+    """The healthy flights of CrazyPAD while they are in the air, and the flight of each piece."""
+    folder = data / "crazypad"
+    labels = json.loads((folder / "labels.json").read_text())
+    pieces, flights = [], []
+    with tempfile.TemporaryDirectory() as name:
+        signals = Path(name) / "signals.yaml"
+        signals.write_text(CRAZYPAD)
+        healthy = [file for file in labels if not labels[file]["faulty"]]
+        for file, flight in zip(healthy, read_transients([folder / f for f in healthy], signals), strict=True):
+            for low, high in labels[file]["airborne_s"]:
+                inside = np.flatnonzero((flight.t >= low) & (flight.t <= high))
+                pieces.append(cut(flight, int(inside[0]), int(inside[-1]) + 1))
+                flights.append(file)
+    return pieces, flights
+
+
+def tuned_row(case: Tuning, data: Path, signals: Path, cache: Path | None) -> list[str]:
+    """What tune came to: rate, choice, size, biases seen beside those of the plain fit, processor time."""
+    groups: list[str] | None = None
+    if case.signals == "crazypad":
+        transients, groups = airborne(data)
+    else:
+        files = [ROOT / f if f.startswith("bags/") else data / f for f in case.recordings]
+        transients = read_transients(files, signals / f"{case.signals}.yaml")
+    began = time.process_time()
+    tuned = tune(transients, case.rate, within=case.within, groups=groups, cache=cache)
+    taken = time.process_time() - began
+    found = tuned.to_dict()
+    plain, chosen = found["trials"][0], found["trials"][found["chosen"]]
+
+    def biases(row: dict[str, Any]) -> str:
+        sizes = [s for s in row["sizes"] if s["kind"] == "bias"]
+        return ", ".join("-" if s["size"] is None else f"{s['size']:.2g}" for s in sizes)
+
+    units = "/".join(dict.fromkeys(s["unit"] for s in plain["sizes"] if s["kind"] == "bias" and s["unit"]))
+    print(f"{case.machine}: {found['reason']}")
+    for text in found["record"]:
+        print(f"  record next: {text}")
+    return [
+        case.machine, f"{case.rate:g}", f"{chosen['fit']}; {chosen['alarm']}", f"{chosen['size']:.2g}",
+        f"{biases(plain)} → {biases(chosen)} {units}".strip(),
+        f"{len(found['trials'])}", f"{math.ceil(taken)} s",
+    ]  # fmt: skip
+
+
+def tunings(data: Path, signals: Path, only: str, cache: Path | None) -> None:
+    """Print the table of what tune chose."""
+    header = (
+        "machine, left out", "false alarms per hour", "chosen", "size",
+        "biases seen: plain fit → chosen", "ways", "processor time",
+    )  # fmt: skip
+    cases = [case for case in TUNINGS if case.machine.lower().startswith(only.lower())]
+    table("What tune chooses", header, [tuned_row(case, data, signals, cache) for case in cases])
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
-    data = parser.parse_args().data
+    parser.add_argument("--tune", metavar="MACHINE", nargs="?", const="", help="what tune chooses, on all or one")
+    parser.add_argument("--cache", type=Path, help="folder that keeps what tune tried")
+    options = parser.parse_args()
+    data = options.data
     if not data.is_dir():
         print(f"{data}: the recordings are not there; name their folder with --data", file=sys.stderr)
         return 2
     signals = ROOT / "config" / "signals"
+    if options.tune is not None:
+        tunings(data, signals, options.tune, options.cache)
+        return 0
     rows = go2(data, signals)
     for case in CASES:
         fitted = read_transients([data / name for name in case.fitted], signals / f"{case.signals}.yaml")

@@ -23,7 +23,7 @@ from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.proposal.horizons import MOST, choose_horizons, lengths_of
 from uncertain_lti.reports.fit_text import horizons_text
 from uncertain_lti.signals.horizon_rule import HorizonRule
-from uncertain_lti.validation.armed import sets_of, values_of
+from uncertain_lti.validation.armed import Family, values_of
 from uncertain_lti.validation.left_out import validate
 
 RUNS = runs(count=4, length=200, noise=1e-2, bend=0.0)
@@ -104,7 +104,8 @@ def test_left_out_parts_have_the_utilisations_of_the_model_fitted_without_them()
 
 def test_statistics_at_a_horizon_take_the_residuals_of_the_model_fitted_without() -> None:
     model = fit(RUNS, additive="noise", horizons={"steps": [4, 9]}, widths="constant")
-    rules = sets_of(("cusum", "chi2", "mewma"), model, [5])[0]
+    assert model.sampling.dt_median is not None
+    rules = Family(("cusum", "chi2", "mewma"), 5, 1, model.sampling.dt_median).rules(model)
     found = {(rule.kind, rule.horizon, getattr(rule, "allowance", 0.0)) for rule in rules}
     assert found >= {("chi2", 9, 0.0), ("mewma", 1, 0.0), ("mewma", 9, 0.0), ("cusum", 9, 0.02), ("cusum", 1, 0.1)}
     assert StatisticRule("chi2", 0.0, 1.0, 9) in rules, "at a horizon over one verdict, too"

@@ -20,7 +20,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, f
 from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.proposal.memories import Remembered, memory_candidates, remember, suggest_memories
-from uncertain_lti.sampling.recall import recall, recalled, with_memories
+from uncertain_lti.sampling.recall import recall, recalled, with_delays, with_memories
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
@@ -224,3 +224,24 @@ def test_what_a_transient_recalls_follows_what_was_done_to_its_states() -> None:
 def test_a_memory_of_nothing_or_under_a_taken_name_is_refused(memories: dict[str, object], words: str) -> None:
     with pytest.raises(TransientError, match=words):
         with_memories(oscillating(1), memories)  # type: ignore[arg-type]
+
+
+def test_a_delayed_control_is_that_of_a_signals_file_with_the_delay() -> None:
+    """Samples and signals alike, and what the monitor replays from them."""
+    run = oscillating(1)
+    late = with_delays(run, {"push": 3})
+    assert late.signals is not None and late.signals.controls[0].delay == 3
+    np.testing.assert_array_equal(late.u[3:, 0], run.u[:-3, 0])
+    assert np.isnan(late.u[:3, 0]).all() and late.control_names == run.control_names
+    twice = with_delays(late, {"push": 1})
+    assert twice.signals is not None and twice.signals.controls[0].delay == 4
+    np.testing.assert_array_equal(twice.u[4:, 0], run.u[:-4, 0])
+    arrays = Transient(run.t_ns, run.x, run.u)
+    np.testing.assert_array_equal(with_delays(arrays, {"u1": 3}).u, late.u)
+
+
+@pytest.mark.parametrize(("name", "words"), [("swing", "there is no control"), ("push_before", "takes no delay")])
+def test_what_is_no_control_or_a_memory_takes_no_delay(name: str, words: str) -> None:
+    run = remember([oscillating(1)], [Remembered("push", Memory("lag"))])[0]
+    with pytest.raises(TransientError, match=words):
+        with_delays(run, {name: 1})

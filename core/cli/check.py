@@ -19,8 +19,10 @@ from uncertain_lti.cli.command import (
     ALARM,
     BAD_INPUT,
     DONE,
+    RECORDINGS,
     SILENT,
     Command,
+    add_model,
     load_model,
     print_json,
     print_notes,
@@ -37,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
-    parser.add_argument("bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag, tables) and folders")
+    add_model(parser, published=True)
+    parser.add_argument("bags", metavar="BAG", nargs="+", help=RECORDINGS)
     add_rule_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
     parser.add_argument(

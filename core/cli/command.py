@@ -15,7 +15,7 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,8 @@ from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import ModelError
 
 if TYPE_CHECKING:
-    from uncertain_lti import UncertainLTI
+    from uncertain_lti import Transient, UncertainLTI
+    from uncertain_lti.signals.signal_map import SignalMap
 
 DONE, ALARM, BAD_INPUT, FAULT, INTERRUPTED, NOT_READ = 0, 1, 2, 70, 130, 141
 """Exit statuses: 1 means that the alarm was raised, and nothing else.
@@ -159,6 +160,67 @@ def load_model(name: str) -> UncertainLTI:
     return UncertainLTI.load(name)
 
 
+RECORDINGS = "recordings (MCAP, .db3, .bag, tables) and folders"
+"""What may be named as recordings."""
+
+
+def add_model(parser: argparse.ArgumentParser, published: bool = False) -> None:
+    """Declare the model file that a command takes.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    published : bool, default False
+        Whether the published model may be named, too (`load_model`).
+    """
+    more = ", or leibov2006 for the published one" if published else ""
+    parser.add_argument("model", metavar="MODEL", help=f"model file{more}")
+
+
+def add_signals(parser: argparse.ArgumentParser) -> None:
+    """Declare the signals file that a command needs.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
+    parser.add_argument(
+        "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
+    )
+
+
+def add_within(parser: argparse.ArgumentParser) -> None:
+    """Declare the time within which a fault shall be seen.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
+    parser.add_argument(
+        "--within",
+        type=float,
+        metavar="S",
+        help="time within which a fault shall be seen (default: 1 s or 20 steps, at most a quarter of a recording)",
+    )
+
+
+def add_output(parser: argparse.ArgumentParser, required: bool) -> None:
+    """Declare the model file that a command writes, and `--force`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    required : bool
+        Whether it must be named.
+    """
+    parser.add_argument("--output", required=required, metavar="MODEL", help="model file to write (*.model.json)")
+    add_force(parser)
+
+
 def add_force(parser: argparse.ArgumentParser) -> None:
     """Declare the option that lets `model_target` replace a model.
 
@@ -168,6 +230,35 @@ def add_force(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     parser.add_argument("--force", action="store_true", help="write over a model that is there already")
+
+
+def read_labelled(
+    options: argparse.Namespace, pairs: Iterable[tuple[str, str]], signals: SignalMap
+) -> Iterator[tuple[str, Transient]]:
+    """Read recordings of known faults as a model has its signals.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Parsed arguments, with `progress`.
+    pairs : iterable of (str, str)
+        Label, and path of a recording or a folder.
+    signals : SignalMap
+        Of the model.
+
+    Yields
+    ------
+    (str, Transient)
+        Label and recording; its notes are printed.
+    """
+    from uncertain_lti.recordings.formats import group_recordings
+    from uncertain_lti.sampling.reading import read_as_fitted
+
+    for label, name in pairs:
+        for bag in group_recordings([name], layout=signals.table):
+            transient = read_as_fitted(bag, signals, options.progress.iterate("reading"))
+            print_notes(options, transient.notes)
+            yield label, transient
 
 
 def model_target(path: str, force: bool) -> Path:

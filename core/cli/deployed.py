@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from uncertain_lti.sampling.sampler_arrays import Decisions
 
 
-def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the alarm rule, as the node has them as parameters.
+def add_margin_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare another rule of containment than the model's.
 
     Parameters
     ----------
@@ -43,6 +43,17 @@ def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
         "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"
     )
     parser.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
+
+
+def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the alarm rule, as the node has them as parameters.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    """
+    add_margin_arguments(parser)
     parser.add_argument(
         "--masked", default="", metavar="STATES", help="states, separated by commas, that never raise the alarm"
     )

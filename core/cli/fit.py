@@ -22,9 +22,11 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.command import (
     DONE,
     GROUP,
+    RECORDINGS,
     SILENT,
     Command,
-    add_force,
+    add_output,
+    add_signals,
     model_target,
     print_json,
     print_notes,
@@ -45,13 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "bags",
         metavar="BAG",
         nargs="+",
-        help="recordings (MCAP, .db3, .bag, tables) and folders; parts of a split bag are one recording",
+        help=f"{RECORDINGS}; parts of a split bag are one recording",
     )
-    parser.add_argument(
-        "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
-    )
-    parser.add_argument("--output", required=True, metavar="MODEL", help="model file to write (*.model.json)")
-    add_force(parser)
+    add_signals(parser)
+    add_output(parser, required=True)
     parser.add_argument("--criterion", choices=("qp", "lp"), default="qp", help="(10) squared or (11) largest width")
     parser.add_argument(
         "--additive",

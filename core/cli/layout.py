@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 
-from uncertain_lti.cli.command import DONE, Command, load_model, print_json
+from uncertain_lti.cli.command import DONE, Command, add_model, load_model, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
+    add_model(parser, published=True)
     parser.add_argument("--foxglove", metavar="FILE.json", help="for Foxglove and Lichtblick")
     parser.add_argument("--plotjuggler", metavar="FILE.xml", help="for PlotJuggler")
     parser.add_argument("--topics", metavar="NAME", help="what the topics begin with (default: /envelope_monitor)")

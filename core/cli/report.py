@@ -17,8 +17,10 @@ from uncertain_lti.cli.command import (
     ALARM,
     BAD_INPUT,
     DONE,
+    RECORDINGS,
     SILENT,
     Command,
+    add_model,
     load_model,
     print_json,
     print_notes,
@@ -35,10 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument("model", metavar="MODEL", help="model file, or leibov2006 for the published one")
-    parser.add_argument(
-        "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag, tables) and folders to check against it"
-    )
+    add_model(parser, published=True)
+    parser.add_argument("bags", metavar="BAG", nargs="+", help=f"{RECORDINGS} to check against it")
     add_rule_arguments(parser)
     parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
     parser.add_argument("--json", action="store_true", help="print the same facts as JSON")

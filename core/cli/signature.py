@@ -18,13 +18,15 @@ from uncertain_lti.cli.command import (
     DONE,
     SILENT,
     Command,
-    add_force,
+    add_model,
+    add_output,
     load_model,
     model_target,
     print_json,
-    print_notes,
     print_summary,
+    read_labelled,
 )
+from uncertain_lti.cli.deployed import add_margin_arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,21 +37,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument("model", metavar="MODEL", help="model file")
+    add_model(parser)
     parser.add_argument(
         "labelled",
         metavar="LABEL=BAG",
         nargs="+",
         help="a fault, and a recording of it in which the alarm is raised; several recordings may have one label",
     )
-    parser.add_argument("--output", required=True, metavar="MODEL", help="model file to write (*.model.json)")
-    parser.add_argument("--violations", type=int, help="alarm: number of violations (default: the model's)")
-    parser.add_argument(
-        "--window", type=int, help="alarm: number of last verdicts they are counted in (default: the model's)"
-    )
-    parser.add_argument("--margin", type=float, help="factor on the half-widths (default: the model's)")
+    add_output(parser, required=True)
+    add_margin_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
-    add_force(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -73,9 +70,7 @@ def run(options: argparse.Namespace) -> int:
         The model or a recording cannot be read.
     """
     from uncertain_lti import EnvelopeMonitor
-    from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.signature_text import signature_text
-    from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.signatures import learn_signatures
 
     output = model_target(options.output, options.force)
@@ -85,12 +80,8 @@ def run(options: argparse.Namespace) -> int:
             raise ModelError(f"{text!r} is not LABEL=BAG; write for example stuck_valve=run7.mcap")
     model = load_model(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
-    checked = []
-    for label, _, name in pairs:
-        for bag in group_recordings([name], layout=model.signals.table):
-            transient = read_as_fitted(bag, model.signals, options.progress.iterate("reading"))
-            print_notes(options, transient.notes)
-            checked.append((label, monitor.check(transient)))
+    labelled = read_labelled(options, [(label, bag) for label, _, bag in pairs], model.signals)
+    checked = [(label, monitor.check(transient)) for label, transient in labelled]
     learnt = learn_signatures(model, checked, options.force)
     model.replace(signatures=learnt.signatures).save(output)
     if options.json:

@@ -22,11 +22,14 @@ from uncertain_lti.cli.command import (
     GROUP,
     SILENT,
     Command,
-    add_force,
+    add_output,
+    add_signals,
+    add_within,
     model_target,
     print_json,
     print_notes,
     print_summary,
+    read_labelled,
 )
 
 
@@ -44,23 +47,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         help="recordings of the healthy machine; LABEL=BAG is one of a machine with the fault LABEL",
     )
-    parser.add_argument(
-        "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
-    )
+    add_signals(parser)
     parser.add_argument(
         "--false-alarms", required=True, type=float, metavar="PER_HOUR", help="false alarms per hour at most"
     )
-    parser.add_argument(
-        "--within", type=float, metavar="S", help="time within which a fault shall be seen (default: as in validate)"
-    )
+    add_within(parser)
     parser.add_argument(
         "--budget", type=_time, default=math.inf, metavar="TIME", help="begin nothing new after 90s, 10m or 1h"
     )
     parser.add_argument("--group", metavar="KEY", help=GROUP)
     parser.add_argument("--cache", metavar="FOLDER", help="keep what every way came to, and go on from there")
-    parser.add_argument("--output", metavar="MODEL", help="model file to write (*.model.json)")
+    add_output(parser, required=False)
     parser.add_argument("--figure", metavar="FILE", help="draw detectable size against false alarms (PNG, SVG, PDF)")
-    add_force(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -86,9 +84,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from uncertain_lti import Transient, read_transients, tune
     from uncertain_lti.base.files import sha256, target
-    from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.tune_text import tune_text
-    from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.groups import resolve_groups
 
     output = None if options.output is None else model_target(options.output, options.force)
@@ -108,11 +104,9 @@ def run(options: argparse.Namespace) -> int:
     signals = transients[0].signals
     assert signals is not None
     faulty: dict[str, list[Transient]] = {}
-    for bag in options.bags:
-        if (label := _label(bag)) is not None:
-            for recording in group_recordings([bag.partition("=")[2]], layout=signals.table):
-                run = read_as_fitted(recording, signals, options.progress.iterate("reading"))
-                faulty.setdefault(label, []).append(run)
+    pairs = [(label, bag.partition("=")[2]) for bag in options.bags if (label := _label(bag)) is not None]
+    for label, run in read_labelled(options, pairs, signals):
+        faulty.setdefault(label, []).append(run)
     with options.progress.stage("tuning") as step:
         tuned = tune(
             transients,

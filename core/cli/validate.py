@@ -18,9 +18,12 @@ from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli.command import (
     DONE,
     GROUP,
+    RECORDINGS,
     SILENT,
     Command,
     add_force,
+    add_model,
+    add_within,
     model_target,
     print_json,
     print_notes,
@@ -36,12 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument("model", metavar="MODEL", help="model file")
+    add_model(parser)
     parser.add_argument(
         "bags",
         metavar="BAG",
         nargs="*",
-        help="recordings (MCAP, .db3, .bag, tables) and folders (default: those the model was fitted to)",
+        help=f"{RECORDINGS} (default: those the model was fitted to)",
     )
     parser.add_argument("--blocks", type=int, help="leave out blocks: their number per recording (a single one: 10)")
     parser.add_argument(
@@ -52,12 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--false-alarms", type=float, metavar="PER_HOUR", help="find the alarm rule that stays below this rate per hour"
     )
-    parser.add_argument(
-        "--within",
-        type=float,
-        metavar="S",
-        help="time within which a fault shall be seen (default: 1 s or 20 steps, at most a quarter of a recording)",
-    )
+    add_within(parser)
     parser.add_argument(
         "--statistics",
         metavar="LIST",
@@ -133,7 +131,9 @@ def run(options: argparse.Namespace) -> int:
     data = validation.to_dict()
     refusal = ""
     if options.false_alarms is not None:
-        calibration = calibrate(validation, options.false_alarms, statistics=options.statistics or ())
+        calibration = calibrate(
+            validation, options.false_alarms, within=options.within, statistics=options.statistics or ()
+        )
         data["calibration"] = calibration.to_dict()
         if calibration.alarm_rule is not None:
             model = model.with_residuals_of(validation.model).replace(alarm=calibration.rules)

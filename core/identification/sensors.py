@@ -387,6 +387,32 @@ def delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int] =
     list of str
         Messages.
     """
+    messages = []
+    for j, (best, share) in late_controls(problem, past).items():
+        said = signals[problem.n + j].delay + best
+        messages.append(
+            f"the states follow control '{signals[problem.n + j].name}' better when it is taken "
+            f"{plural(best, 'sample')} earlier "
+            f"(the unexplained part of a step falls by {share:.0%}): try `delay: {said}` for it in the signals file"
+        )
+    return messages
+
+
+def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tuple[int, float]]:
+    """Controls that explain the states clearly better when taken some samples earlier.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    past : collection of int, optional
+        Columns that are a state some samples earlier, which are late by intention.
+
+    Returns
+    -------
+    dict of int to (int, float)
+        As of `lags`; empty where too few samples follow one another.
+    """
     n, p = problem.n, problem.p
     follows = successive(problem)
     joined = np.zeros(problem.N, dtype=bool)
@@ -396,20 +422,11 @@ def delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int] =
     run = np.arange(problem.N) - breaks[np.searchsorted(breaks, np.arange(problem.N), side="right") - 1]
     usable = np.flatnonzero(run >= LONGEST_DELAY)
     if len(usable) < 20 * p:
-        return []
+        return {}
     lagged = np.stack([problem.z_columns[n:, usable - lag] for lag in range(LONGEST_DELAY + 1)])
     now = problem.z_columns[:n, usable]
-    messages = []
-    for j, (best, share) in lags(now, lagged, problem.next_columns[:, usable] - now, problem.dt[usable]).items():
-        if n + j in past:
-            continue
-        said = signals[n + j].delay + best
-        messages.append(
-            f"the states follow control '{signals[n + j].name}' better when it is taken "
-            f"{plural(best, 'sample')} earlier "
-            f"(the unexplained part of a step falls by {share:.0%}): try `delay: {said}` for it in the signals file"
-        )
-    return messages
+    found = lags(now, lagged, problem.next_columns[:, usable] - now, problem.dt[usable])
+    return {j: late for j, late in found.items() if n + j not in past}
 
 
 def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int, float]]:

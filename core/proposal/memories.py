@@ -120,7 +120,7 @@ def memory_candidates(transients: Sequence[Transient], additive: str = "noise") 
         Alternatives for the states, then for the controls; empty where nothing speaks for one.
     """
     first = transients[0]
-    point = _operating_point(first)
+    point = operating_point(first)
     try:
         problem = assemble(transients, point, None, additive)  # type: ignore[arg-type]
     except FitError:
@@ -285,7 +285,19 @@ def _judged(
     return np.maximum(width, 1e-300), float(1.0 - outside)
 
 
-def _operating_point(transient: Transient) -> OperatingPoint:
+def operating_point(transient: Transient) -> OperatingPoint:
+    """That of the signals of a recording; of arrays 0, with scales of 1.
+
+    Parameters
+    ----------
+    transient : Transient
+        The recording.
+
+    Returns
+    -------
+    OperatingPoint
+        Steady values and scales.
+    """
     signals = transient.signals
     if signals is not None:
         return OperatingPoint.of(signals.states, signals.controls, signals.scheduling)

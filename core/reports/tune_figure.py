@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -33,6 +34,7 @@ def tune_figure(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     figure, axes = plt.subplots(figsize=(7.0, 4.5), layout="constrained")
     judged = [t for t in data["trials"] if "refused" not in t and t["size"] is not None]
@@ -49,12 +51,21 @@ def tune_figure(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
     axes.set(
         xscale="log",
         yscale="log",
-        xlabel=f"false alarms per hour on what was left out (leftmost: none in {hours:.3g} h)",
+        xlabel=f"false alarms per hour on what was left out, {hours:.3g} h",
         ylabel="smallest detectable fault, relative to the plain fit",
-        title=f"{chosen['fit']}; alarm {chosen['alarm']}",
     )
-    axes.title.set_fontsize("small")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend()
+    axes.set_title(textwrap.fill(f"{chosen['fit']}; alarm {chosen['alarm']}", 90), fontsize="small")
+    none = NONE / hours
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    low, high = axes.get_xlim()
+    if low < none:  # there the axis says what its logarithm cannot
+        ticks = [t for t in axes.get_xticks() if 2.0 * none <= t <= high]
+        axes.set_xticks([none, *ticks], ["none", *(f"{t:g}" for t in ticks)])
+        axes.set_xlim(low, high)
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small", frameon=False)
     figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -103,6 +103,42 @@ def with_memories(transient: Transient, memories: Mapping[str, tuple[str, Memory
     return transient.replace(u=u, control_names=(*transient.control_names, *memories))
 
 
+def with_delays(transient: Transient, delays: Mapping[str, int]) -> Transient:
+    """The same run with some controls taken so many samples earlier, as `delay` in a signals file does.
+
+    Parameters
+    ----------
+    transient : Transient
+        The run; one that was read from topics gets signals with these delays, beside those they have.
+    delays : mapping of str to int
+        Name of a control that is no memory -> samples.
+
+    Returns
+    -------
+    Transient
+        A new transient.
+
+    Raises
+    ------
+    TransientError
+        There is no such control, or it is a memory.
+    """
+    u, controls = transient.u.copy(), list(transient.signals.controls) if transient.signals is not None else []
+    for name, samples in delays.items():
+        if name not in transient.control_names:
+            there = ", ".join(transient.control_names)
+            raise TransientError(f"{transient.name}: there is no control '{name}'; there are {there}")
+        j = list(transient.control_names).index(name)
+        if controls and controls[j].memory is not None:
+            raise TransientError(f"{transient.name}: control '{name}' is {controls[j].field}; it takes no delay")
+        u[:, j] = _column(transient, u[:, j], Memory("lag", samples))
+        if controls:
+            controls[j] = replace(controls[j], delay=controls[j].delay + samples)
+    if transient.signals is not None:
+        return transient.replace(u=u, signals=replace(transient.signals, controls=tuple(controls)))
+    return transient.replace(u=u)
+
+
 def _with_rules(structure: Any, memories: Mapping[str, tuple[str, Memory]]) -> Any:
     """Rules of a signals file, with those that a signal has no effect said of its memories, too."""
     if not isinstance(structure, list):

@@ -7,38 +7,44 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Several rules armed at once: their levels on what was left out, and one factor on all of their thresholds.
+"""Rules armed together, and the one search for their thresholds: on what was left out, each brought to a common scale.
 
-Each rule is brought to a common scale first: its level over what its peaks on the other recordings or groups that were
-left out make likely (their mean logarithm and its deviation). So one factor raises all thresholds together, states that
-are noisier have higher ones, as has a statistic that differs more from recording to recording, and the search for the
-factor is one search however many rules are armed. As the scale at one recording or group comes from the others, the
-scaled levels are those of a new one.
+A rule is scaled by what its peaks on the other recordings or groups that were left out make likely (their mean
+logarithm and its deviation). So one factor raises all thresholds together, states that are noisier have higher ones, as
+has a statistic that differs more from recording to recording, and the search for the factor is one search however many
+rules are armed. As the scale at one recording or group comes from the others, the scaled levels are those of a new one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, StatisticRule
+from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.model.alarm_rule import KINDS, AlarmRule, Rule, StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, row_of
-from uncertain_lti.validation.part import Part, unit_numbers
+from uncertain_lti.validation.part import Part, by_unit, rising, unit_numbers
 
 ALLOWANCES = (0.02, 0.1)
 """Allowances of cusum: utilisation of so much adds nothing. What is small and lasts is what it is for."""
-WINDOWS = (5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-"""Windows tried, in median steps, as far as the recordings support them."""
-SUPPORT = 10
-"""A window is tried if the median part holds as many of them one after the other."""
-DEVIATIONS = 1.5
-"""Standard deviations above the mean logarithm of the peaks at which the scale of a rule is."""
-_TINY = 1e-12
+SUPPORT = 4
+"""A window is tried if the median recording or group is as long as so many of them."""
+SHORTER, MOST_WINDOWS, FEWEST_STEPS = 4, 4, 5
+"""Windows of statistics are tried from the longest down, each a quarter of the last; how many, and the shortest."""
+COUNTED = ((3, 5), (5, 10), (20, 50), (80, 200), (400, 1000))
+"""(violations, window) tried beside 1 of 1, up to the longest window that the recordings support, and 10."""
+DEVIATIONS, FROM = 1.5, 8
+"""Standard deviations above the mean logarithm of the peaks at which the scale of a rule is, of many recordings or
+groups; half as many where there are FROM, as what few of them scatter by is hardly known."""
+FINE, LEAST = 1.02, 0.25
+"""`quiet` lowers the factor in this ratio, from above the largest level down to so much of it."""
+_TINY, _HUGE = 1e-12, LARGEST
 
 
 def kinds_of(statistics: Sequence[str] | str) -> tuple[str, ...]:
@@ -69,8 +75,68 @@ def kinds_of(statistics: Sequence[str] | str) -> tuple[str, ...]:
     return tuple(kind for kind in KINDS if kind in names or "all" in names)
 
 
-def supported_windows(parts: Sequence[Part], dt: float) -> list[int]:
-    """Windows that the recordings support.
+@dataclass(frozen=True)
+class Family:
+    """Alarm rules that differ in one factor on their thresholds and margins alone.
+
+    Parameters
+    ----------
+    kinds : tuple of str, default ()
+        Statistics; none for containment alone.
+    window : int, default 1
+        In verdicts of containment, in median steps of statistics.
+    violations : int, default 1
+        m of m of n; 1 beside statistics.
+    dt : float, default 0.0
+        Median step, s; 0 if there is none.
+    """
+
+    kinds: tuple[str, ...] = ()
+    window: int = 1
+    violations: int = 1
+    dt: float = 0.0
+
+    @property
+    def window_s(self) -> float:
+        """The window, s."""
+        return self.window * self.dt
+
+    @property
+    def words(self) -> str:
+        """In words."""
+        if not self.kinds:
+            return f"{self.violations} of {self.window}"
+        return f"{', '.join(self.kinds)} over {self.window_s:.3g} s"
+
+    def rules(self, model: UncertainLTI) -> tuple[Rule, ...]:
+        """The rules for one model, with thresholds and margins of 1.
+
+        Parameters
+        ----------
+        model : UncertainLTI
+            Its horizons are watched, too.
+
+        Returns
+        -------
+        tuple of Rule
+            Containment of one step and of each horizon, and every kind at one step and at the longest horizon; there
+            chi2 of one verdict, too.
+        """
+        steps = [horizon.steps for horizon in model.horizons]
+        if not self.kinds:
+            return tuple(AlarmRule(self.violations, self.window, 1.0, h) for h in (1, *steps))
+        found: list[Rule] = [AlarmRule(1, 1, 1.0, h) for h in (1, *steps)]
+        for kind in self.kinds:
+            for h in (1, *steps[-1:]):
+                for allowance in ALLOWANCES if kind == "cusum" else (0.0,):
+                    found.append(StatisticRule(kind, self.window_s, 1.0, h, allowance))
+        if "chi2" in self.kinds and steps:
+            found.append(StatisticRule("chi2", 0.0, 1.0, steps[-1]))
+        return tuple(found)
+
+
+def longest_window(parts: Sequence[Part], dt: float) -> int:
+    """The longest window that the recordings support, in median steps.
 
     Parameters
     ----------
@@ -81,45 +147,37 @@ def supported_windows(parts: Sequence[Part], dt: float) -> list[int]:
 
     Returns
     -------
-    list of int
-        In median steps, of `WINDOWS`.
+    int
+        SUPPORT of them are as long as the median recording or group, and two as the median part of it.
     """
-    longest = float(np.median([float(p.dt.sum()) for p in parts])) / SUPPORT
-    return [n for n in WINDOWS if n * dt <= longest * (1.0 + 1e-9)]
+    lengths = np.array([float(p.dt.sum()) for p in parts])
+    typical = min(float(np.median(by_unit(parts, lengths))) / SUPPORT, float(np.median(lengths)) / 2.0)
+    return int(typical / dt * (1.0 + 1e-9)) if dt else 0
 
 
-def sets_of(kinds: Sequence[str], model: UncertainLTI, windows: Sequence[int]) -> list[tuple[Rule, ...]]:
-    """Rules that may be armed together, with thresholds and margins of 1, one set per window.
+def families(parts: Sequence[Part], dt: float, kinds: Sequence[Sequence[str]] = ()) -> list[Family]:
+    """What may be armed, as far as the recordings support its window; the plainest first.
 
     Parameters
     ----------
-    kinds : sequence of str
-        Of `kinds_of`.
-    model : UncertainLTI
-        Its horizons are watched, too.
-    windows : sequence of int
-        In median steps.
+    parts : sequence of Part
+        Left-out parts.
+    dt : float
+        Median step, s.
+    kinds : sequence of sequence of str, optional
+        Sets of statistics that are armed together.
 
     Returns
     -------
-    list of tuple of Rule
-        Containment of one step and of each horizon, and every kind at one step and at the longest horizon; there chi2
-        of one verdict, too.
+    list of Family
+        1 of 1, m of n, then each set of statistics over each window.
     """
-    steps = [horizon.steps for horizon in model.horizons]
-    dt = model.sampling.dt_median
-    found: list[tuple[Rule, ...]] = []
-    for count in windows:
-        assert dt is not None
-        rules: list[Rule] = [AlarmRule(1, 1, 1.0, h) for h in (1, *steps)]
-        for kind in kinds:
-            for h in (1, *steps[-1:]):
-                for allowance in ALLOWANCES if kind == "cusum" else (0.0,):
-                    rules.append(StatisticRule(kind, count * dt, 1.0, h, allowance))
-        if "chi2" in kinds and steps:
-            rules.append(StatisticRule("chi2", 0.0, 1.0, steps[-1]))
-        found.append(tuple(rules))
-    return found
+    longest = longest_window(parts, dt)
+    found = [Family(dt=dt)]
+    found += [Family((), n, m, dt) for m, n in COUNTED if n <= max(10, longest)]
+    windows = [longest // SHORTER**k for k in range(MOST_WINDOWS)]
+    windows = sorted(n for n in set(windows) if n >= FEWEST_STEPS)
+    return found + [Family(tuple(together), n, 1, dt) for together in kinds for n in windows]
 
 
 def values_of(rules: Sequence[Rule], part: Part, table: Array | None = None) -> list[Array]:
@@ -128,7 +186,7 @@ def values_of(rules: Sequence[Rule], part: Part, table: Array | None = None) -> 
     Parameters
     ----------
     rules : sequence of Rule
-        Of `sets_of`.
+        Of `Family.rules`.
     part : Part
         The part.
     table : array (K, rows, n), optional
@@ -148,51 +206,54 @@ def values_of(rules: Sequence[Rule], part: Part, table: Array | None = None) -> 
         if isinstance(rule, AlarmRule):
             sizes = np.abs(table[:, row_of(rule, model)])
             severity = np.where(np.isnan(sizes).all(axis=1), 0.0, np.nan_to_num(sizes, nan=np.inf).max(axis=1))
-            found.append(severity[:, None])
+            level = part.level(rule.violations, rule.window, severity)
+            found.append(np.clip(level, 0.0, _HUGE)[:, None])
             continue
-        values = np.zeros((part.judged, 1 if rule.kind in JOINT else model.n))
+        values = np.zeros((part.judged, len(rule.thresholds(model.n))))
         for start, stop in part.spans:
             span = slice(start, stop)
             violated = np.zeros(stop - start, dtype=bool)
             values[span] = Alarm([rule], model, counted).over(part.dt[span], violated, table[span])[2]
-        found.append(np.nan_to_num(np.abs(values)))
+        found.append(np.minimum(np.nan_to_num(np.abs(values)), _HUGE))
     return found
 
 
 def _scale(peaks: Array) -> Array:
     """Where the peak of another recording or group may be, (c,), from those of some, (units, c)."""
     logarithm = np.log(peaks)
-    return np.asarray(np.exp(logarithm.mean(axis=0) + DEVIATIONS * logarithm.std(axis=0)))
+    share = DEVIATIONS * len(peaks) / (len(peaks) + FROM)
+    return np.asarray(np.exp(logarithm.mean(axis=0) + share * logarithm.std(axis=0)))
 
 
 class Armed:
-    """One set of rules on a common scale.
+    """One set of rules on a common scale; a single rule of containment on its own, that of margins.
 
     Parameters
     ----------
     rules : sequence of Rule
-        Of `sets_of`.
+        Of `Family.rules`.
     parts : sequence of Part
-        Left-out parts, of two recordings or groups at least.
+        Left-out parts.
 
     Attributes
     ----------
     rules : tuple of Rule
         As given.
     levels : list of array (K,)
-        Of each part the factor below which some rule raises the alarm.
+        Of each part the factor below which some rule raises the alarm; 0 where a margin of 1 does not.
     """
 
     def __init__(self, rules: Sequence[Rule], parts: Sequence[Part]) -> None:
-        self.rules = tuple(rules)
+        self.rules, self._parts = tuple(rules), parts
         values = [values_of(self.rules, part) for part in parts]
         units = unit_numbers(parts)
+        alone = len(self.rules) == 1 and isinstance(self.rules[0], AlarmRule)
         peaks = []  # of each rule: (units, c)
         for j in range(len(self.rules)):
             each = np.zeros((int(units.max(initial=0)) + 1, values[0][j].shape[1]))
             for unit, of_part in zip(units.tolist(), values, strict=True):
                 each[unit] = np.maximum(each[unit], of_part[j].max(axis=0, initial=0.0))
-            peaks.append(np.maximum(each, _TINY))
+            peaks.append(np.ones_like(each) if alone else np.maximum(each, _TINY))
         self._scales = [_scale(each) for each in peaks]
         self.levels = []
         for unit, of_part in zip(units.tolist(), values, strict=True):
@@ -205,6 +266,52 @@ class Armed:
                 level = np.maximum(level, scaled.max(axis=1))
             self.levels.append(level)
 
+    @property
+    def top(self) -> float:
+        """The largest level."""
+        return max(float(level.max(initial=0.0)) for level in self.levels)
+
+    def counts(self, factor: float) -> NDArray[np.intp]:
+        """Alarms that are raised on each part.
+
+        Parameters
+        ----------
+        factor : float
+            On the scales.
+
+        Returns
+        -------
+        array (parts,) of int
+            Rising edges.
+        """
+        each = zip(self.levels, self._parts, strict=True)
+        return np.array([rising(level > factor, part.starts) for level, part in each], dtype=np.intp)
+
+    def lowest(
+        self, factors: Iterable[float], keeps: Callable[[float, NDArray[np.intp]], bool]
+    ) -> tuple[float, NDArray[np.intp]] | None:
+        """The last factor before one does not keep to what is asked for.
+
+        Parameters
+        ----------
+        factors : iterable of float
+            From the largest down.
+        keeps : callable
+            Whether a factor, with the alarms of each part, keeps to it.
+
+        Returns
+        -------
+        (float, array (parts,) of int), or None
+            The factor and its alarms; None if the first does not keep to it.
+        """
+        chosen = None
+        for factor in factors:
+            counts = self.counts(factor)
+            if not keeps(factor, counts):
+                break
+            chosen = factor, counts
+        return chosen
+
     def at(self, factor: float) -> tuple[Rule, ...]:
         """The rules with the thresholds and margins of one factor.
 
@@ -216,7 +323,7 @@ class Armed:
         Returns
         -------
         tuple of Rule
-            Margins are at least 1.
+            Margins are at least 1, below which samples like those that were fitted would count as violations.
         """
         found: list[Rule] = []
         for rule, scale in zip(self.rules, self._scales, strict=True):
@@ -226,3 +333,42 @@ class Armed:
                 each = tuple(factor * float(s) for s in scale)
                 found.append(replace(rule, threshold=each[0] if len(each) == 1 else each))
         return tuple(found)
+
+
+def quiet(
+    family: Family, model: UncertainLTI, parts: Sequence[Part], allowed: int
+) -> tuple[tuple[Rule, ...], NDArray[np.intp]]:
+    """The rules of a family with the smallest factor that raises at most so many alarms on what was left out.
+
+    Parameters
+    ----------
+    family : Family
+        What is armed.
+    model : UncertainLTI
+        The full model.
+    parts : sequence of Part
+        What was left out.
+    allowed : int
+        Alarms.
+
+    Returns
+    -------
+    tuple of Rule
+        The alarm.
+    array (parts,) of int
+        Alarms of each part.
+
+    Raises
+    ------
+    FitError
+        No threshold is quiet: bounds without width are left.
+    """
+    armed = Armed(family.rules(model), parts)
+    top = armed.top
+    if top >= _HUGE:
+        raise FitError("no threshold is quiet: bounds without width are left on what was left out")
+    steps = int(np.log(1.0 / LEAST) / np.log(FINE))
+    factors = max(top, _TINY) * FINE / FINE ** np.arange(steps)
+    found = armed.lowest(factors.tolist(), lambda _, counts: counts.sum() <= allowed)
+    assert found is not None  # above the largest level there is no alarm
+    return armed.at(found[0]), found[1]

@@ -13,77 +13,92 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import FitError
-from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule, containment
-from uncertain_lti.monitor.alarm import Alarm, raised, residual_row
-from uncertain_lti.validation.armed import SUPPORT, WINDOWS, Armed, kinds_of, sets_of, supported_windows
+from uncertain_lti.base.errors import FitError, ModelError
+from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.validation.armed import FEWEST_STEPS, SUPPORT, Armed, Family, families, kinds_of
+from uncertain_lti.validation.detectable import (
+    COMPARED,
+    COMPARED_CASES,
+    LARGEST,
+    Detectable,
+    check_within,
+    detectable,
+    log_sizes,
+    typical_within,
+)
 from uncertain_lti.validation.false_alarms import borrowed_margin, peaks
 from uncertain_lti.validation.intervals import cluster_size, rate_interval
-from uncertain_lti.validation.part import Part, by_unit, rising
+from uncertain_lti.validation.part import Part, by_unit
 from uncertain_lti.validation.result import Validation, short_condition
 
-RULES = ((1, 1), (3, 5), (5, 10), (8, 20), (20, 50), (40, 100), (80, 200), (200, 500), (400, 1000))
-"""(violations, window) tried by default, up to the longest window that the recordings support."""
-MARGINS = tuple(round(float(m), 12) for m in np.geomspace(4.0, 0.5, 106))
-"""Margins tried, from the largest, about 2 % apart: down to 1, below which samples like those that were fitted would
-count as violations. Factors on the thresholds of statistics go on to the end."""
-FAULT_SIZE = 1.0
-"""Size of the reference fault: one state moves by this many mean widths more in every step."""
-FAINT = (0.25, 0.5, 1.0)
-"""Sizes of the faults by which a rule is chosen: small ones that last count as much as large ones."""
+FACTORS = tuple(round(float(m), 12) for m in np.geomspace(4.0, 0.5, 106))
+"""Factors on margins and thresholds, from the largest down, about 2 % apart. No margin goes below 1, where samples like
+those that were fitted would count as violations."""
 BLIND = 0.5
-"""A rule that detects a smaller share of the reference faults on some state gets a warning: it is insensitive."""
-STARTS = 8
-"""Instants per left-out part at which the reference fault is added, with either sign; fewer if there are many parts."""
-_TRIALS, _VERDICTS = 64, 3e7
-# instants over all parts, and verdicts times states that statistics are tried on with a fault, about, for one set
+"""A state of which not even a bias, or a drift within the time, of this share of its range is seen gets a warning."""
+WORTH = 0.02
+"""A rule must detect faults smaller by this share, on average, to be taken before a plainer one."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One alarm rule at the smallest margin that keeps to the target.
+    """One alarm rule, or several armed together, at the smallest factor that keeps to the target.
 
     Parameters
     ----------
-    violations : int
-        m of the rule.
-    window : int
-        n of the rule, in verdicts.
+    family : Family
+        What is armed, but for its thresholds.
     margin : float or None
-        The smallest margin; None if none keeps to the target.
+        Of one-step bounds, the smallest; None if none keeps to the target.
     alarms : int
-        False alarms on the left-out parts at that margin.
+        False alarms on the left-out parts.
     upper : float
         One-sided upper confidence limit of the false alarms per hour.
-    detected : array (n,)
-        Share of the reference faults on each state that raise the alarm before the part ends.
-    delay : array (n,)
-        Median time to the alarm, s; inf if most are missed.
-    faint : array (n,)
-        Share of the faults of every size of FAINT, of either sign and of a sign that changes, that raise the alarm.
     rules : tuple of AlarmRule or StatisticRule
-        All that are armed, at the smallest factor on their thresholds; empty if none keeps to the target.
-    window_s : float
-        The longest window, s.
+        All that are armed; empty if none keeps to the target.
+    faults : Detectable or None
+        The smallest faults that are detected; None if none keeps to the target.
     """
 
-    violations: int
-    window: int
+    family: Family
     margin: float | None
     alarms: int
     upper: float
-    detected: Array
-    delay: Array
-    faint: Array
-    rules: tuple[Rule, ...]
-    window_s: float
+    rules: tuple[Rule, ...] = ()
+    faults: Detectable | None = field(default=None, repr=False)
+
+    @property
+    def violations(self) -> int:
+        """m of the rule."""
+        return self.family.violations
+
+    @property
+    def window(self) -> int:
+        """n of the rule, in verdicts; of statistics in median steps."""
+        return self.family.window
+
+    @property
+    def size(self) -> float:
+        """Geometric mean of the smallest detectable sizes over the largest tried; 1 if nothing is known of them."""
+        known = _relative(self.faults)
+        return math.exp(float(known.mean())) if len(known) else 1.0
+
+
+def _relative(faults: Detectable | None) -> NDArray[np.float64]:
+    """Logarithms of the sizes that are known, over the largest tried."""
+    if faults is None:
+        return np.zeros(0)
+    largest = np.array([f.largest for f in faults.faults])
+    sizes = log_sizes([(f.thresholds, f.largest) for f in faults.faults])
+    known = np.isfinite(sizes)
+    return np.asarray(sizes[known] - np.log(largest[known]))
 
 
 @dataclass(frozen=True)
@@ -102,12 +117,14 @@ class Calibration:
         Time under verdict in the left-out parts, h.
     needed_hours : float
         Time without a false alarm that would show the target, h.
+    within : float
+        Time within which the faults are seen by which rules were compared, s.
     candidates : tuple of Candidate
         One per rule tried.
     words : str
         The outcome as a sentence.
     warning : str, default ""
-        What the chosen rule does not detect; empty if it detects at least BLIND of the reference faults on every state.
+        What the chosen rule does not detect; empty if it sees biases or drifts of BLIND of the range of every state.
     rules : tuple of AlarmRule or StatisticRule
         All that were chosen to be armed together, for `UncertainLTI.alarm`; empty without a choice.
     """
@@ -117,6 +134,7 @@ class Calibration:
     confidence: float
     hours: float
     needed_hours: float
+    within: float
     candidates: tuple[Candidate, ...]
     words: str
     warning: str = ""
@@ -138,7 +156,8 @@ class Calibration:
             "reached": self.alarm_rule is not None,
             "words": self.words,
             "warning": self.warning,
-            "fault": f"one state moved by {FAULT_SIZE:g} mean width more in every step",
+            "within": self.within,
+            "faults": list(COMPARED),
             "candidates": [
                 {
                     "violations": c.violations,
@@ -146,11 +165,15 @@ class Calibration:
                     "margin": c.margin,
                     "alarms": c.alarms,
                     "upper_per_hour": c.upper if math.isfinite(c.upper) else None,
-                    "detected": c.detected.tolist(),
-                    "delay": [d if math.isfinite(d) else None for d in c.delay.tolist()],
-                    "faint": c.faint.tolist(),
-                    "window_s": c.window_s,
+                    "window_s": c.family.window_s,
+                    "statistics": list(c.family.kinds),
                     "rules": [rule.to_dict() for rule in c.rules],
+                    "size": c.size if c.rules else None,
+                    "sizes": [
+                        {"kind": f.kind, "signal": f.signal, "unit": f.unit, "size": f.size}
+                        for f in (c.faults.faults if c.faults is not None else ())
+                        if math.isfinite(f.size)
+                    ],
                 }
                 for c in self.candidates
             ],
@@ -161,20 +184,22 @@ def calibrate(
     validation: Validation,
     target: float,
     *,
+    within: float | None = None,
     rules: Sequence[tuple[int, int]] | None = None,
     statistics: Sequence[str] | str = (),
     confidence: float | None = None,
 ) -> Calibration:
-    """Find the rule and margin whose false alarms stay below a target, and which then detect small faults best.
+    """Find the rule and margin whose false alarms stay below a target, and which then detect the smallest faults.
 
-    For each rule, margins are tried from the largest down to 1, as long as the upper confidence limit of the false
-    alarms on the left-out parts stays at or below the target; going in a fixed order and stopping at the first failure,
-    the confidence of one test holds for the whole search. The error is shared equally among the candidates, so that
-    choosing among them costs no confidence. With statistics, a candidate arms all of them over one window, and the
-    containment of one step and of every horizon: the alarms of all together are counted, while one factor lowers all
-    thresholds on the scale that the peaks on the other recordings give (`armed`). Chosen is the candidate that detects
-    the largest share of the faults of the sizes FAINT on the state where it detects least, then over all states, then
-    the one that detects the reference fault first.
+    For each rule, factors on its margins and thresholds are tried from the largest down, as long as the upper
+    confidence limit of the false alarms on the left-out parts stays at or below the target; going in a fixed order and
+    stopping at the first failure, the confidence of one test holds for the whole search. No margin goes below 1. The
+    error is shared equally among the candidates, so that choosing among them costs no confidence. A candidate is m of n
+    violations, or statistics over one window (each of those named, and all together) beside containment of every
+    verdict; all of it also over every horizon of the model. The alarms of all together are counted, while one factor
+    lowers all thresholds on the scale that the peaks on the other recordings give (`armed`). Chosen is the candidate
+    with the smallest detectable faults (`detectable`: biases, drifts and noise of every state, offsets of every
+    control; geometric mean), and of those within WORTH of it the plainest.
 
     Parameters
     ----------
@@ -182,11 +207,12 @@ def calibrate(
         Of `validate`; its parts are what the search counts on.
     target : float
         Target rate: false alarms per hour at most.
+    within : float, optional
+        Time within which faults shall be seen, s; default `typical_within`.
     rules : sequence of (int, int), optional
-        (violations, window) of each rule of containment; default those of RULES that the recordings support, or none
-        with statistics.
+        (violations, window) of each rule of containment; default those of `armed.COUNTED` that the recordings support.
     statistics : sequence of str, or str, optional
-        Kinds of statistics to arm together, with commas between them in one text; `all` for every kind.
+        Kinds of statistics to try, with commas between them in one text; `all` for every kind.
     confidence : float, optional
         That the true rate is below the target; default that of the validation.
 
@@ -198,275 +224,135 @@ def calibrate(
     Raises
     ------
     FitError
-        The target is not positive, a rule or a statistic is none, or the recordings are too short for a window.
+        The target or the time is not positive, a rule or a statistic is none, or the recordings are too short for a
+        window.
     """
     if not (math.isfinite(target) and target > 0):
         raise FitError(f"the target is {target} false alarms per hour; give a positive number")
+    check_within(within)
     model, parts = validation.model, validation.parts
+    within = typical_within(parts) if within is None else within
     dt = model.sampling.dt_median or 0.0
-    supported = supported_windows(parts, dt) if dt else []
-    if rules is None:
-        rules = [] if statistics else [(m, n) for m, n in RULES if n <= max(10, *supported, 10)]
-    sets = sets_of(kinds_of(statistics), model, supported) if statistics else []
-    if not (rules or sets):
-        if statistics:
-            raise FitError(
-                f"statistics need windows of at least {WINDOWS[0]} steps, and the parts left out are shorter than "
-                f"{SUPPORT} of them; record longer, or leave statistics out"
-            )
+    kinds = kinds_of(statistics) if statistics else ()
+    sets = [(kind,) for kind in kinds] + ([kinds] if len(kinds) > 1 else [])
+    tried = families(parts, dt, sets)
+    if kinds and not any(family.kinds for family in tried):
+        raise FitError(
+            f"statistics need windows of at least {FEWEST_STEPS} steps, and the parts left out are shorter than "
+            f"{SUPPORT} of them; record longer, or leave statistics out"
+        )
+    if rules is not None:
+        for m, n in rules:
+            if not 1 <= m <= n:
+                raise FitError(f"alarm rule {m} of {n}: it takes 1 <= violations <= window")
+        tried = [Family((), n, m, dt) for m, n in rules] + [family for family in tried if family.kinds]
+    if not tried:
         raise FitError("no alarm rule to choose from; give at least one (violations, window)")
-    for m, n in rules:
-        if not 1 <= m <= n:
-            raise FitError(f"alarm rule {m} of {n}: it takes 1 <= violations <= window")
     confidence = validation.confidence if confidence is None else confidence
-    each = 1.0 - (1.0 - confidence) / (len(rules) + len(sets))
+    each = 1.0 - (1.0 - confidence) / len(tried)
     hours = sum(p.hours for p in parts)
-    candidates = tuple(_containment(parts, m, n, target, each, hours, dt) for m, n in rules)
-    candidates += tuple(_together(parts, chosen, target, each, hours) for chosen in sets)
+    candidates = tuple(_candidate(model, parts, family, target, each, hours, within) for family in tried)
     needed = rate_interval(np.zeros(validation.units), 1.0, each, one_sided=True)[1] / target
     found = [c for c in candidates if c.margin is not None]
     if not found:
-        return Calibration(
-            None, target, confidence, hours, needed, candidates, _refusal(candidates, target, hours, needed)
-        )
-    best = max(found, key=_worth)
-    assert best.margin is not None
-    names = model.state_names
-    slow = int(np.lexsort((-best.detected, best.delay))[-1])  # of those never seen by half, the least seen
-    missed = 1.0 - float(best.detected[slow])
+        words = _refusal(candidates, target, hours, needed)
+        return Calibration(None, target, confidence, hours, needed, within, candidates, words)
+    least = min(c.size for c in found)
+    best = next(c for c in found if c.size <= least * (1.0 + WORTH))
+    assert best.margin is not None and best.faults is not None
     words = (
         f"alarm at {_what(best)}: at "
         f"most {target:g} false alarms per hour with {confidence:.0%} confidence {short_condition(validation)} "
         f"({best.alarms} in {hours:.3g} h left "
-        f"out, limit {best.upper:.3g} per hour); a fault that moves one state by {FAULT_SIZE:g} mean width more in "
-        f"every step is seen "
-        + (
-            f"after {best.delay[slow]:.3g} s (median; slowest state: {names[slow]}; {missed:.0%} missed)"
-            if math.isfinite(best.delay[slow])
-            else f"in {best.detected[slow]:.0%} of the cases only (worst state: {names[slow]})"
-        )
-        + f"; of faults of {', '.join(f'{size:g}' for size in FAINT[:-1])} and {FAINT[-1]:g} mean widths "
-        f"{float(best.faint.mean()):.0%}"
+        f"out, limit {best.upper:.3g} per hour); {_sees(best.faults, model.state_names)}"
     )
-    rule = AlarmRule(best.violations, best.window, best.margin)
-    return Calibration(
-        rule, target, confidence, hours, needed, candidates, words, _insensitive(best.detected, names), best.rules
-    )
+    one_step = containment(best.rules)
+    warning = _insensitive(best.faults, model.state_names)
+    return Calibration(one_step, target, confidence, hours, needed, within, candidates, words, warning, best.rules)
 
 
-def _worth(candidate: Candidate) -> tuple[float, float, float, float]:
-    """By what a candidate is chosen: the largest is best."""
-    faint = np.round(candidate.faint, 3)
-    return float(faint.min()), float(faint.mean()), -float(candidate.delay.max()), -(candidate.margin or 0.0)
+def _candidate(
+    model: UncertainLTI, parts: Sequence[Part], family: Family, target: float, confidence: float, hours: float,
+    within: float,
+) -> Candidate:  # fmt: skip
+    """What a family is armed with at the smallest factor that keeps to the target, and what that detects."""
+    armed = Armed(family.rules(model), parts)
+    largest = peaks(parts, armed.levels)
+    limits = [math.inf]
+
+    def keeps(factor: float, counts: NDArray[np.intp]) -> bool:
+        typical = cluster_size(by_unit(parts, armed.counts(borrowed_margin(largest, factor))))
+        limits.append(rate_interval(by_unit(parts, counts), hours, confidence, typical, one_sided=True)[1])
+        return limits[-1] <= target
+
+    found = armed.lowest(FACTORS, keeps)
+    if found is None:
+        return Candidate(family, None, int(armed.counts(FACTORS[0]).sum()), limits[1])
+    factor, counts = found
+    rules = armed.at(factor)
+    upper = limits[1 + FACTORS.index(factor)]
+    one_step = containment(rules)
+    assert one_step is not None
+    try:
+        faults = detectable(model.replace(alarm=rules), parts, within, kinds=COMPARED, cases=COMPARED_CASES)
+    except ModelError as error:
+        raise FitError(f"the alarm {family.words} cannot be tried: {error}") from None
+    return Candidate(family, one_step.margin, int(counts.sum()), upper, rules, faults)
 
 
 def _what(candidate: Candidate) -> str:
     """The rules of a candidate in words."""
+    family = candidate.family
     if len(candidate.rules) == 1:
-        window = f" ({candidate.window_s:.3g} s)" if candidate.window > 1 else ""
+        window = f" ({family.window_s:.3g} s)" if family.window > 1 else ""
         return (
-            f"{candidate.violations} of {candidate.window} verdicts{window} outside {candidate.margin:.3g} times the "
+            f"{family.violations} of {family.window} verdicts{window} outside {candidate.margin:.3g} times the "
             f"half-widths"
         )
     found = []
     for rule in candidate.rules:
         if isinstance(rule, AlarmRule):
             over = "" if rule.horizon == 1 else f" over {rule.horizon} steps"
-            found.append(f"a verdict{over} outside {rule.margin:.3g} times the half-widths")
+            count = "a verdict" if rule.window == 1 else f"{rule.violations} of {rule.window} verdicts"
+            found.append(f"{count}{over} outside {rule.margin:.3g} times the half-widths")
         else:
             found.append(rule.words)
     return ", or ".join(found)
 
 
-def _insensitive(detected: Array, names: Sequence[str]) -> str:
-    """Warning that a rule, which detects the shares `detected` (n,) of the reference faults, misses most on some."""
-    missed = [f"{name} in {share:.0%}" for name, share in zip(names, detected, strict=True) if not share >= BLIND]
+def _sees(faults: Detectable, names: Sequence[str]) -> str:
+    """The largest of the smallest detectable biases, in words."""
+    biases = [
+        (f, f.size / f.largest) for name in names if (f := faults.find("bias", name)) is not None and not f.refused
+    ]
+    if not biases:
+        return f"which faults it sees within {faults.within:.3g} s is unknown: {faults.refused}"
+    worst, share = max(biases, key=lambda pair: pair[1])
+    if not math.isfinite(share):
+        return f"within {faults.within:.3g} s it does not see a bias of {worst.largest:.3g} {worst.unit}".rstrip() + (
+            f" of {worst.signal} in 90% of the cases"
+        )
+    unit = f" {worst.unit}" if worst.unit else ""
+    beside = ", and relatively smaller ones of the other states" if len(biases) > 1 else ""
+    return (
+        f"within {faults.within:.3g} s it sees in 90% of the cases a bias of {worst.size:.3g}{unit} of {worst.signal} "
+        f"({LARGEST * share:.2g} times its range){beside}"
+    )
+
+
+def _insensitive(faults: Detectable, names: Sequence[str]) -> str:
+    """Warning that a rule misses biases and drifts of BLIND of the range of some states."""
+    missed = []
+    for name in names:
+        known = [f for kind in ("bias", "drift") if (f := faults.find(kind, name)) is not None and not f.refused]
+        if known and min(LARGEST * f.size / f.largest for f in known) > BLIND:
+            missed.append(name)
     if not missed:
         return ""
     return (
-        f"this rule keeps quiet by seeing little: a fault that moves one state by {FAULT_SIZE:g} mean width more in "
-        f"every step is seen on {', '.join(missed)} of the cases; accept more false alarms per hour, or record more"
+        f"this rule keeps quiet by seeing little: a bias of {BLIND:g} times the range of {', '.join(missed)} is not "
+        f"seen within {faults.within:.3g} s in 90% of the cases; accept more false alarms per hour, or record more"
     )
-
-
-def _containment(
-    parts: Sequence[Part], m: int, n: int, target: float, confidence: float, hours: float, dt: float
-) -> Candidate:
-    """m of n one-step violations at the smallest margin that keeps to the target."""
-    levels = [p.level(m, n) for p in parts]
-    margin, count, limit = _search(parts, levels, target, confidence, hours, least=1.0)
-    rules = () if margin is None else (AlarmRule(m, n, margin),)
-    return _candidate(parts, m, n, margin, count, limit, rules, n * dt)
-
-
-def _together(
-    parts: Sequence[Part], rules: Sequence[Rule], target: float, confidence: float, hours: float
-) -> Candidate:
-    """Rules armed together, at the smallest factor on their thresholds that keeps to the target."""
-    armed = Armed(rules, parts)
-    factor, count, limit = _search(parts, armed.levels, target, confidence, hours)
-    chosen = () if factor is None else armed.at(factor)
-    longest = max(rule.window_s for rule in rules if isinstance(rule, StatisticRule))
-    one_step = containment(chosen)
-    return _candidate(parts, 1, 1, one_step.margin if one_step else None, count, limit, chosen, longest)
-
-
-def _search(
-    parts: Sequence[Part],
-    levels: Sequence[Array],
-    target: float,
-    confidence: float,
-    hours: float,
-    least: float = 0.0,
-) -> tuple[float | None, int, float]:
-    """The smallest of MARGINS whose alarms keep to the target, their number, and the upper limit of their rate."""
-    counts = by_unit(
-        parts,
-        [[rising(level > margin, p.starts) for p, level in zip(parts, levels, strict=True)] for margin in MARGINS],
-    )
-    largest = peaks(parts, levels)
-    chosen, count, limit = None, 0, math.inf
-    for margin, row in zip(MARGINS, counts, strict=True):
-        if margin < least:
-            break
-        nearby = int(np.argmax(np.array([*MARGINS, 0.0]) <= borrowed_margin(largest, margin)))
-        typical = cluster_size(counts[min(nearby, len(counts) - 1)])
-        upper = rate_interval(row, hours, confidence, typical, one_sided=True)[1]
-        if upper > target:
-            if chosen is None:
-                count, limit = int(row.sum()), upper
-            break
-        chosen, count, limit = margin, int(row.sum()), upper
-    return chosen, count, limit
-
-
-def _candidate(
-    parts: Sequence[Part],
-    m: int,
-    n: int,
-    margin: float | None,
-    count: int,
-    limit: float,
-    rules: tuple[Rule, ...],
-    window_s: float,
-) -> Candidate:
-    if margin is None:
-        nothing = np.full(parts[0].utilisation.shape[1], np.nan)
-        return Candidate(m, n, None, count, limit, nothing, nothing, nothing, rules, window_s)
-    detected, delay = detection(parts, rules)
-    faint = [_shares(_times(parts, rules, size, (1.0, -1.0, 0.0))) for size in FAINT]
-    return Candidate(m, n, margin, count, limit, detected, delay, np.mean(faint, axis=0), rules, window_s)
-
-
-def detection(
-    parts: Sequence[Part], rules: AlarmRule | Sequence[Rule], size: float = FAULT_SIZE
-) -> tuple[Array, Array]:
-    """Share of reference faults that raise the alarm, and the time to it.
-
-    The fault: from one verdict on, one state moves by `size` mean widths of its bounds more in every step than
-    recorded, in either direction, the step still starting from the measured state; over a horizon the steps add up, as
-    far as the nominal model keeps what is added to the state. It is added to the left-out parts at STARTS instants
-    each, to fewer if there are many; one that is not detected before the part ends counts as missed (infinite time).
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    rules : AlarmRule, or sequence of AlarmRule and StatisticRule
-        What is armed.
-    size : float, optional
-        Of the fault, in mean widths; default FAULT_SIZE.
-
-    Returns
-    -------
-    array (n,)
-        Share detected, of the faults on each state; NaN without a verdict.
-    array (n,)
-        Median time to the alarm, s.
-    """
-    times = _times(parts, (rules,) if isinstance(rules, AlarmRule) else rules, size, (1.0, -1.0))
-    return _shares(times), np.array([np.median(t) if t else np.nan for t in times])
-
-
-def _shares(times: Sequence[Sequence[float]]) -> Array:
-    return np.array([np.mean(np.isfinite(t)) if t else np.nan for t in times])
-
-
-def _times(parts: Sequence[Part], rules: Sequence[Rule], size: float, signs: Sequence[float]) -> list[list[float]]:
-    """Time from each fault on each state to the alarm, s; a sign of 0 stands for one that changes at random."""
-    n = parts[0].utilisation.shape[1]
-    times: list[list[float]] = [[] for _ in range(n)]
-    starts = max(1, min(STARTS, _TRIALS // len(parts)))
-    looks = any(rule.kind != "containment" or rule.horizon > 1 for rule in rules)
-    most = int(max(200, _VERDICTS / (starts * len(parts) * n * n * len(signs)))) if looks else None
-    for part in parts:
-        K = part.judged
-        if K == 0:
-            continue
-        clock = np.cumsum(part.dt)
-        table = part.table if looks else part.utilisation[:, None]
-        anyway = _alarm(part, rules, table, 0)  # alarms that are not the fault's
-        rng = np.random.default_rng(0)
-        for start in sorted({int(s) for s in np.linspace(0, max(K - 1, 0), starts + 1)[:-1]}):
-            first, stop = 0, K
-            if most is not None:
-                first, stop = max(0, start - _memory(part, rules)), min(K, start + most)
-            for i in range(n):
-                for sign in signs:
-                    moved = table[first:stop].copy()
-                    shift = rng.choice([-1.0, 1.0], stop - start) if sign == 0.0 else np.full(stop - start, sign)
-                    _add_fault(part, moved[start - first :], start, i, size * shift, looks)
-                    alarm = _alarm(part, rules, moved, first)
-                    seen = np.flatnonzero(alarm[start - first :] & ~anyway[start:stop])
-                    before = clock[start] - part.dt[start]
-                    times[i].append(float(clock[start + seen[0]] - before) if len(seen) else math.inf)
-    return times
-
-
-def _add_fault(part: Part, table: Array, start: int, i: int, shift: Array, longer: bool) -> None:
-    """Move state i by `shift` mean widths in each step from the verdict `start` on, in the rows of the table."""
-    # one mean width is 2 mean half-widths; half_k follows from the sample's own width
-    table[:, 0, i] += 2.0 * shift * part.narrowness[start : start + len(table), i]
-    model = part.judged_by
-    if not longer or model is None:
-        return
-    width = float(part.mean_width[i] / model.operating_point.X[i])
-    first = residual_row(model)
-    table[:, first, i] += shift * width
-    dt = float(np.median(part.dt))
-    kept = float(np.clip(1.0 + dt * np.mean(model.A[..., i, i]), 0.0, 1.0))  # of what was added, after one step
-    for j, horizon in enumerate(model.horizons):
-        weights = kept ** np.arange(horizon.steps)
-        added = np.convolve(shift, weights)[: len(shift)] * width
-        half = 0.5 * part.longer_width[j, i] / model.operating_point.X[i]
-        table[:, 1 + j, i] += added / max(half, 1e-300) if half == half else 0.0
-        table[:, first + 1 + j, i] += added
-
-
-def _memory(part: Part, rules: Sequence[Rule]) -> int:
-    """Verdicts before a fault that the rules still remember when it begins."""
-    dt = max(float(np.median(part.dt)), 1e-12)
-    windows = [rule.window if isinstance(rule, AlarmRule) else 3.0 * rule.window_s / dt for rule in rules]
-    return int(max(windows)) + 1
-
-
-def _alarm(part: Part, rules: Sequence[Rule], table: Array, first: int) -> NDArray[np.bool_]:
-    """The alarm of some rules over the verdicts of a part from `first` on, with the numbers of this table."""
-    stop = first + len(table)
-    found = np.zeros(len(table), dtype=bool)
-    one_step = containment(rules)
-    violated = np.abs(table[:, 0]).max(axis=1) > (one_step.margin if one_step else math.inf)
-    for a, b in part.spans:
-        a, b = max(a, first) - first, min(b, stop) - first
-        if a >= b:
-            continue
-        if len(rules) == 1 and one_step is not None:
-            found[a:b] = raised(violated[a:b], one_step)
-        else:
-            assert part.judged_by is not None
-            alarm = Alarm(rules, part.judged_by, np.ones(table.shape[2], dtype=bool))
-            found[a:b] = alarm.over(part.dt[first + a : first + b], violated[a:b], table[a:b])[0]
-    return found
 
 
 def _refusal(candidates: Sequence[Candidate], target: float, hours: float, needed: float) -> str:
@@ -478,7 +364,7 @@ def _refusal(candidates: Sequence[Candidate], target: float, hours: float, neede
         )
     best = min(candidates, key=lambda c: c.upper)
     return (
-        f"no alarm rule can be shown to stay below {target:g} false alarms per hour: even at {MARGINS[0]:g} times the "
-        f"half-widths, {best.violations} of {best.window} verdicts raise {best.alarms} alarms in {hours:.3g} h left "
+        f"no alarm rule can be shown to stay below {target:g} false alarms per hour: even at {FACTORS[0]:g} times the "
+        f"half-widths, {best.family.words} raises {best.alarms} alarms in {hours:.3g} h left "
         f"out (limit {best.upper:.3g} per hour); look at what leaves the envelope so far, or choose a higher target"
     )

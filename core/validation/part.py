@@ -38,8 +38,6 @@ class Part:
         Step of each judged transition, s.
     utilisation : array (K, n)
         (x_next - centre) / half of every judged transition.
-    narrowness : array (K, n)
-        Mean half-width over half-width.
     starts : tuple of int
         Positions at which the alarm restarts: 0, and after every step back in time.
     violations : array (n,) of int
@@ -79,7 +77,6 @@ class Part:
     name: str
     dt: Array
     utilisation: Array
-    narrowness: Array
     starts: tuple[int, ...]
     violations: NDArray[np.intp]
     violated: int
@@ -216,7 +213,6 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         name,
         steps.dt,
         np.asarray(settled(utilisation, ~flags)),
-        np.ones(width.shape) if empty else width.mean(axis=0) / np.maximum(width, 1e-300),
         tuple(starts),
         flags.sum(axis=0),
         int(flags.any(axis=1).sum()),
