@@ -886,7 +886,7 @@ FAMILIES = (
 )
 MINE = (
     Drawn("ours, containment, one step", (OURS + ",",), "#6baed6", "containment"),
-    Drawn("ours, one rule", (OURS + ",",), "#08519c"),
+    Drawn("ours, best single rule", (OURS + ",",), "#08519c"),
     Drawn("ours, three rules armed together", (OURS + ",",), "#000000", "armed together"),
 )
 
@@ -925,11 +925,10 @@ def draw(reports: Sequence[Report], folder: Path) -> None:
                     continue
                 o = report.outcomes[name]
                 limits = np.sort(o.largest)[::-1]
-                label = family.label if family.contains or family in FAMILIES else name
                 ours = family in MINE
                 ax.step(
                     np.arange(len(limits)) / o.exposure, [early_share(o, limit) for limit in limits], where="post",
-                    color=family.colour, label=label, linewidth=2.2 if ours else 1.4, linestyle="-" if ours else "--",
+                    color=family.colour, label=family.label, linewidth=2.2 if ours else 1.4, linestyle="-" if ours else "--",
                 )  # fmt: skip
             ax.set_xscale("symlog", linthresh=report.linear)
             ax.set_xlim(0.0, report.most)
@@ -982,7 +981,7 @@ def draw_delays(report: Report, path: Path) -> None:
     ax.axvline(28, color="#999999", linewidth=0.8)
     ax.set_yticks(range(len(SHOWN)), SHOWN)
     ax.set_ylim(len(SHOWN) - 0.5, -0.5)
-    ax.set_xlabel("median time from the fault to the alarm, s; every detector at one false alarm per hour")
+    ax.set_xlabel("median time from the fault to the alarm, s; thresholds at one false alarm per hour")
     ax.set_title(
         f"{report.name.replace('Turbofan', 'Simulated turbofan')}: faults on manoeuvres that were not recorded"
     )
