@@ -928,7 +928,8 @@ def draw(reports: Sequence[Report], folder: Path) -> None:
                 ours = family in MINE
                 ax.step(
                     np.arange(len(limits)) / o.exposure, [early_share(o, limit) for limit in limits], where="post",
-                    color=family.colour, label=family.label, linewidth=2.2 if ours else 1.4, linestyle="-" if ours else "--",
+                    color=family.colour, label=family.label, linewidth=2.2 if ours else 1.4,
+                    linestyle="-" if ours else "--",
                 )  # fmt: skip
             ax.set_xscale("symlog", linthresh=report.linear)
             ax.set_xlim(0.0, report.most)
