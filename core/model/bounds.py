@@ -823,7 +823,13 @@ class Judge:
             left = left or unknown
         if self._cells and not left:
             left = self._unvisited()
-        self._ordered_sums()
+        self._ordered_sums(
+            cython.address(self._theta[0]),
+            cython.address(self._delta[0]),
+            cython.address(self._phi[0]),
+            cython.address(self._rate[0]),
+            cython.address(self._spread[0]),
+        )
         blank = array("d", self._blank)
         values: cython.double[::1] = blank
         x_next: cython.double
@@ -961,22 +967,23 @@ class Judge:
         return False
 
     @cython.cfunc
-    @cython.boundscheck(False)
-    @cython.wraparound(False)
     @cython.exceptval(check=False)
-    def _ordered_sums(self) -> cython.void:
+    def _ordered_sums(
+        self,
+        theta: cython.p_double,
+        delta: cython.p_double,
+        phi: cython.p_double,
+        rate: cython.p_double,
+        spread: cython.p_double,
+    ) -> cython.void:
         """`ordered_sum` of Theta phi and Delta |phi|: columns from first to last, the rows of one beside each other."""
         n: cython.Py_ssize_t = self.n
         i: cython.Py_ssize_t
         j: cython.Py_ssize_t
         value: cython.double
         size: cython.double
-        rate: cython.p_double = cython.address(self._rate[0])
-        spread: cython.p_double = cython.address(self._spread[0])
-        theta: cython.p_double = cython.address(self._theta[0])
-        delta: cython.p_double = cython.address(self._delta[0])
         for j in range(self.p):
-            value = self._phi[j]
+            value = phi[j]
             size = abs(value)
             if j == 0:
                 for i in range(n):
@@ -1198,7 +1205,7 @@ class Runs:
     _one_v: cython.double[::1]
     _rate: cython.double[::1]
     _spread: cython.double[::1]
-    _mean: cython.double[::1]
+    _phi: cython.double[::1]  # beyond the states and the mean controls 1
     _blank = cython.declare(object)
 
     def __init__(self, judge: Judge, horizons: Sequence[Any], runner: Judge | None = None) -> None:
@@ -1226,7 +1233,7 @@ class Runs:
             self._delta = _doubles(np.stack([delta for _, delta in columns]))
             self._v = _doubles(np.stack([v for *_, v in tables]))
             self._one_theta, self._one_delta = _doubles(np.zeros(n * judge.p)), _doubles(np.zeros(n * judge.p))
-            self._one_v, self._mean = _doubles(np.zeros(n)), _doubles(np.zeros(m or 1))
+            self._one_v, self._phi = _doubles(np.zeros(n)), _doubles(np.ones(judge.p))
             self._rate, self._spread = _doubles(np.zeros(n)), _doubles(np.zeros(n))
             self._blank = array("d", np.full(self.count * n, np.nan).tobytes())
             self.residuals = array("d", self._blank)
@@ -1364,8 +1371,10 @@ class Runs:
             if k < 0:
                 k += longest
             time = self._time[k]
+            for i in range(n):
+                self._phi[i] = self._start[i * longest + k]
             for j in range(m):
-                self._mean[j] = self._control[j * longest + k] / time
+                self._phi[n + j] = self._control[j * longest + k] / time
             i = h * judge.blocks
             if judge._axes:
                 self._blend(i, k, corners)
@@ -1375,17 +1384,13 @@ class Runs:
                 theta = cython.address(self._theta[i * n * judge.p])
                 delta = cython.address(self._delta[i * n * judge.p])
                 v = cython.address(self._v[i * n])
-            for j in range(judge.p):
-                value = self._start[j * longest + k] if j < n else self._mean[j - n] if j < n + m else 1.0
-                size = abs(value)
-                if j == 0:
-                    for i in range(n):
-                        self._rate[i] = theta[i] * value
-                        self._spread[i] = delta[i] * size
-                else:
-                    for i in range(n):
-                        self._rate[i] += theta[j * n + i] * value
-                        self._spread[i] += delta[j * n + i] * size
+            judge._ordered_sums(
+                theta,
+                delta,
+                cython.address(self._phi[0]),
+                cython.address(self._rate[0]),
+                cython.address(self._spread[0]),
+            )
             for i in range(n):
                 x_next = after[i]
                 x_next = normalised(x_next, judge._steady[i], judge._scale[i])
