@@ -47,6 +47,7 @@ def equal(one, two):
     assert one.sampling == two.sampling
     assert one.signals == two.signals
     assert np.array_equal(one.domain.x_min, two.domain.x_min)
+    assert np.array_equal(one.domain.step_max, two.domain.step_max)
     assert one.fit_summary["transitions"] == two.fit_summary["transitions"] and one.fit_summary["violations"] == 0
     for name, values in two.repeats.to_dict().items():
         assert one.repeats.to_dict()[name] == pytest.approx(values, rel=1e-6, abs=1e-9)

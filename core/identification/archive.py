@@ -32,6 +32,7 @@ from uncertain_lti.identification.regimes import Knots, scheduled_by
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.jumps import largest_steps
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.repeats import repeats_in, together
 from uncertain_lti.model.schedule import Schedule
@@ -205,7 +206,12 @@ def fit_archive(
         "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
     found = visit("repeats in", repeats, model)
-    return model.replace(fit_summary=facts, repeats=together(model.n, found))
+    step_max = np.max([largest for _, _, largest in found], axis=0)
+    return model.replace(
+        fit_summary=facts,
+        repeats=together(model.n, [(most, windows) for most, windows, _ in found]),
+        domain=replace(model.domain, step_max=step_max),
+    )
 
 
 def _sampled(recording: Recording, signals: SignalMap) -> Transient:
@@ -295,8 +301,8 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     )
 
 
-def repeats(recording: Recording, model: UncertainLTI) -> tuple[Array, Array]:
-    """What one recording has of exact repeats.
+def repeats(recording: Recording, model: UncertainLTI) -> tuple[Array, Array, Array]:
+    """What one recording has of exact repeats, and its largest steps.
 
     Parameters
     ----------
@@ -311,8 +317,11 @@ def repeats(recording: Recording, model: UncertainLTI) -> tuple[Array, Array]:
         As of `repeats_in`.
     array (windows, n)
         Likewise.
+    array (n,)
+        As of `largest_steps`.
     """
-    return repeats_in(model, _sampled(recording, model.signals))
+    transient = _sampled(recording, model.signals)
+    return *repeats_in(model, transient), largest_steps(model, [transient])
 
 
 def _constant_dt(recording: Recording, signals: SignalMap) -> bool:
