@@ -284,3 +284,16 @@ def test_an_installation_goes_on_without_cython_or_a_compiler_that_works(monkeyp
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "Cython", None)
         assert extensions(patch) == []
+
+
+def test_the_changelog_of_a_release_is_what_catkin_reads(package):
+    """Docutils finds no fault, and sections are versions with a date, or what is to come (REP-132)."""
+    convert = runpy.run_path(str(ROOT / "docs" / "changelog.py"))["to_rst"]
+    text = (ROOT / "CHANGELOG.md").read_text()
+    assert "\nForthcoming\n-----------\n* " in convert(text, package.findtext("name"))
+    released = convert(text.replace("(unreleased)", "(2026-01-31)"), package.findtext("name"))
+    assert "\n0.1.0 (2026-01-31)\n------------------\n* " in released
+    core = pytest.importorskip("docutils.core", reason="docutils comes with the extra docs")
+    tree = core.publish_doctree(released, settings_overrides={"report_level": 2, "halt_level": 2})
+    (section,) = [*tree.findall(lambda node: node.tagname == "bullet_list" and node.parent.tagname != "list_item")]
+    assert len(section.children) == len(re.findall(r"^- ", text, re.MULTILINE))
