@@ -17,11 +17,12 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import formulation, passes, row, solvers
+from uncertain_lti.identification import formulation, passes, products, row, solvers
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import Columns, Problem, assemble
+from uncertain_lti.identification.problem import Columns, Problem, Regimes, assemble
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import SUBSAMPLE
+from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.plants.leibov import leibov2006
 
 ADDITIVE = ("none", "disturbance", "noise", "both")
@@ -492,7 +493,7 @@ def test_judging_what_is_in_doubt_is_judging_everything():
         block = problem.block(slice(0, problem.N))
         every = passes._judged(block, model)
         for known in (np.zeros(problem.n), every.largest, np.nextafter(every.largest, 0.0)):
-            fast = passes._judged_in_doubt(block, model, known)
+            fast = passes._judged_in_doubt(block, model, known, None)
             if fast is not None:
                 decided += 1
                 outside += int(fast.outside.sum())
@@ -506,14 +507,76 @@ def test_judging_what_is_in_doubt_is_judging_everything():
     assert decided > 300 and outside > 1000
 
 
+def scheduled_sample(seed):
+    """As `judged_sample`, of a scheduled model: knots of one or two signals, or modes."""
+    rng = np.random.default_rng(seed)
+    n, m, N = int(rng.integers(2, 5)), int(rng.integers(1, 4)), int(rng.integers(300, 4000))
+    axes = [Axis("x1", knots=(-1.0, 0.1, 0.5, 1.0)), Axis("u1", knots=(-0.5, 0.5)), Axis("u1", modes=(0.0, 2.0))]
+    schedule = Schedule(((axes[0],), (axes[0], axes[1]), (axes[2],), (axes[0], axes[2]))[seed % 4])
+    R = schedule.blocks
+    arrays = [rng.normal(size=(R, n, n)), rng.normal(size=(R, n, m))]
+    arrays += [np.abs(a) * rng.choice([0, 1e-3, 1.0]) for a in arrays]
+    c, dc, v = rng.normal(size=(3, R, n)) * rng.choice([0, 1], size=(3, 1, 1))
+    model = UncertainLTI(*arrays, c=c, dc=np.abs(dc), v=np.abs(v), schedule=schedule)
+    z = rng.normal(size=(n + m, N))
+    if seed % 4 > 1:
+        z[n] = rng.choice([0.0, 2.0], size=N)
+    dt = np.full(N, 0.01) if seed % 3 else rng.uniform(0.005, 0.02, N)
+    centre, half = np.empty((2, n, N))
+    model.columns_centre_and_half(z, dt, centre, half)
+    x_next = centre + half * rng.uniform(-1, 1, centre.shape)
+    edge = rng.integers(0, N, 20)
+    x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
+    x_next[:, edge[:10]] = np.nextafter(x_next[:, edge[:10]], rng.choice([-np.inf, np.inf]))
+    nothing = np.zeros(N, dtype=np.intp)
+    names = [*(f"x{i + 1}" for i in range(n)), *(f"u{j + 1}" for j in range(m))]
+    regimes = Regimes(schedule, schedule.positions(names))
+    columns = Columns.of("both", bool(seed % 3), regimes)
+    weights = rng.uniform(0.5, 2, n) if seed % 5 else rng.uniform(0.5, 2, (N, n))
+    return model, Problem(z, x_next, dt, nothing, nothing, weights, columns)
+
+
+def test_judging_a_scheduled_model_in_doubt_is_judging_everything():
+    decided = outside = 0
+    for seed in range(1, 80):
+        model, problem = scheduled_sample(seed)
+        block = problem.block(slice(0, problem.N))
+        every, total = passes._judged(block, model), passes.judge(problem, model)
+        assert np.array_equal(total.outside, every.outside)
+        assert total.largest.tobytes() == every.largest.tobytes()
+        assert total.weighted.tobytes() == every.weighted.tobytes()
+        if problem.weights.ndim == 1:
+            fast = passes._judged_in_doubt(block, model, np.zeros(problem.n), problem.columns.regimes)
+            decided += fast is not None
+            outside += int(every.outside.sum())
+    assert decided > 20 and outside > 100
+
+
+def test_sums_over_the_blocks_that_hold_are_those_over_all_blocks():
+    for seed in range(1, 20):
+        _, problem = scheduled_sample(seed)
+        sums, _ = passes.moments(problem)
+        dt, step = problem.dt, problem.x_next - problem.z[:, : problem.n]
+        phi, psi = problem.phi() * dt[:, None], problem.psi() * dt[:, None]
+        main = problem.columns.regimes.main_block(problem.z.T, None)
+        assert sums.centre == pytest.approx(phi.T @ phi)
+        assert sums.target == pytest.approx(phi.T @ step)
+        assert sums.plain_gram == pytest.approx(psi.T @ psi)
+        assert sums.width_sum == pytest.approx(psi.sum(axis=0))
+        assert sums.visits.tolist() == np.bincount(main, minlength=problem.columns.count).tolist()
+        if problem.weights.ndim == 2:
+            for i in range(problem.n):
+                assert sums.gram[i] == pytest.approx((psi * problem.weights[:, [i]]).T @ psi)
+
+
 def test_products_are_those_of_whole_matrices():
     rng = np.random.default_rng(0)
     for rows, count in ((3, 1), (9, 511), (9, 20_000), (70, 5000), (1, 2049)):
         a, b = rng.standard_normal((rows, 2 * count))[:, ::2], rng.standard_normal((4, count))
-        np.testing.assert_allclose(passes._gram(a, b), a @ b.T, atol=1e-9)
-        np.testing.assert_allclose(passes._gram(b, b), b @ b.T, atol=1e-9)
+        np.testing.assert_allclose(products.gram_of(a, b), a @ b.T, atol=1e-9)
+        np.testing.assert_allclose(products.gram_of(b, b), b @ b.T, atol=1e-9)
         M = rng.standard_normal((5, rows))
-        np.testing.assert_allclose(passes._product(M, a), M @ a, atol=1e-12)
+        np.testing.assert_allclose(products.product(M, a), M @ a, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(5))

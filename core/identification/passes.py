@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
-from uncertain_lti.identification.problem import Block, Columns, Partition, scaled_eigenvalues
+from uncertain_lti.identification.cells import Cells, Whole
+from uncertain_lti.identification.problem import Block, Columns, Partition, Regimes, scaled_eigenvalues
+from uncertain_lti.identification.products import gram_of, product
 from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of
 
 
@@ -153,49 +155,17 @@ _FEW_ALL = 20_000
 """Transitions up to which a scan spends its time elsewhere."""
 _EPS, _TINY = float(np.finfo(np.float64).eps), 1e-290
 """Relative rounding of one operation, twice; and more than underflow can add up to."""
-_SINGLE_THREADED = 2**18
-"""Multiplications up to which OpenBLAS keeps a product on one thread; waking the others costs more, for narrow ones."""
 
 
 def _pieces(part: Partition) -> Iterator[Block]:
     """All transitions, in pieces of a size that suits the cache."""
-    most = max(_PIECE // (part.p * part.columns.count + part.n), 2048)
+    most = max(_PIECE // (part.p + part.n), 2048)
     for block in part.blocks():
         if len(block) <= most:
             yield block
             continue
         for start in range(0, len(block), most):
             yield block.piece(start, start + most)
-
-
-def _stacked(columns: Array, width: int) -> Array:
-    """(r, K) as a stack (K / width, r, width), without a copy."""
-    rows, count = columns.shape
-    return columns.reshape(rows, count // width, width).transpose(1, 0, 2)
-
-
-def _gram(a: Array, b: Array) -> Array:
-    """a bᵀ, (r, s), of columns (r, K) and (s, K), on one thread where they are narrow."""
-    count = a.shape[1]
-    width = max(_SINGLE_THREADED // (len(a) * len(b)), 512)
-    whole = count - count % width
-    total: Array = a[:, whole:] @ b[:, whole:].T
-    if whole:
-        total = total + (_stacked(a[:, :whole], width) @ _stacked(b[:, :whole], width).transpose(0, 2, 1)).sum(axis=0)
-    return total
-
-
-def _product(matrix: Array, columns: Array) -> Array:
-    """matrix (s, r) @ columns (r, K), on one thread if it is narrow."""
-    count = columns.shape[1]
-    width = max(_SINGLE_THREADED // matrix.size, 512)
-    whole = count - count % width
-    total = np.empty((len(matrix), count))
-    if whole:
-        np.matmul(matrix, _stacked(columns[:, :whole], width), out=_stacked(total[:, :whole], width))
-    if whole < count:
-        np.matmul(matrix, columns[:, whole:], out=total[:, whole:])
-    return total
 
 
 def occupied(partition: Partition, least: Array, greatest: Array, cells: int, stride: int) -> NDArray[np.bool_]:
@@ -264,45 +234,43 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
             first = -(block.start + offset) % stride
             sampled.append(block.every(first, stride))
             index.append(np.arange(first, len(block), stride) + (block.start + offset))
+        cells = Whole() if columns.regimes is None else Cells.of(columns.regimes, block)
+        block = cells.sort(block)
         # a constant step goes into the sums
         constant = bool((block.dt == block.dt[0]).all())
         unit = float(block.dt[0]) if constant else 1.0
-        phi = block.phi(columns) if constant else block.phi(columns) * block.dt
-        if columns.regimes is None:
-            psi = np.empty((q, len(block)))
-            np.abs(phi[:p], out=psi[:p])  # Δt > 0
-            for row, term in zip(psi[p:], columns.half, strict=True):
-                row[:] = (block.dt if term.times_dt else 1.0) / unit
-            visits = np.array([len(block)])
-        else:
-            psi = block.psi(columns) if constant else block.psi(columns) * block.dt
-            largest = columns.regimes.main_block(block.z, block.s)
-            visits = np.bincount(largest, minlength=columns.count)
+        plain = columns.plain_phi(block.z)
+        plain = plain if constant else plain * block.dt
+        own = np.empty((p + len(columns.half), len(block)))
+        np.abs(plain[:p], out=own[:p])  # Δt > 0
+        for row, term in zip(own[p:], columns.half, strict=True):
+            row[:] = (block.dt if term.times_dt else 1.0) / unit
+        phi, psi = cells.spread(plain), cells.spread(own)
         step = block.x_next - block.origin
         weights = block.weights
-        gram = np.stack([_gram(psi * weights[:, i], psi) for i in range(n)]) if weights.ndim == 2 else None
+        gram = np.stack([cells.gram(psi, weights[:, i]) for i in range(n)]) if weights.ndim == 2 else None
         coupled = None
         if weights.ndim == 3:
             parts = np.empty((n, q, n, q))
             for i in range(n):
                 for j in range(i, n):
-                    parts[i, :, j] = _gram(psi * weights[:, i, j], psi)
+                    parts[i, :, j] = cells.gram(psi, weights[:, i, j])
                     parts[j, :, i] = parts[i, :, j].T
             coupled = parts.reshape(n * q, n * q)
         found = Moments(
-            _gram(psi, psi) * unit**2,
+            cells.gram(psi) * unit**2,
             None if gram is None else gram * unit**2,
             None if coupled is None else coupled * unit**2,
-            _gram(phi, phi) * unit**2,
-            _gram(phi, step) * unit,
+            cells.gram(phi) * unit**2,
+            cells.against(phi, step) * unit,
             np.einsum("ik,ik->i", step, step),
-            psi.sum(axis=1) * unit,
+            cells.total(psi) * unit,
             block.z.min(axis=1),
             block.z.max(axis=1),
             float(block.dt.min()),
             float(block.dt.max()),
             len(block),
-            visits,
+            cells.visits(len(block)),
         )
         sums = found if sums is None else sums + found
     if sums is None:
@@ -479,32 +447,38 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
 
     halves = shifted()
     for block in _pieces(part):
-        psi = block.psi(columns)
+        cells = None if columns.regimes is None else Cells.of(columns.regimes, block)
+        some = block if cells is None else cells.sort(block)
+        times = product if cells is None else cells.product
         # a constant step goes into the elements, unless the transitions are too few for it to save time
         step = float(block.dt[0]) if part.N > _FEW_ALL and (block.dt == block.dt[0]).all() else None
-        if columns.regimes is not None:
-            residual = _product(theta * (step or 1.0), block.phi(columns))
+        if cells is not None:
+            residual = cells.product(theta * (step or 1.0), columns.plain_phi(some.z))
         else:
-            residual = _product(theta[:, :p] * (step or 1.0), block.z)
+            residual = product(theta[:, :p] * (step or 1.0), block.z)
             if columns.drift:
                 residual += theta[:, p:] * (step or 1.0)
-        rate = block.x_next[rows] - block.origin[rows]
+        rate = some.x_next[rows] - some.origin[rows]
         if not step:
-            rate /= block.dt
+            rate /= some.dt
         residual -= rate
         np.abs(residual, out=residual)
-        half = _product(halves * (step or 1.0), psi)
+        half = times(halves * (step or 1.0), columns.plain_psi(some.z, some.dt))
         below = residual > half[:n]
         if candidate.limit is not None:
             width = half[n:]
             if not step:
-                width *= block.dt
-            root = block.root_weights()
+                width *= some.dt
+            root = some.root_weights()
             below |= width > candidate.limit[:, None] / (2.0 * (root if len(root) == 1 else root[rows]))
         chosen = np.flatnonzero(below)
+        distance = residual.ravel()[chosen] / (step or 1.0)
+        if cells is not None:
+            chosen, sorting = cells.before(chosen)
+            distance = distance[sorting]
         if not len(chosen):
             continue
-        found.append(_near(candidate, block, columns, chosen, residual.ravel()[chosen] / (step or 1.0), offset))
+        found.append(_near(candidate, block, columns, chosen, distance, offset))
         kept += np.bincount(found[-1].row, minlength=n)
         if (kept > 2 * candidate.most).any():
             near = _Near.join(found)
@@ -660,8 +634,8 @@ def judge(part: Partition, model: Envelope) -> Judged:
     zeros = np.zeros(part.n)
     total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
     for block in _pieces(part):
-        quick = block.weights.ndim == 1 and part.columns.regimes is None
-        found = _judged_in_doubt(block, model, total.largest) if quick else None
+        quick = block.weights.ndim == 1
+        found = _judged_in_doubt(block, model, total.largest, part.columns.regimes) if quick else None
         total = total + (found or _judged(block, model))
     return total
 
@@ -694,7 +668,7 @@ def _centre_and_half(model: Envelope, block: Block) -> tuple[Array, Array]:
     return centre, half
 
 
-def _judged_in_doubt(block: Block, model: Envelope, known: Array) -> Judged | None:
+def _judged_in_doubt(block: Block, model: Envelope, known: Array, regimes: Regimes | None) -> Judged | None:
     """`_judged` to the bit, from the transitions alone that the rounding of a faster arithmetic leaves in doubt.
 
     A transition that is inside, or narrower than the widest, by more than any order of the sums can differ is so by the
@@ -709,24 +683,32 @@ def _judged_in_doubt(block: Block, model: Envelope, known: Array) -> Judged | No
         The model, or a horizon.
     known : array (n,)
         Widths that were found already; transitions that are narrower need not be judged.
+    regimes : Regimes or None
+        The schedule of the model.
 
     Returns
     -------
     Judged or None
         None where the doubt is not worth the trouble; widths are 0 where none is larger than what was known.
     """
-    nominal, spread, v = model.tables
+    tables = model.tables
+    cells = None if regimes is None else Cells.of(regimes, block)
+    block = block if cells is None else cells.sort(block)
+    # blended elements are no larger than those of the blocks
+    nominal, spread, v = tables if cells is None else (np.abs(table).max(axis=0) for table in tables)
     n, p = block.n, len(block.z)
     drift, steady = nominal[:, p:].sum(axis=1), spread[:, p:].sum(axis=1)  # beyond z the regressors are 1
     longest = float(block.dt.max())
     psi = np.abs(block.z)
     most = psi.max(axis=1)
-    constant = float(block.dt.min()) == longest
+    constant = cells is None and float(block.dt.min()) == longest
     widest, floor = longest * (spread[:, :p] @ most), v
     if constant:
         floor = longest * steady + v
     else:
         widest = widest + longest * steady
+    if cells is not None:
+        widest, floor = widest + v, np.zeros(n)
     size = longest * (np.abs(nominal[:, :p]) @ most + np.abs(nominal[:, p:]).sum(axis=1)) + widest + floor
     size += most[:n] if block.base is None else np.abs(block.base).max(axis=1)
     relative = 8.0 * (p + 8) * _EPS
@@ -735,18 +717,26 @@ def _judged_in_doubt(block: Block, model: Envelope, known: Array) -> Judged | No
         return None
     if constant:  # the step goes into the elements
         own = np.eye(n, p) if block.base is None else 0.0
-        distance = _product(nominal[:, :p] * longest + own, block.z)
-        half = _product(spread[:, :p] * longest, psi)
+        distance = product(nominal[:, :p] * longest + own, block.z)
+        half = product(spread[:, :p] * longest, psi)
         if drift.any():
             distance += (drift * longest)[:, None]
     else:
-        distance, half = _product(nominal[:, :p], block.z), _product(spread[:, :p], psi)
-        distance += drift[:, None]
+        if cells is None:
+            distance, half = product(nominal[:, :p], block.z), product(spread[:, :p], psi)
+            distance += drift[:, None]
+            half += steady[:, None]
+        else:
+            nominal, spread = (table.transpose(1, 0, 2).reshape(n, -1) for table in tables[:2])
+            ones = np.ones((tables[0].shape[2] - p, len(block)))
+            distance = cells.product(nominal, np.vstack([block.z, ones]))
+            half = cells.product(spread, np.vstack([psi, ones]))
         distance *= block.dt
+        half *= block.dt
         if block.base is None:
             distance += block.z[:n]
-        half += steady[:, None]
-        half *= block.dt
+        if cells is not None:
+            half += cells.product(tables[2].T, np.ones((1, len(block))))
     if block.base is not None:
         distance += block.base
     distance -= block.x_next
@@ -795,7 +785,7 @@ def residual_sums(part: Partition, model: Envelope) -> tuple[Array, Array]:
     for block in _pieces(part):
         r = block.x_next - _centre_and_half(model, block)[0]
         total += r.sum(axis=1)
-        products += _gram(r, r)
+        products += gram_of(r, r)
     return total, products
 
 
@@ -820,8 +810,10 @@ def block_widths(part: Partition, d: Array) -> tuple[Array, Array]:
     assert columns.regimes is not None
     total, largest = np.zeros((columns.count, part.n)), np.zeros((columns.count, part.n))
     for block in _pieces(part):
-        width = _product(np.ascontiguousarray(2.0 * d.T), block.psi(columns)) * block.dt
-        which = columns.regimes.main_block(block.z, block.s)
+        cells = Cells.of(columns.regimes, block)
+        block = cells.sort(block)
+        width = cells.product(np.ascontiguousarray(2.0 * d.T), columns.plain_psi(block.z, block.dt)) * block.dt
+        which = cells.main_blocks
         for r in np.unique(which):
             own = width[:, which == r]
             total[r] += own.sum(axis=1)

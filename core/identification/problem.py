@@ -190,8 +190,22 @@ class Columns:
         array (r, K)
             φ / Δt.
         """
-        phi = np.vstack([z, np.ones((len(self.nominal), z.shape[1]))]) if self.nominal else z
-        return self._weighted(phi, z, s)
+        return self._weighted(self.plain_phi(z), z, s)
+
+    def plain_phi(self, z: Array) -> Array:
+        """`phi` of one block, without its weight.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+
+        Returns
+        -------
+        array (r / R, K)
+            z, and 1 for each additive term.
+        """
+        return np.vstack([z, np.ones((len(self.nominal), z.shape[1]))]) if self.nominal else z
 
     def psi(self, z: Array, dt: Array, s: Array | None) -> Array:
         """Regressors ψ of the half-width: |z|, and for each additive term 1 or, if Δt does not multiply it, 1/Δt.
@@ -210,12 +224,29 @@ class Columns:
         array (q, K)
             ψ / Δt; of R blocks, each times its weight.
         """
+        return self._weighted(self.plain_psi(z, dt), z, s)
+
+    def plain_psi(self, z: Array, dt: Array) -> Array:
+        """`psi` of one block, without its weight.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        dt : array (K,)
+            Δt, s.
+
+        Returns
+        -------
+        array (q / R, K)
+            |z|, and 1 or 1 / Δt for each additive term.
+        """
         p = len(z)
         psi = np.empty((p + len(self.half), z.shape[1]))
         np.abs(z, out=psi[:p])
         for row, term in zip(psi[p:], self.half, strict=True):
             row[:] = 1.0 if term.times_dt else 1.0 / dt
-        return self._weighted(psi, z, s)
+        return psi
 
     def _weighted(self, base: Array, z: Array, s: Array | None) -> Array:
         """w(s) ⊗ base."""

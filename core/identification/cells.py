@@ -1,0 +1,340 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Transitions of a scheduled fit sorted by the blocks that hold, so that the others cost nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.identification.problem import Block, Regimes
+from uncertain_lti.identification.products import gram_of, product
+
+
+class Whole:
+    """Transitions of a model with one block, as they are; the sums of `Cells` for them."""
+
+    def sort(self, block: Block) -> Block:
+        """As of `Cells`.
+
+        Parameters
+        ----------
+        block : Block
+            The transitions.
+
+        Returns
+        -------
+        Block
+            The same.
+        """
+        return block
+
+    def spread(self, columns: Array) -> list[Array]:
+        """As of `Cells`.
+
+        Parameters
+        ----------
+        columns : array (r, K)
+            Regressors.
+
+        Returns
+        -------
+        list of array (r, K)
+            All of them.
+        """
+        return [columns]
+
+    def gram(self, a: list[Array], factor: Array | None = None) -> Array:
+        """As of `Cells`.
+
+        Parameters
+        ----------
+        a : list of array
+            Of `spread`.
+        factor : array (K,), optional
+            Of each transition; default 1.
+
+        Returns
+        -------
+        array (r, r)
+            Sum.
+        """
+        return gram_of(a[0] if factor is None else a[0] * factor, a[0])
+
+    def against(self, a: list[Array], columns: Array) -> Array:
+        """As of `Cells`.
+
+        Parameters
+        ----------
+        a : list of array
+            Of `spread`.
+        columns : array (s, K)
+            Others.
+
+        Returns
+        -------
+        array (r, s)
+            Sum.
+        """
+        return gram_of(a[0], columns)
+
+    def total(self, a: list[Array]) -> Array:
+        """As of `Cells`.
+
+        Parameters
+        ----------
+        a : list of array
+            Of `spread`.
+
+        Returns
+        -------
+        array (r,)
+            Sum.
+        """
+        total: Array = a[0].sum(axis=1)
+        return total
+
+    def visits(self, count: int) -> NDArray[np.intp]:
+        """As of `Cells`.
+
+        Parameters
+        ----------
+        count : int
+            Number of transitions.
+
+        Returns
+        -------
+        array (1,) of int
+            The same.
+        """
+        return np.array([count])
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Which blocks hold at some transitions, those of the same blocks side by side.
+
+    Between knots two blocks of each scheduling signal hold, in a mode one: of w(s) ⊗ z, with w the weights of all
+    blocks, the rest is zero, and is neither built nor multiplied.
+
+    Parameters
+    ----------
+    order : array (K,) of int
+        Where each transition was before they were sorted.
+    parts : tuple of (slice, array (C,) of int)
+        Transitions side by side, and the blocks that hold at them.
+    weights : array (C, K)
+        Of these blocks, sorted.
+    count : int
+        Number of all blocks, R.
+    """
+
+    order: Index
+    parts: tuple[tuple[slice, Index], ...]
+    weights: Array
+    count: int
+
+    @classmethod
+    def of(cls, regimes: Regimes, block: Block) -> Cells:
+        """Sort transitions.
+
+        Parameters
+        ----------
+        regimes : Regimes
+            The schedule.
+        block : Block
+            The transitions.
+
+        Returns
+        -------
+        Cells
+            Which blocks hold.
+        """
+        places, weights = regimes.schedule.corners(regimes.vectors(block.z, block.s))
+        first = places[0].astype(np.int16)  # the first block tells the others; short numbers are sorted by digits
+        order = np.argsort(first, kind="stable")
+        ends = np.cumsum(np.bincount(first, minlength=regimes.schedule.blocks))
+        starts = np.concatenate([[0], ends[:-1]])
+        parts = tuple(
+            (slice(int(start), int(end)), places[:, order[start]])
+            for start, end in zip(starts, ends, strict=True)
+            if start < end
+        )
+        return cls(order, parts, weights[:, order], regimes.schedule.blocks)
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def sort(self, block: Block) -> Block:
+        """The transitions in its order.
+
+        Parameters
+        ----------
+        block : Block
+            Those it was made of.
+
+        Returns
+        -------
+        Block
+            A copy.
+        """
+        return block.take(self.order)
+
+    def before(self, chosen: Index) -> tuple[Index, Index]:
+        """Where some transitions of several rows were before they were sorted.
+
+        Parameters
+        ----------
+        chosen : array (k,) of int
+            Row x K + position, sorted.
+
+        Returns
+        -------
+        array (k,) of int
+            Row x K + position before, in increasing order.
+        array (k,) of int
+            Which of `chosen` each of them is.
+        """
+        row, k = np.divmod(chosen, len(self))
+        found = row * len(self) + self.order[k]
+        sorting = np.argsort(found)
+        return found[sorting], sorting
+
+    def product(self, matrix: Array, columns: Array) -> Array:
+        """matrix @ (w(s) ⊗ columns).
+
+        Parameters
+        ----------
+        matrix : array (s, R r)
+            Elements of all blocks, those of the first block first.
+        columns : array (r, K)
+            Regressors of one block, sorted.
+
+        Returns
+        -------
+        array (s, K)
+            Sorted.
+        """
+        rows, (r, count) = len(matrix), columns.shape
+        elements = matrix.reshape(rows, self.count, r).transpose(1, 0, 2)
+        total = np.empty((rows, count))
+        for part, blocks in self.parts:
+            each = product(elements[blocks].reshape(-1, r), columns[:, part])
+            each = each.reshape(len(blocks), rows, -1)
+            each *= self.weights[:, None, part]
+            each.sum(axis=0, out=total[:, part])
+        return total
+
+    def spread(self, columns: Array) -> list[Array]:
+        """The part of w(s) ⊗ columns that is not zero.
+
+        Parameters
+        ----------
+        columns : array (r, K)
+            Regressors of one block, sorted.
+
+        Returns
+        -------
+        list of array (C r, k)
+            Of each part those of the blocks that hold.
+        """
+        return [
+            (self.weights[:, None, part] * columns[:, part]).reshape(-1, part.stop - part.start)
+            for part, _ in self.parts
+        ]
+
+    def gram(self, a: list[Array], factor: Array | None = None) -> Array:
+        """Sum over the transitions of the products of weighted columns.
+
+        Parameters
+        ----------
+        a : list of array
+            Of `spread`.
+        factor : array (K,), optional
+            Of each transition, sorted; default 1.
+
+        Returns
+        -------
+        array (R r, R r)
+            (w ⊗ columns)(w ⊗ columns)ᵀ, which is zero but for blocks that hold together.
+        """
+        r, held = len(a[0]) // len(self.weights), len(self.weights)
+        total = np.zeros((self.count, r, self.count, r))
+        for (part, blocks), columns in zip(self.parts, a, strict=True):
+            found = gram_of(columns if factor is None else columns * factor[part], columns)
+            total[blocks[:, None], :, blocks[None, :]] += found.reshape(held, r, held, r).transpose(0, 2, 1, 3)
+        return total.reshape(self.count * r, self.count * r)
+
+    def against(self, a: list[Array], columns: Array) -> Array:
+        """Sum over the transitions of the products of weighted columns with others.
+
+        Parameters
+        ----------
+        a : list of array
+            Of `spread`.
+        columns : array (s, K)
+            Sorted.
+
+        Returns
+        -------
+        array (R r, s)
+            (w ⊗ columns of a) columnsᵀ.
+        """
+        r = len(a[0]) // len(self.weights)
+        total = np.zeros((self.count, r, len(columns)))
+        for (part, blocks), weighted in zip(self.parts, a, strict=True):
+            total[blocks] += gram_of(weighted, columns[:, part]).reshape(len(blocks), r, -1)
+        return total.reshape(self.count * r, -1)
+
+    def total(self, a: list[Array]) -> Array:
+        """Sum of weighted columns over the transitions.
+
+        Parameters
+        ----------
+        a : list of array
+            Of `spread`.
+
+        Returns
+        -------
+        array (R r,)
+            Σ w ⊗ columns.
+        """
+        r = len(a[0]) // len(self.weights)
+        total = np.zeros((self.count, r))
+        for (_, blocks), weighted in zip(self.parts, a, strict=True):
+            total[blocks] += weighted.sum(axis=1).reshape(len(blocks), r)
+        return total.reshape(-1)
+
+    @property
+    def main_blocks(self) -> NDArray[np.intp]:
+        """The block of the largest weight at each transition, of two alike the first, (K,), sorted."""
+        largest = np.argmax(self.weights, axis=0)
+        found = np.empty(len(self), dtype=np.intp)
+        for part, blocks in self.parts:
+            found[part] = blocks[largest[part]]
+        return found
+
+    def visits(self, count: int) -> NDArray[np.intp]:
+        """Of how many transitions each block has the largest weight.
+
+        Parameters
+        ----------
+        count : int
+            Number of transitions.
+
+        Returns
+        -------
+        array (R,) of int
+            They add up to that number.
+        """
+        return np.bincount(self.main_blocks, minlength=self.count)
