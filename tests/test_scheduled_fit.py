@@ -195,6 +195,28 @@ def test_large_problem_reaches_the_same_optimum(criterion):
     assert outside_normalised(model, transient) == 0
 
 
+def test_five_knots_reach_the_least_largest_width_and_its_ties():
+    """With fifty unknowns per row: the least largest width, and among its optima the least squared widths."""
+    schedule = Schedule((Axis("u1", knots=(-1, -0.5, 0, 0.5, 1)),))
+    transient = drawn(THREE, 1000, 6, noise=1e-4)
+    model = fit(transient, "lp", additive="both", schedule=schedule)
+    assert model.fit_summary["optimality_gap"] < 1e-7
+    assert "PIQP" not in model.fit_summary["solver"]["names"]
+    assert outside_normalised(model, transient) == 0
+    steps = transient.transitions()
+    lower, upper = model.bounds(steps.x, steps.u, steps.dt, s=steps.s)
+    problem = written(transient, schedule, "both")
+    phi, psi = (columns * problem.dt[:, None] for columns in (problem.phi(), problem.psi()))
+    phi, psi = (columns / np.abs(columns).max(axis=0) for columns in (phi, psi))
+    for half, step in zip(0.5 * (upper - lower).T, (problem.rate() * problem.dt[:, None]).T, strict=True):
+        unit = np.sqrt(np.mean(step**2))
+        theta, d = cp.Variable(phi.shape[1]), cp.Variable(psi.shape[1], nonneg=True)
+        room = [cp.abs(step / unit - phi @ theta) <= psi @ d, psi @ d <= half.max() / unit * (1 + 1e-8)]
+        squares = cp.Problem(cp.Minimize(cp.sum_squares(psi @ d) / len(step)), room)
+        squares.solve(cp.CLARABEL)
+        assert np.mean(half**2) / unit**2 < 1.001 * squares.value
+
+
 def test_a_piecewise_linear_plant_is_recovered():
     transient = drawn(SCHEDULES["further"], 2000, 5, spread=0.0)
     rng = np.random.default_rng(5)

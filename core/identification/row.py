@@ -48,14 +48,16 @@ REGULARISATION = 1e-4
 """Weight of the squared widths relative to δ in (11), for a solver of strictly convex programmes.
 
 With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
-of the squared widths. Whether it was is seen from the optimum of δ alone, at the end.
+of the squared widths. Whether it was is seen from the optimum of δ alone, at the end. With the unknowns of many blocks
+it seldom is small enough, so they are left to the simplex method at once.
 """
-NEAR = 2e-6
-"""Distance from the optimum of (11), relative, up to which a row with many blocks is left as it is if a smaller weight
-leads to no answer: to break the ties of that many unknowns among the exact optima takes minutes."""
-LEAST_REGULARISATION = 1e-9
-"""Weight below which it is left to the simplex method and to a programme of the ties of their own."""
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
+_HELD = 6
+"""Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
+_RIDGE = 1e-9
+"""Share of the largest weight with which the ties of (11) hold on to the vertex where nothing else decides."""
+_ROOM = (1e-10, 3e-9, 3e-8)
+"""Violation, in scaled units, that the ties of (11) may leave, by attempt: the set of optima can be as thin as that."""
 JOIN = 48  # samples that join a working set per round, at least; more if there are many unknowns
 
 
@@ -210,10 +212,8 @@ class Row:
         self.samples = Samples.join([], len(sums.low))
         self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
         self.limit: float | None = None  # δ of (11) in units of scale x width_unit
-        self.exact = False  # (11) by the simplex method
-        self.regularisation = REGULARISATION
-        self.near: tuple[Array, Array, float | None, float] | None = None  # θ, d, limit and δ of an answer that will do
-        self.done = False  # and nothing better was found
+        self.exact = sums.visits.size > 1  # (11) by the simplex method
+        self.least = 0.0  # δ of (11) that it found, in the same units as the limit
         self._forget()
 
     def _forget(self) -> None:
@@ -639,9 +639,9 @@ class Row:
 
         def objective(factor: float, ridge: float) -> tuple[Array, Array]:
             H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
-            whole = self.regularisation * np.eye(size + 1)
-            whole[:size, :size] = self.regularisation * H
-            return whole, np.append(self.regularisation * f, 1.0)
+            whole = REGULARISATION * np.eye(size + 1)
+            whole[:size, :size] = REGULARISATION * H
+            return whole, np.append(REGULARISATION * f, 1.0)
 
         answer, solver = self._solve(
             "regularised",
@@ -651,7 +651,6 @@ class Row:
             np.append(self.upper, np.inf),
         )
         self._store_limited(answer)
-        self._active["bounded"] = np.delete(self._active["regularised"], size)  # all but δ
         return solver
 
     def solve_linear(self) -> str:
@@ -667,14 +666,32 @@ class Row:
         FitError
             There is no optimum.
         """
-        if self._simplex is None:
+        G, h = self._rows(self.pool)
+        number = 3 * np.tile(self.samples.index[self.pool], 3) + np.repeat(np.arange(3), len(self.pool))
+        if self._simplex is None:  # of each sample the side that it is on, and its width
             self._simplex = self._minimax()
-        index = self.samples.index[self.pool]
-        fresh = self.pool[~np.isin(index, self._known)]
-        if len(fresh):
-            self._simplex.add(*self._rows(fresh))
-            self._known = index
-        answer = self._simplex.solve()
+            theta, d = self.scaled()
+            away = self.plain_phi[self.pool] @ theta - self.y[self.pool]
+            half = self.psi[self.pool] @ d + self.half[self.pool]
+            outside = np.concatenate([away + half, half - away]) < 0.0
+            wanted = np.concatenate([outside, outside.reshape(2, -1).any(axis=0)])
+        else:
+            wanted = G @ self._simplex.solution() - h < -TOLERANCE
+            idle = self._simplex.idle(_HELD * (self.r + self.q))
+            idle = idle[idle >= len(self.asked)]  # those come first, and stay
+            if len(idle):
+                self._simplex.drop(idle)
+                self._known = np.delete(self._known, idle - len(self.asked))
+        while True:  # of a sample few have more than one row that matters
+            wanted &= ~np.isin(number, self._known)
+            if wanted.any():
+                self._simplex.add(G[wanted], h[wanted])
+                self._known = np.concatenate([self._known, number[wanted]])
+            answer = self._simplex.solve()
+            wanted = G @ answer - h < -TOLERANCE
+            if not (wanted & ~np.isin(number, self._known)).any():
+                break
+        self.least = float(answer[-1])
         self._store_limited(answer)
         return "HiGHS simplex"
 
@@ -735,11 +752,26 @@ class Row:
         value = max(self.value(d), self.least_value())
         weight = factor * TIE_BREAK * float(np.diagonal(self.gram).min(initial=1.0))
         spread = max(float(d @ self.plain @ d), 0.0)
-        smallest = float(np.linalg.eigvalsh(self.centre)[0]) if self.r else 1.0
+        smallest = self._least_effect()
         largest = (self.rms_step / self.scale + np.sqrt(spread) + float(np.abs(self.half).max(initial=0.0))) ** 2
         lifted = 0.5 * weight * ridge * 4.0 * largest / smallest if smallest > 1e-13 else np.inf
         ties = factor * TIE_BREAK * (1.0 if self.sums.gram is None else float(len(d)))
         return float(max(0.5 * xi @ H @ xi + f @ xi - bound, 0.0) + lifted) / value + ties
+
+    def _least_effect(self) -> float:
+        """Least mean square effect that unknowns of unit length have on the centre, but for those that have none.
+
+        A state or control that schedules the model moves with the drift of all knots: some elements can change
+        together without moving any sample, and of those no one needs to be large.
+        """
+        free = np.isinf(self.lower[: self.r]) & np.isinf(self.upper[: self.r])
+        values, directions = np.linalg.eigh(self.centre)
+        for value, direction in zip(values.tolist(), directions.T, strict=True):
+            if value > 1e-13 or not free[np.abs(direction) > COLLINEAR].all():
+                return float(value)
+            if np.abs(self.phi @ direction).max(initial=0.0) > COLLINEAR:
+                return float(value)
+        return 1.0
 
     def among(self, coupled: Array, widths: list[Array]) -> None:
         """Take the row's part of (10) with full weights, given the other rows, as its own.
@@ -827,7 +859,7 @@ class Row:
         bool
             Never in refined coordinates.
         """
-        return self.r > 0 and not self.refined and float(np.linalg.eigvalsh(self.centre)[0]) < 1e-8
+        return self.r > 0 and not self.refined and self._least_effect() < 1e-8
 
     @property
     def rms_step(self) -> float:
@@ -955,34 +987,53 @@ class Row:
         FitError
             There is no optimum.
         """
-        assert self.limit is not None
-        G, h = self.containment(self.pool)
-        width, limit = self.width[self.pool], self.limit
-        if limit > 0:
-            width, limit = width / limit, 1.0
-        G = np.vstack([G, np.hstack([np.zeros((len(width), self.r)), -width[:, None] * self.psi[self.pool]])])
-        h = np.concatenate([h, width * self.half[self.pool] - limit])
-        try:
-            answer, solver = self._solve(
-                "bounded",
-                lambda factor, ridge: self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge),
-                G,
-                h,
-                self.lower,
-                self.upper,
-                any_solver=self.exact,
-            )
-            self.store(answer)
-            return solver
-        except FitError:  # rounding has closed the room of WIDTH_SLACK: as near to the ties as it goes
-            before = self.limit
+        assert self.limit is not None and self._simplex is not None
+        point, along = self._optima
+        pool = self.pool
+        G, h = self.containment(pool)
+        width = self.width[pool]
+        unit = np.minimum(1.0, 1.0 / width)
+        rows = np.hstack([np.zeros((len(pool), self.r)), -(width * unit)[:, None] * self.psi[pool]])
+        limits = (width * self.half[pool] - self.limit) * unit
+        low, high = np.isfinite(self.lower), np.isfinite(self.upper)
+        every = np.eye(len(point))
+        h = np.concatenate([h, limits, self.lower[low], -self.upper[high]])
+        G, h = self._asked(np.vstack([G, rows, every[low], -every[high]]), h)
+        h = np.minimum(h - G @ point, 0.0)  # the point satisfies them, but for rounding
+        anywhere = np.full(along.shape[1], np.inf)
+        some = np.zeros(len(h))  # containment, and half-widths that may be 0; the limit has some room already
+        some[: 2 * len(pool)] = 1.0
+        some[3 * len(pool) :][: np.count_nonzero(low)] = np.flatnonzero(low) >= self.r
+        G, size = G @ along, np.linalg.norm(G, axis=1)
+        moved = np.linalg.norm(G, axis=1) > 1e-9 * size  # the others are as they are in every optimum
+        G, h, some = G[moved], h[moved], some[moved]
+        for (factor, ridge), room in zip(_ATTEMPTS, _ROOM, strict=True) if len(anywhere) else ():
+            h = np.minimum(h, -room * some)
+            H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
+            f, H = along.T @ (f + H @ point), along.T @ H @ along
+            H += _RIDGE * float(np.diagonal(H).max()) * np.eye(len(f))
             try:
-                solver = self.solve_linear() if self.exact else self.solve_regularised()
+                answer = solve_qp(H, f, G, h, -anywhere, anywhere, any_solver=False)
             except FitError:
-                self.exact = True
-                solver = self.solve_linear()
-            self.limit = max(before, self.limit * (1.0 + WIDTH_SLACK))
-            return solver
+                continue
+            self.attempt = factor, ridge
+            self._store_limited(np.append(point + along @ answer.xi, self.limit))
+            return answer.solver
+        self.store(point)  # one optimum, or rounding leaves no room to choose
+        return "HiGHS simplex"
+
+    @property
+    def _optima(self) -> tuple[Array, Array]:
+        """Where the optima of (11) are: one of them, and orthonormal directions to all others.
+
+        What carries the optimum keeps its value, so the directions leave it as it is.
+        """
+        assert self._simplex is not None
+        point = self._simplex.solution()[:-1]
+        carrying = self._simplex.carrying()[:, :-1]
+        norm = np.linalg.norm(carrying, axis=1)
+        _, values, right = np.linalg.svd(carrying[norm > 0.0] / norm[norm > 0.0, None])
+        return point, right[np.count_nonzero(values > 1e-10) :].T
 
     def polish(self) -> None:
         """Solve for the centre again, with the half-widths as they are: the tie-break on its own.

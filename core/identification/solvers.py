@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 
 Sense = NDArray[np.int32]
@@ -210,6 +210,8 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
 
 _ITERATIONS = 50
 """Steps of the simplex method per variable: on degenerate programmes it may go round for ever; most take under 5."""
+_PRICE = 1e-7
+"""Share of the largest price above which a price is none of rounding."""
 _REMEDIES: tuple[dict[str, Any], ...] = (
     {"simplex_scale_strategy": 2},
     {"presolve": "off"},
@@ -247,6 +249,7 @@ class Simplex:
         infinity = highspy.kHighsInf
         self._infinity = infinity
         self._size = len(cost)
+        self._rows, self._limits = np.empty((0, len(cost))), np.empty(0)
         self._optimal = highspy.HighsModelStatus.kOptimal
         self._endless = highspy.HighsModelStatus.kIterationLimit
         self._highs.setOptionValue("simplex_iteration_limit", _ITERATIONS * (len(cost) + 100))
@@ -265,6 +268,8 @@ class Simplex:
             Their lower limits.
         """
         count = len(rows)
+        self._rows = np.vstack([self._rows, rows])
+        self._limits = np.concatenate([self._limits, h])
         starts = np.arange(count, dtype=np.int32) * self._size
         index = np.tile(np.arange(self._size, dtype=np.int32), count)
         self._highs.addRows(
@@ -294,6 +299,67 @@ class Simplex:
         """
         return np.asarray(self._highs.getSolution().row_dual, dtype=np.float64)
 
+    def drop(self, rows: Index) -> None:
+        """Take rows out that the optimum found last does not rest on; it stays, and so does what it starts from.
+
+        Parameters
+        ----------
+        rows : array (K,) of int
+            Their numbers; those after them move up.
+        """
+        self._highs.deleteRows(len(rows), rows.astype(np.int32))
+        self._rows, self._limits = np.delete(self._rows, rows, axis=0), np.delete(self._limits, rows)
+
+    def idle(self, most: int) -> Index:
+        """Rows that the optimum found last is furthest from, of those that it does not rest on.
+
+        Parameters
+        ----------
+        most : int
+            So many are left.
+
+        Returns
+        -------
+        array (K,) of int
+            Their numbers; none if there are no more rows than that.
+        """
+        import highspy
+
+        if len(self._rows) <= most:
+            return np.empty(0, dtype=np.intp)
+        basic = np.array([s == highspy.HighsBasisStatus.kBasic for s in self._highs.getBasis().row_status])
+        slack = self._rows @ self.solution() - self._limits
+        slack[~basic] = -np.inf
+        furthest = np.argsort(-slack)[: len(slack) - most]
+        found: Index = np.sort(furthest[slack[furthest] > FEASIBLE])
+        return found
+
+    def solution(self) -> Array:
+        """The optimum found last.
+
+        Returns
+        -------
+        array (variables,)
+            ξ.
+        """
+        return np.asarray(self._highs.getSolution().col_value, dtype=np.float64)
+
+    def carrying(self) -> Array:
+        """What the optimum found last rests on: rows and unknowns that keep their value in every optimum.
+
+        A row with a price, or an unknown with one, is at its limit in all of them.
+
+        Returns
+        -------
+        array (k, variables)
+            Rows as they were added, and unit vectors of unknowns.
+        """
+        found = self._highs.getSolution()
+        prices, reduced = np.abs(self.duals()), np.abs(np.asarray(found.col_dual, dtype=np.float64))
+        largest = max(prices.max(initial=0.0), reduced.max(initial=0.0))
+        rows = self._rows[prices > _PRICE * largest]
+        return np.vstack([rows, np.eye(self._size)[reduced > _PRICE * largest]])
+
     def solve(self) -> Array:
         """Minimise.
 
@@ -320,4 +386,4 @@ class Simplex:
         if self._highs.getModelStatus() != self._optimal:
             status = self._highs.modelStatusToString(self._highs.getModelStatus())
             raise FitError(f"HiGHS could not solve the linear programme ({status}); scale the signals to order one")
-        return np.asarray(self._highs.getSolution().col_value, dtype=np.float64)
+        return self.solution()

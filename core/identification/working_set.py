@@ -25,8 +25,6 @@ from uncertain_lti.identification.regimes import tied_blocks
 from uncertain_lti.identification.row import (
     JOIN,
     LEAST,
-    LEAST_REGULARISATION,
-    NEAR,
     ROUGH,
     TIE_BREAK,
     WIDTH_SLACK,
@@ -163,7 +161,9 @@ class WorkingSet:
                     row.refine()
             self._again(again, self._settle_quadratic)
             for row in again:
-                gaps[row.i] = min(row.duality_gap(), row.linear_gap())
+                gaps[row.i] = row.duality_gap()
+                if not gaps[row.i] + row.lifted_loss() <= GOOD:
+                    gaps[row.i] = min(gaps[row.i], row.linear_gap())
                 answer, value = before[row.i]
                 now = self._lifted(row) if row.outside() <= max(1e-6, row.tolerance) else np.inf
                 if value <= now * (1.0 + GOOD):  # nothing gained: the elements stay
@@ -265,18 +265,12 @@ class WorkingSet:
 
         def settle(rows: list[Row]) -> None:
             for row in rows:
-                if row.done:
-                    continue
                 if not row.exact:
                     try:
                         self._settle([row], Row.solve_regularised, polish=True)
                     except InfeasibleError:
                         raise
                     except FitError:
-                        if row.near is not None:
-                            row.theta, row.d, row.limit, deltas[row.i] = row.near
-                            row.done = True
-                            continue
                         row.exact = True
                 if row.exact:
                     row.limit = None if row.limit is None else float(deltas[row.i]) / row.limit_unit
@@ -298,8 +292,6 @@ class WorkingSet:
                 above = deltas[row.i] > (1.0 + WIDTH_SLACK) * bounds[row.i] + 1e-13 * row.scale
                 if above and not row.exact:
                     again.append(row)
-        if self.fleet.columns.count > 1:
-            again = self._less_regularised(again, deltas, bounds, settle)
         for row in again:
             row.exact = True
         if again:  # the weight relative to δ was too large for these rows
@@ -308,10 +300,7 @@ class WorkingSet:
         again = [
             row
             for row in self.rows
-            if row.unknown
-            and not row.done
-            and (row.collinear() or not self._above(row, bounds) <= GOOD)
-            and not row.refined
+            if row.unknown and (row.collinear() or not self._above(row, bounds) <= GOOD) and not row.refined
         ]
         if again:
             before = {row.i: (row.answer(), self._largest_width(row)) for row in again}
@@ -326,31 +315,10 @@ class WorkingSet:
                     row.keep(answer)
         return self._solution(np.minimum(deltas, bounds))
 
-    def _less_regularised(
-        self, rows: list[Row], deltas: Array, bounds: Array, settle: Callable[[list[Row]], None]
-    ) -> list[Row]:
-        """Solve (11) with less and less weight on the squared widths; return the rows left to the simplex method."""
-        left: list[Row] = []
-        while rows:
-            for row in rows:
-                if self._largest_width(row) <= (1.0 + NEAR) * bounds[row.i]:  # lifted over what is left outside
-                    row.near = row.theta.copy(), row.d.copy(), row.limit, float(deltas[row.i])
-                row.regularisation *= 1e-2
-            settle(rows)
-            self._prove(settle)
-            above = []
-            for row in rows:
-                if row.done or row.exact:
-                    continue
-                bounds[row.i] = max(bounds[row.i], self._least_width(row))
-                if deltas[row.i] > (1.0 + WIDTH_SLACK) * bounds[row.i] + 1e-13 * row.scale:
-                    above.append(row)
-            rows = [row for row in above if row.regularisation > LEAST_REGULARISATION]
-            left += [row for row in above if row not in rows]
-        return left
-
     def _least_width(self, row: Row) -> float:
         """A lower bound of δ."""
+        if row.exact:
+            return row.least * row.limit_unit
         self.solvers.add("HiGHS simplex")
         try:
             return row.least_width() * row.limit_unit
