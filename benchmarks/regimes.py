@@ -16,6 +16,7 @@
     ./run python benchmarks/regimes.py gas-turbine    # the real micro gas turbine, each recording left out in turn
     ./run python benchmarks/regimes.py linear minute  # a linear plant; a minute of data
     ./run python benchmarks/regimes.py million        # 1e6 transitions, 5 knots, against least squares
+    ./run python benchmarks/regimes.py live           # CPU time of a verdict, with one knot and more
     ./run python benchmarks/regimes.py all
 
 PARC and jax-sysid are asked from the interpreter --peers (default: .venv-regimes/bin/python); make one with
@@ -48,9 +49,12 @@ from measure import table
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
+from uncertain_lti.model.schedule import Axis, Schedule
+from uncertain_lti.model.terms import ARRAYS, SHAPES
 from uncertain_lti.plants.coil import coil_runs
 from uncertain_lti.plants.turbofan_faults import Fault
 from uncertain_lti.plants.turbofan_runs import DT, LARGE, Run, lever_moves, make_run, simulate, turbofan_signals
+from uncertain_lti.sampling.sampler import Status, Step
 
 ROOT = Path(__file__).resolve().parents[1]
 Array = np.ndarray
@@ -623,8 +627,39 @@ def million(keep: Path | None, count: int) -> None:
     )
 
 
+def live(keep: Path | None) -> None:
+    """CPU time of the monitor's verdict on one sample after the other, models of one knot and of more in turn."""
+    rng, rows, count = np.random.default_rng(0), [], 2000
+    for n, m in ((5, 4), (50, 10)):
+        monitors = []
+        for knots in LIVE_KNOTS:
+            shapes = {name: SHAPES[name].shape(n, m) for name in ARRAYS}
+            arrays = {
+                name: 0.01 * np.abs(rng.normal(size=shape if knots == 1 else (knots, *shape)))
+                for name, shape in shapes.items()
+            }
+            schedule = None if knots == 1 else Schedule((Axis("x1", knots=tuple(np.linspace(-2, 2, knots).tolist())),))
+            monitors.append(EnvelopeMonitor(UncertainLTI(**arrays, schedule=schedule), 1, 1, 1.0))
+        steps = [
+            Step(Status.OK, k * 10**6, k * 10**6, 0.002, rng.normal(size=n + m).tolist(), rng.normal(size=n).tolist())
+            for k in range(count)
+        ]
+        best = [math.inf] * len(monitors)
+        for _ in range(15):
+            for i, monitor in enumerate(monitors):
+                began = time.process_time()
+                for step in steps:
+                    monitor.judge(step)
+                best[i] = min(best[i], time.process_time() - began)
+        for knots, seconds in zip(LIVE_KNOTS, best, strict=True):
+            rows.append([str(n), str(m), str(knots), f"{1e6 * seconds / count:.2f} µs", f"{seconds / best[0]:.2f}"])
+    table("CPU time of a verdict (aim: at most 1.3 times one knot's)", ["n", "m", "knots", "CPU", "ratio"], rows)
+
+
+LIVE_KNOTS = (1, 2, 3, 5, 12)
 PARTS: dict[str, Callable[[Path | None], None]] = {
     "turbofan": turbofan, "paper": paper, "bags": bags, "gas-turbine": gas_turbine, "linear": linear, "minute": minute,
+    "live": live,
 }  # fmt: skip
 
 
