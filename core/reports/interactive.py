@@ -284,7 +284,7 @@ def interactive_page(title: str, recordings: Sequence[PlottedRecording]) -> str:
     keys = "".join(
         f'<span class="key" style="background:{colour}"></span>{word}'
         for colour, word in (
-            ("#56B4E9", "one-step bounds"), ("var(--ink)", "recorded"), ("#D55E00", "violated"), ("#F0E442", "alarm"),
+            ("#56B4E9", "bounds"), ("var(--ink)", "recorded"), ("#D55E00", "violated"), ("#F0E442", "alarm"),
             ("#999999", "no verdict"),
         )
     )  # fmt: skip

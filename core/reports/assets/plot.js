@@ -55,7 +55,7 @@
       bands.push({ series: [upper, lower], fill: c.band });
     }
     const held = panel.word === "control" && !source.greatest ? { paths: uPlot.paths.stepped({ align: 1 }) } : {};
-    const least = add(source.greatest ? "least" : panel.word, source.least, c.ink, 1, held);
+    const least = add(source.greatest ? "least" : shares(panel) ? "utilisation" : panel.word, source.least, c.ink, 1, held);
     if (source.greatest) bands.push({ series: [add("greatest", source.greatest, c.ink, 1), least], fill: c.ink });
     if (source.marked) {
       add("violated", source.marked, c.violated, 1, {
