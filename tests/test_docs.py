@@ -47,6 +47,7 @@ from uncertain_lti.identification.structure import Structure
 from uncertain_lti.monitor.outputs import OUTPUTS
 
 ROOT = Path(__file__).resolve().parent.parent
+PATIENCE = 1200.0  # s for one block; costs nothing where all is well
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "generated" not in p.name)]
 LANGUAGES = {"sh", "python", "yaml", "json", "text", "matlab", "{toctree}", "{include}", "{eval-rst}"}
 NOT_RUN = 14
@@ -153,7 +154,7 @@ class Reader:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=300,
+            timeout=PATIENCE,
         )
         assert done.returncode == int(block.marks.get("status", 0)), done.stdout
         self.said = done.stdout
@@ -290,6 +291,7 @@ ROS = re.compile(r"envelope_monitor --ros|uncertain-lti (play|record|demo)")
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 @pytest.mark.slow
+@pytest.mark.timeout(3 * PATIENCE)
 def test_every_block_runs(page, tmp_path, request):
     every = blocks(page)
     if any(ROS.search(b.text) and "not run" not in b.marks for b in every):

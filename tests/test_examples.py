@@ -25,7 +25,7 @@ EXAMPLES = ROOT / "examples"
 def said_by(name: str, folder: Path, *arguments: str) -> str:
     """What a script prints, run in an empty folder."""
     command = [sys.executable, str(EXAMPLES / name), *arguments]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -40,7 +40,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_processes import World, open_world
+from ros_processes import PATIENCE, World, open_world, until
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Empty, Float64, Float64MultiArray, Header, MultiArrayDimension, MultiArrayLayout, String
@@ -204,16 +204,17 @@ def test_recording_waits_for_topics_and_stops_after_the_duration(world: World, t
     output = tmp_path / "out"
     process = world.command("record", "/late", "--output", output, "--duration", "0.6")
     process.says("waiting for /late")
+    began, sent = time.monotonic(), 0
     late = world.publisher(Float64, "late")
     world.subscribed(late)
-    for k in range(200):
-        late.publish(Float64(data=float(k)))
+    while process.running and time.monotonic() < began + PATIENCE:
+        late.publish(Float64(data=float(sent)))
+        sent += 1
         time.sleep(0.01)
-        if not process.running:
-            break
     process.succeed()
+    assert time.monotonic() - began >= 0.6
     values = [m.data for _, _, m in Bag(tmp_path / "out.mcap").messages(["/late"])]
-    assert values == [float(k) for k in range(len(values))] and 30 < len(values) < 120
+    assert values == [float(k) for k in range(len(values))] and 0 < len(values) <= sent
 
 
 def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> None:
@@ -221,14 +222,19 @@ def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> N
     numbers = world.publisher(Float64, "/numbers")
     process = recorder(world, ["/numbers"], output)
     world.subscribed(numbers)
-    end = time.monotonic() + 5.0
-    while time.monotonic() < end:
+    part, sizes = tmp_path / "out.mcap.part", set[int]()
+
+    def grown() -> bool:
+        """Whether it was written out twice while messages came."""
         numbers.publish(Float64(data=1.0))
-        time.sleep(0.01)
+        sizes.add(part.stat().st_size)
+        return len(sizes) > 2
+
+    until(grown, "what is written out every now and then")
     process.kill()
     assert not output.exists()
-    bag = Bag(tmp_path / "out.mcap.part")
-    assert bag.warnings and 150 < len(list(bag.messages(["/numbers"])))
+    bag = Bag(part)
+    assert bag.warnings and len(list(bag.messages(["/numbers"]))) > 1
 
 
 def test_what_cannot_be_recorded_is_said_in_a_sentence(world: World, tmp_path: Path) -> None:
