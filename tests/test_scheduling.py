@@ -131,7 +131,7 @@ def test_knots_on_one_signal_beside_modes_of_another():
 
 
 def test_what_is_no_choice_is_refused_by_name():
-    with pytest.raises(FitError, match="did you mean x1"):
+    with pytest.raises(FitError, match="is x1 meant"):
         fit(RUNS, schedule={"x11": "auto"})
     with pytest.raises(FitError, match="transient_weights"):
         fit(RUNS, schedule={"x1": "auto"}, transient_weights=[1] * 6)
@@ -252,7 +252,7 @@ def test_the_signals_file_asks_for_a_schedule(folder):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (["--schedule", "fam"], "did you mean fan"),
+        (["--schedule", "fam"], "is fan meant"),
         (["--schedule", "fan", "--schedule", "fan=3"], "twice"),
         (["--schedule", "fan=x"], "neither auto"),
         (["--schedule", "fan="], "write SIGNAL"),

@@ -230,7 +230,7 @@ def _tied(model: UncertainLTI, problem: Problem, sums: Moments) -> list[str]:
 
 def _at(model: UncertainLTI, block: int) -> str:
     """at the knot of a block; empty of a model with one."""
-    return f" at {regimes.place(model.schedule, block, model.signals.signals)}" if model.schedule is not None else ""
+    return f" at {model.block_name(block)}" if model.schedule is not None else ""
 
 
 def _few(words: Sequence[str]) -> str:

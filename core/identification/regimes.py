@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Columns, Problem, Regimes
@@ -193,7 +192,7 @@ def tied_words(
     for r, (reason, block) in enumerate(zip(reasons, tied, strict=True)):
         if block == r:
             continue
-        where, other = place(schedule, r, signals), place(schedule, block, signals)
+        where, other = schedule.block_name(r, signals), schedule.block_name(block, signals)
         if not sums.visits[r]:
             reason = "no transition is nearest to it, so there is no bound to trust there"
         messages.append(
@@ -201,32 +200,6 @@ def tied_words(
             f"record the machine there, or give fewer knots"
         )
     return messages
-
-
-def place(schedule: Schedule, block: int, signals: Sequence[Signal]) -> str:
-    """A block in words.
-
-    Parameters
-    ----------
-    schedule : Schedule
-        The schedule.
-    block : int
-        Number of the block.
-    signals : sequence of Signal
-        With the operating point.
-
-    Returns
-    -------
-    str
-        Signals with their knots in recorded units.
-    """
-    named = {s.name: s for s in signals}
-    parts = []
-    at = zip(schedule.axes, schedule.recorded_values(signals), schedule.indices[block], strict=True)
-    for axis, values, index in at:
-        unit = named[axis.signal].unit
-        parts.append(f"{axis.signal} {'= ' if axis.modes else ''}{values[index]:.6g}{' ' + unit if unit else ''}")
-    return ", ".join(parts)
 
 
 def asked_by(signals: SignalMap) -> dict[str, Knots]:
@@ -265,9 +238,9 @@ def check_names(schedule: Iterable[str], names: Sequence[str]) -> None:
         raise FitError(f"schedule: {plural(len(asked), 'scheduling signal')}; give one or two")
     for name in asked:
         if name not in names:
-            near = difflib.get_close_matches(str(name), names, 3, 0.5)
-            there = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names)}"
-            raise FitError(f"schedule: there is no signal '{name}'; {there}")
+            raise FitError(
+                f"schedule: there is no signal '{name}'{meant(name, names, 1)}; there are {', '.join(names)}"
+            )
 
 
 def scheduled_by(

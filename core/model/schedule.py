@@ -339,6 +339,25 @@ class Schedule:
             for axis in self.axes
         ]
 
+    def block_name(self, r: int, signals: Sequence[Signal]) -> str:
+        """Where one block holds, in words.
+
+        Parameters
+        ----------
+        r : int
+            Number of the block.
+        signals : sequence of Signal
+            With the scheduling signals, their units, steady states and scales.
+
+        Returns
+        -------
+        str
+            `fan_speed = 0.92`, for example, in recorded units.
+        """
+        units = {signal.name: signal.unit for signal in signals}
+        at = zip(self.axes, self.recorded_values(signals), self.indices[r], strict=True)
+        return ", ".join(f"{axis.signal} = {values[k]:.6g} {units[axis.signal]}".rstrip() for axis, values, k in at)
+
     @property
     def words(self) -> str:
         """Its signals with their numbers of knots or modes."""

@@ -631,11 +631,7 @@ class UncertainLTI:
         str
             `fan_speed = 0.92`, for example, in recorded units; empty without a schedule.
         """
-        if self.schedule is None:
-            return ""
-        signals = self.signals.signals
-        at = zip(self.schedule.recorded_values(signals), self.schedule.indices[r], self._positions, strict=True)
-        return ", ".join(f"{signals[i].name} = {values[k]:.6g} {signals[i].unit}".rstrip() for values, k, i in at)
+        return "" if self.schedule is None else self.schedule.block_name(r, self.signals.signals)
 
     def own_rates(self, z: Array) -> Array:
         """The elements a_ii of the nominal model, blended where there is a schedule.
