@@ -330,7 +330,7 @@ def digest(file: str) -> None:
 def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any]:
     """The same checksums of a check of every sample sent, and how often the alarm was raised."""
     from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-    from uncertain_lti.monitor.verdict_messages import VerdictRecords
+    from uncertain_lti.monitor.verdict_records import VerdictRecords
     from uncertain_lti.recordings.mcap_records import MESSAGE
 
     model = UncertainLTI.load(model_path)
@@ -341,7 +341,7 @@ def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any
     verdicts = EnvelopeMonitor(model).check(transient)
     vectors = [output for output in RECORDED if output.position]
     channels = {output.name: i for i, output in enumerate(vectors)}
-    records = VerdictRecords(model.state_names, channels, model.steps)
+    records = VerdictRecords(model.state_names, channels, model.steps, verdicts.statistic_names)
     sums: list[array[int]] = [array("L") for _ in vectors]
     names = {name for output in vectors for name in (output.position, output.velocity) if name}
     for begin in range(0, len(stamps), 5000):

@@ -46,8 +46,7 @@ from uncertain_lti.model import bounds
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
-from uncertain_lti.monitor.envelope_monitor import NUMBERS
-from uncertain_lti.monitor.verdict_messages import AnyVerdict
+from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.sampling import sampler as sampler_module
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti_ros import envelope_monitor as node_module
@@ -57,7 +56,10 @@ VECTOR, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
 START_NS, STEP_NS = 10**18, 10_000_000
 
 needs_compiled = pytest.mark.skipif(bool(compiled.why_not()), reason=f"not compiled: {compiled.why_not()}")
-PURE_BOUNDS, PURE_SAMPLER = (compiled.uncompiled(name) for name in ("model.bounds", "sampling.sampler"))
+PURE_BOUNDS, PURE_SAMPLER, PURE_VERDICT, PURE_MESSAGES = (
+    compiled.uncompiled(name)
+    for name in ("model.bounds", "sampling.sampler", "monitor.verdict", "monitor.verdict_messages")
+)
 
 
 class Input:
@@ -134,7 +136,7 @@ class Node(node_module.EnvelopeMonitorNode):
             "latest": repr(session.sampler.latest()),
             "enable": (session.arming.on, session.arming.value),
             "last": last and (last.t_ns, last.outside_domain, last.unknown_regime, last.alarm),
-            "last numbers": last and [last.packed(name) for name in NUMBERS],
+            "last numbers": last and last.packed(),
             "remembered": [
                 (e.arrival_ns, e.topic, e.data, e.alarm, [told(v) for v in e.verdicts])
                 for e in self.snapshots.recent.entries()
@@ -143,8 +145,8 @@ class Node(node_module.EnvelopeMonitorNode):
         }
 
 
-def told(verdict: AnyVerdict) -> tuple[Any, ...]:
-    said = [verdict.packed(name) for name in NUMBERS] if verdict.judged else []
+def told(verdict: Verdict) -> tuple[Any, ...]:
+    said = verdict.packed() if verdict.judged else b""
     return verdict.t_ns, verdict.n, verdict.judged, verdict.outside_domain, said
 
 
@@ -153,7 +155,7 @@ def ros(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """Nodes whose inputs are `Input`, that keep all messages, and do nothing by the time that the test takes."""
     monkeypatch.setattr(node_module, "MatchedSubscription", Input)
     given = {"heartbeat": 3600.0, "diagnostics_period": 3600.0, "snapshot.seconds": 3600.0, "snapshot.memory": 1024.0}
-    given |= {"snapshot.folder": tmp_path / "snapshots", "catch_up": 0.0}
+    given |= {"snapshot.folder": tmp_path / "snapshots", "catch_up": 0.0, "state_timeout": 3600.0}
     arguments = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
     with own_domain() as domain:
         rclpy.init(args=["--ros-args", *arguments], domain_id=domain)
@@ -288,7 +290,10 @@ def played(path: Path, messages: Sequence[Any], pure: bool, silent: tuple[str, .
     with pytest.MonkeyPatch.context() as patch:
         if pure:
             patch.setattr("uncertain_lti.model.uncertain_lti.Judge", PURE_BOUNDS.Judge)
-            patch.setattr("uncertain_lti.monitor.session.Sampler", PURE_SAMPLER.Sampler)
+            patch.setattr("uncertain_lti.monitor.stream.Sampler", PURE_SAMPLER.Sampler)
+            patch.setattr("uncertain_lti.monitor.envelope_monitor.Verdict", PURE_VERDICT.Verdict)
+            patch.setattr("uncertain_lti.monitor.verdict_messages.Encoder", PURE_MESSAGES.Encoder)
+            patch.setattr("uncertain_lti_ros.outputs.NamedVector", PURE_MESSAGES.NamedVector)
         node = Node(path, silent)
         if given:
             results = node.set_parameters([Parameter(name, value=value) for name, value in given.items()])

@@ -27,6 +27,7 @@ from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Horizon, Run
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, SHAPES
+from uncertain_lti.monitor.verdict import place as place_of
 from uncertain_lti.sampling.sampler import Sampler, Step
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import Signal
@@ -285,7 +286,9 @@ def test_what_is_foreseen_is_judged_when_the_longest_horizon_ends() -> None:
         assert found is not None and found.t_ns == transient.t_ns[k + 5]
         centre, half = (found.upper + found.lower) / 2, (found.upper - found.lower) / 2 / 1.5
         np.testing.assert_allclose((x[k + 5] - centre) / half, judged[k + 5], rtol=1e-9)
-        assert found.packed("lower") == found.lower.tobytes() and found.packed("upper") == found.upper.tobytes()
+        packed = found.packed()
+        assert packed[place_of("lower", model.n)] == found.lower.tobytes()
+        assert packed[place_of("upper", model.n)] == found.upper.tobytes()
     assert EnvelopeMonitor(model.replace(horizons=())).foresee(0, [*x[0], *u[0]], dt) is None
 
 

@@ -31,8 +31,8 @@ from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor import outputs
-from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.reason import over_recording
+from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.sampling.reading import read_as_fitted

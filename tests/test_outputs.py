@@ -19,9 +19,10 @@ from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.terms import ARRAYS
-from uncertain_lti.monitor.envelope_monitor import NUMBERS
 from uncertain_lti.monitor.outputs import OUTPUTS, REASON, RECORDED, VECTOR_TYPE, VIOLATION, Output, names_of
-from uncertain_lti.monitor.verdict_messages import NamedVector, VerdictMessages, VerdictRecords
+from uncertain_lti.monitor.verdict import NUMBERS, place
+from uncertain_lti.monitor.verdict_messages import NamedVector, VerdictMessages
+from uncertain_lti.monitor.verdict_records import VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
@@ -77,7 +78,8 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
     verdicts = [monitor.judge(step) for step in steps]
     assert [v.judged for v in verdicts] == [True, True, False] and verdicts[1].outside_domain
     statistics = statistics_of(model)
-    encode = VerdictMessages(names, steps=model.steps, statistics=statistics).encode
+    messages = VerdictMessages(names, steps=model.steps, statistics=statistics)
+    encode = {name: messages.encoder([name]) for name in messages.outputs}
     outputs = [o for o in RECORDED if not o.position or names_of(names, model.steps, statistics)[o.of]]
     outputs.remove(REASON)
     assert ("horizon_utilisation" in encode) == bool(model.horizons)
@@ -85,7 +87,8 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
     numbers = {o.position: np.array([v.numbers(o.position) for v in verdicts]) for o in outputs if o.position}
     for verdict in verdicts:
         for name in numbers:
-            assert verdict.packed(name) == np.array(verdict.numbers(name)).tobytes()
+            own = verdict.packed_statistics() if name == "statistics" else verdict.packed()[place(name, model.n)]
+            assert own == np.array(verdict.numbers(name)).tobytes()
     numbers |= {o.velocity: np.array([getattr(v, o.velocity) for v in verdicts]) for o in RECORDED if o.velocity}
     records = VerdictRecords(names, {output.name: i for i, output in enumerate(outputs)}, model.steps, statistics)
     times = np.arange(3)
@@ -99,10 +102,13 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
     for output in outputs:
         for verdict in verdicts:
             if output.position:
-                message = encode[output.name](verdict)
+                (message,) = encode[output.name](verdict)
                 assert (message in data) == (output.when == "message" or verdict.judged)
+    for wanted in ([], ["lower"], ["state", "flags"], list(encode)):  # together as one by one
+        for verdict in verdicts:
+            assert messages.encoder(wanted)(verdict) == [encode[name](verdict)[0] for name in wanted]
     marks = NamedVector(names, velocities=True)
-    flags = [encode["flags"](verdict) for verdict in verdicts]
+    flags = [encode["flags"](verdict)[0] for verdict in verdicts]
     velocities = [np.frombuffer(f[marks.velocity : marks.velocity + 8 * model.n], "<f8") for f in flags]
     np.testing.assert_array_equal(velocities, np.repeat([[0.0], [1.0], [np.nan]], model.n, axis=1))
 

@@ -29,7 +29,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
-from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.figures import budget_figure, matrices_figure, save
 from uncertain_lti.reports.regimes import block_facts, check_regimes, unknown_in_words
 from uncertain_lti.reports.reliance import CARE, UNKNOWN

@@ -448,14 +448,15 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.session.failed()
 
     def _take(self, session: Session, topic: str, arrival: int, data: bytes, now: float) -> None:
-        alarms, alarm = session.alarms, session.alarm
+        alarms, before = session.alarms, session.alarm
         verdicts, opened = session.take(topic, arrival, data, now)
-        turned = session.alarm != alarm
+        alarm = session.alarm
+        turned = alarm != before
         if turned:
             self._event_log.turned(session, verdicts, now)
         if self.snapshots.recent is not None:
-            self.snapshots.add(Entry(now, arrival, topic, data, verdicts, session.alarm), session.alarms > alarms)
-        if turned and not session.alarm:
+            self.snapshots.add(Entry(now, arrival, topic, data, verdicts, alarm), session.alarms > alarms)
+        if turned and not alarm:
             self.snapshots.alarm_over(now)
         if verdicts or opened or turned:
             self.outputs.publish(session, verdicts, opened, now, turned)

@@ -19,15 +19,22 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION
 from uncertain_lti.monitor.session import Session
-from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, VerdictMessages, text_message
+from uncertain_lti.monitor.verdict import Verdict
+from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, Encoder, VerdictMessages, text_message
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.polled_events import PolledEvents
 
 _OUTPUT_DEPTH = 1000
+_WHEN = {
+    "message": ("message",),
+    "judged": ("message", "judged"),
+    "predicted": ("predicted",),
+    "predicted over": ("predicted over",),
+}
+"""Of a message without a verdict, one with a verdict and predictions: which outputs are published."""
 
 
 class OutputPublisher:
@@ -43,26 +50,44 @@ class OutputPublisher:
         Of the topic, below the node's.
     qos : QoSProfile
         What is offered.
+    changed : callable
+        Called when there are more or fewer listeners.
 
     Attributes
     ----------
-    listeners : int
-        Subscriptions at the last poll.
     send : callable
         Publishes the bytes of a message.
     poll : callable
         Reads the events of the middleware.
     """
 
-    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
+    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile, changed: Callable[[], None]) -> None:
         events = PublisherEventCallbacks(matched=self._matched)
         self._node = node
         self._publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
         self._events = PolledEvents(node, self._publisher)
         self.poll = self._events.poll
+        self._changed = changed
         self.listeners = 0
         # Past the check of the lifecycle state: the node publishes only while it is active.
         self.send = self._publisher.handle.publish_raw
+
+    @property
+    def listeners(self) -> int:
+        """Subscriptions at the last poll."""
+        return self._listeners
+
+    @listeners.setter
+    def listeners(self, count: int) -> None:
+        """Take another number.
+
+        Parameters
+        ----------
+        count : int
+            Subscriptions.
+        """
+        self._listeners = count
+        self._changed()
 
     def _matched(self, event: Any) -> None:
         self.listeners = event.current_count
@@ -73,8 +98,8 @@ class OutputPublisher:
         self._node.destroy_lifecycle_publisher(self._publisher)
 
 
-_Vector = tuple[OutputPublisher, Callable[[Any], bytes]]
-"""A publisher, and what makes its message of a verdict, or of bounds to come."""
+_Heard = tuple[list[OutputPublisher], Encoder]
+"""Publishers of vectors that somebody listens to, and what makes their messages of a verdict."""
 
 
 class Outputs:
@@ -100,6 +125,7 @@ class Outputs:
         self.publishers: dict[str, OutputPublisher] = {}
         self.alarm_sent = now
         self._reason_sent = ""
+        self._heard: dict[str, _Heard] = {}  # by what they are published for; empty when it must be made again
 
     def open(self, heartbeat: float) -> None:
         """Make the publishers.
@@ -116,7 +142,7 @@ class Outputs:
         for output in OUTPUTS:
             offered = offers.get(output, qos)
             kind = message_class(output.type)
-            self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered)
+            self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered, self._heard.clear)
         self._violation, self._reason = self.publishers[VIOLATION.name], self.publishers[REASON.name]
         self._reason_sent = ""
 
@@ -129,14 +155,15 @@ class Outputs:
             Has both.
         """
         model = session.model
-        encode = VerdictMessages(model.state_names, sendable, model.steps, session.monitor.alarms.names).encode
+        self._messages = VerdictMessages(model.state_names, sendable, model.steps, session.monitor.alarms.names)
+        self._heard.clear()
 
-        def vectors(*when: str) -> list[_Vector]:
-            chosen = [output.name for output in OUTPUTS if output.name in encode and output.when in when]
-            return [(self.publishers[name], encode[name]) for name in chosen]
-
-        self._vectors = vectors("message"), vectors("message", "judged")
-        self._predicted = vectors("predicted"), vectors("predicted over")
+    def _listen(self) -> None:
+        """Choose the vectors that somebody listens to, and lay out their messages."""
+        vectors = self._messages.outputs
+        for made_for, when in _WHEN.items():
+            names = [name for name in vectors if vectors[name].when in when and self.publishers[name].listeners]
+            self._heard[made_for] = [self.publishers[name] for name in names], self._messages.encoder(names)
 
     def poll(self) -> None:
         """Update the numbers of listeners."""
@@ -162,23 +189,27 @@ class Outputs:
         turned : bool
             The alarm changed; it is published in any case.
         """
-        messages = []
+        if not self._heard:
+            self._listen()
+        messages: list[tuple[OutputPublisher, bytes]] = []
         for verdict in verdicts:
             judged = verdict.judged
-            for publisher, encode in self._vectors[judged]:
-                if publisher.listeners:
-                    messages.append((publisher.send, encode(verdict)))
+            publishers, encode = self._heard["judged" if judged else "message"]
+            if publishers:
+                messages += zip(publishers, encode(verdict), strict=True)
             turned |= judged and self._violation.listeners > 0
         if opened:
-            for predicted, predict in zip(self._predicted, (session.predict, session.foresee), strict=True):
-                heard = [vector for vector in predicted if vector[0].listeners]
-                if heard and (expected := predict()) is not None:
-                    messages += [(publisher.send, encode(expected)) for publisher, encode in heard]
+            publishers, encode = self._heard["predicted"]
+            if publishers and (expected := session.predict()) is not None:
+                messages += zip(publishers, encode(expected), strict=True)
+            publishers, encode = self._heard["predicted over"]
+            if publishers and (foreseen := session.foresee()) is not None:
+                messages += zip(publishers, encode(foreseen), strict=True)
         if turned:
             self.alarm_sent = now
-            messages.append((self._violation.send, TRUE if session.alarm else FALSE))
-        for send, message in messages:
-            send(message)
+            messages.append((self._violation, TRUE if session.alarm else FALSE))
+        for publisher, message in messages:
+            publisher.send(message)
         if self._reason.listeners:
             self.send_reason(session.reasons.text)
 

@@ -27,6 +27,8 @@ from zlib import crc32
 MODULES = (
     "model.bounds",
     "monitor.statistics",
+    "monitor.verdict",
+    "monitor.verdict_messages",
     "sampling.sampler",
 )
 """Modules that have a twin where they were compiled; setup.py builds them."""

@@ -20,7 +20,7 @@ from uncertain_lti.cli.command import complain
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
     from uncertain_lti.monitor.deployed import DeployedMonitor
-    from uncertain_lti.monitor.envelope_monitor import Verdicts
+    from uncertain_lti.monitor.verdicts import Verdicts
     from uncertain_lti.recordings.recording import Progress, Recording
     from uncertain_lti.sampling.sampler_arrays import Decisions
 
@@ -104,7 +104,7 @@ def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> Deploy
     from uncertain_lti.model.file import read_rules
     from uncertain_lti.monitor.arming import Condition
     from uncertain_lti.monitor.deployed import DeployedMonitor
-    from uncertain_lti.monitor.session import listed_states
+    from uncertain_lti.monitor.live_rule import listed_states
 
     if options.rules is not None:
         rules = read_rules(options.rules)

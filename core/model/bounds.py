@@ -514,7 +514,7 @@ def centre_and_half(
     return centre_of(phi[: len(v)] if base is None else base, dt, rate), half_of(dt, spread, v)
 
 
-LOWER, UPPER, UTILISATION, RESIDUAL, FLAGS = range(5)
+LOWER, UPPER, RESIDUAL, FLAGS, UTILISATION = range(5)
 """What a `Judgement` holds of each state."""
 _TOGETHER = 64  # runs that one compiled loop advances: they stay in the cache
 _FEW = 8192  # runs that one numpy operation advances
@@ -577,6 +577,18 @@ class Judgement:
         if which == RESIDUAL:
             return x_next - centre
         return np.subtract(1.0, inside, dtype=np.float64)
+
+    def packed(self) -> bytes:
+        """All of it, one kind after another.
+
+        Returns
+        -------
+        bytes
+            Little-endian doubles, of `LOWER` first and of `UTILISATION` last.
+        """
+        if cython.compiled:
+            return bytes(self._values.tobytes())
+        return b"".join([self.numbers(which).tobytes() for which in range(UTILISATION + 1)])
 
 
 @cython.cclass
@@ -849,9 +861,9 @@ class Judge:
                 violation = violation or self._counted[i]
             values[i] = recorded(lower, self._steady[i], self._scale[i])
             values[n + i] = recorded(upper, self._steady[i], self._scale[i])
-            values[2 * n + i] = utilisation_of(x_next - centre, half)
-            values[3 * n + i] = x_next - centre
-            values[4 * n + i] = not inside
+            values[2 * n + i] = x_next - centre
+            values[3 * n + i] = not inside
+            values[4 * n + i] = utilisation_of(x_next - centre, half)
         return Judgement(blank, every, violation, left, unknown)
 
     @cython.cfunc

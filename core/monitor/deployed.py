@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.monitor.arming import Arming, Condition
-from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Verdicts
+from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
+from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.transient import Transient
 

@@ -18,9 +18,9 @@ from typing import Any
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.alarm_rule import CONTAINMENT
-from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.reason import WHY
 from uncertain_lti.monitor.session import OK, WARN, Session
+from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.sampling.status import Status
 
 _BURST, _REFILL = 6, 10.0  # lines on one subject at once, and s until one more is allowed

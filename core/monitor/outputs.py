@@ -39,7 +39,7 @@ class Output:
     text : str
         Its meaning, for the reference (Markdown).
     position : str
-        The number of a verdict that `position` holds, one of `envelope_monitor.NUMBERS`; empty without one.
+        The number of a verdict that `position` holds, one of `verdict.NUMBERS`; empty without one.
     velocity : str
         Attribute of a verdict, true or false, that `velocity` repeats for each state; empty without one.
     view : {"", "bound", "sample", "states", "steps", "alarm"}

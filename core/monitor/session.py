@@ -11,115 +11,26 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from uncertain_lti.base.english import shortlist
-from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.jumps import jumps_in_words
 from uncertain_lti.model.repeats import Moved
-from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.arming import Arming, Condition
-from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Waiting
 from uncertain_lti.monitor.deployed import condition_words
-from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor, Foreseen, Verdict
 from uncertain_lti.monitor.frozen import frozen_words, repeat_words
-from uncertain_lti.monitor.likeness import Explainer, Likeness
+from uncertain_lti.monitor.likeness import Likeness
+from uncertain_lti.monitor.live_rule import Rule as Rule
+from uncertain_lti.monitor.live_rule import listed_states as listed_states
 from uncertain_lti.monitor.outputs import JUDGED
-from uncertain_lti.monitor.reason import QUIET, WHY, Reasons
-from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
-from uncertain_lti.sampling.counters import LATE, MISSING, TOO_OLD, Counters
-from uncertain_lti.sampling.instants import to_ns
-from uncertain_lti.sampling.sampler import Sampler, all_finite
+from uncertain_lti.monitor.reason import WHY
+from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream
+from uncertain_lti.monitor.stream import topic_types as topic_types
+from uncertain_lti.sampling.counters import MISSING, TOO_OLD, Counters
 from uncertain_lti.sampling.status import Status
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.field_types import TypeFields
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of diagnostic_msgs/DiagnosticStatus."""
-FUTURE = 1.0
-"""s that a stamp may be ahead of the clock before it is reported."""
-
-_FUTURE_NS = to_ns(FUTURE)
-_SHOWN = 5  # signals that a report names
-_NOTHING: tuple[Verdict, ...] = ()
-
-MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
-"""Type name and paths -> reader."""
-
-
-@dataclass(frozen=True)
-class Rule:
-    """Alarm rule as the parameters give it; 0 means that of the model.
-
-    Parameters
-    ----------
-    violations : int, default 0
-        m of the rule.
-    window : int, default 0
-        n of the rule, in verdicts.
-    margin : float, default 0.0
-        Multiplies the half-widths.
-    masked : str, default ""
-        States that do not count, separated by commas.
-    enable : str, default ""
-        See `Condition`; empty for none.
-    enable_type : str, default ""
-        Message type of its topic; empty for that of the model or of the graph.
-    grace : float, default 0.0
-        Time of grace, s.
-    latch : bool, default False
-        Whether an alarm lasts until it is reset.
-    """
-
-    violations: int = 0
-    window: int = 0
-    margin: float = 0.0
-    masked: str = ""
-    enable: str = ""
-    enable_type: str = ""
-    grace: float = 0.0
-    latch: bool = False
-
-    def monitor(self, model: UncertainLTI) -> EnvelopeMonitor:
-        """Monitor of a model under this rule.
-
-        Parameters
-        ----------
-        model : UncertainLTI
-            The model.
-
-        Returns
-        -------
-        EnvelopeMonitor
-            With a cleared alarm.
-
-        Raises
-        ------
-        ModelError
-            The two do not fit.
-        """
-        return EnvelopeMonitor(
-            model, self.violations or None, self.window or None, self.margin or None, listed_states(self.masked)
-        )
-
-
-def listed_states(text: str) -> list[str]:
-    """Names of states, separated by commas.
-
-    Parameters
-    ----------
-    text : str
-        Of the parameter `masked`.
-
-    Returns
-    -------
-    list of str
-        The names.
-    """
-    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 @dataclass(frozen=True)
@@ -144,668 +55,8 @@ class Report:
     values: Mapping[str, str]
 
 
-@dataclass
-class Period:
-    """What has happened since the last report.
-
-    Parameters
-    ----------
-    began : float
-        Steady time, s.
-    verdicts : int, default 0
-        Verdicts given in it.
-    outside : int, default 0
-        Those from outside the fitted domain.
-    unknown : int, default 0
-        Those of a regime that was not fitted.
-    last_unknown : Verdict or None, optional
-        The last of these.
-    alarm : bool, default False
-        The alarm was raised at some time in it.
-    frozen, repeating : dict of int to Moved
-        By number of the state, the last repeat of those that were frozen, and of others that repeat for longer than
-        ever in the fit.
-    violations : Counter of int
-        By number of the state.
-    jumps : list of str
-        The first jumps larger than any of the fit, in words.
-    statuses : Counter of Status
-        Of the samples in it.
-    counters : Counter of str
-        Those of the sampler when it began.
-    late : int, default 0
-        Late messages when it began.
-    unreadable : int, default 0
-        Unreadable messages when it began.
-    future : int, default 0
-        Messages with a stamp in the future when it began.
-    """
-
-    began: float
-    verdicts: int = 0
-    outside: int = 0
-    unknown: int = 0
-    last_unknown: Verdict | None = None
-    alarm: bool = False
-    frozen: dict[int, Moved] = field(default_factory=dict)
-    repeating: dict[int, Moved] = field(default_factory=dict)
-    violations: Counter[int] = field(default_factory=Counter)
-    jumps: list[str] = field(default_factory=list)
-    statuses: Counter[Status] = field(default_factory=Counter)
-    counters: Counter[str] = field(default_factory=Counter)
-    late: int = 0
-    unreadable: int = 0
-    future: int = 0
-
-
-def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> dict[str, str]:
-    """Message type of each topic that a model reads, with every field path checked.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted to a recording.
-    source : str
-        What errors call the model.
-    type_fields : callable
-        Type name -> {field name: FieldType}.
-
-    Returns
-    -------
-    dict of str to str
-        Topic -> type.
-
-    Raises
-    ------
-    ModelError
-        The model names no topics or types, or two types for one topic.
-    SignalError
-        A type is not installed, or a field is not in it.
-    """
-    types: dict[str, str] = {}
-    for signal in model.signals.signals:
-        if not (signal.topic and signal.type):
-            raise ModelError(
-                f"{source}: signal '{signal.name}' has no {'type' if signal.topic else 'topic'}, as the model was "
-                f"fitted to arrays; fit it to a recording, so that topics and types are in the file"
-            )
-        if types.setdefault(signal.topic, signal.type) != signal.type:
-            raise ModelError(
-                f"{source}: {signal.topic} is given as {types[signal.topic]} and as {signal.type}; mend the file"
-            )
-    for topic, type_name in types.items():
-        model.signals.check(topic, type_name, type_fields)
-    return types
-
-
-def _held(model: UncertainLTI, signals: Sequence[int]) -> float:
-    """How long the last values of these signals may be used, s."""
-    if any(i < model.n for i in signals):
-        return 0.0
-    holds = [model.signals[i].max_hold for i in signals]
-    return max(math.inf if hold is None else hold for hold in holds)
-
-
-class Session:
-    """Samples and judges the messages of one model, and keeps count.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted to a recording.
-    rule : Rule
-        The alarm rule.
-    types : mapping of str to str
-        From `topic_types`.
-    type_fields : callable
-        Type name -> {field name: FieldType}.
-    make_reader : callable
-        Type name and paths -> `MessageReader`.
-    now : float
-        A steady time in s, as everywhere below.
-    arming : Arming, optional
-        Of the session before: where the condition asks for the same field, what is known of that stays.
-    catch_up : float, optional
-        How long messages wait in `accept` at most, s; 0 for not at all.
-
-    Attributes
-    ----------
-    latched : bool
-        An alarm has been raised that lasts until `reset`.
-    enable_topic : str
-        Topic of the enable condition; empty without one.
-    period : Period
-        What has happened since the last report.
-    reordered : int
-        Messages that were taken after one that came later.
-    caught_up : str
-        What the last catching up came to, in words; empty as long as no message was put in order.
-
-    Raises
-    ------
-    ModelError
-        The rule does not fit.
-    SignalError
-        The model does not state how samples are cut.
-    """
-
-    def __init__(
-        self,
-        model: UncertainLTI,
-        rule: Rule,
-        types: Mapping[str, str],
-        type_fields: TypeFields,
-        make_reader: MakeReader,
-        now: float,
-        arming: Arming | None = None,
-        catch_up: float = WINDOW,
-    ) -> None:
-        self.model, self._model_types = model, types
-        self._type_fields, self._make_reader = type_fields, make_reader
-        signals = model.signals
-        self._readers = {
-            topic: make_reader(types[topic], [FieldPath(signals.signals[i].field) for i in signals.on(topic)])
-            for topic in signals.topics
-        }
-        self._held = {topic: _held(model, signals.on(topic)) for topic in signals.topics}
-        stamped = [topic for topic in signals.topics if signals.time[topic] == "header"]
-        self._stamped = [topic for topic in stamped if topic != signals.clock]
-        waits = signals.clock in stamped and bool(self._stamped) and catch_up > 0.0  # arrivals are in order as they are
-        self._window, self._stall = catch_up, max(STALL, 5 * (model.sampling.dt_median or 0.0)) if waits else math.inf
-        self.arming = arming if arming is not None else Arming(None, 0)
-        self.latched, self.enable_topic, self.enable_type = False, "", ""
-        self._follow(rule)
-        self.restart(now)
-
-    def restart(self, now: float) -> None:
-        """Forget every message, verdict and count; keep the last value of the enable condition.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-        """
-        self._start()
-        self.unreadable: Counter[str] = Counter()
-        self.why_unreadable: dict[str, str] = {}
-        self.future: Counter[str] = Counter()
-        self.received: Counter[str] = Counter()
-        self.verdicts = self.alarms = self.failures = 0
-        self.violations = [0] * self.model.n
-        self.last: Verdict | None = None
-        self._heard: dict[str, float] = {}
-        self._began, self._judged = now, -math.inf
-        self._came = now
-        self._catches_up = self._catch_up(self._stamped, start=True) if math.isfinite(self._stall) else None
-        self.reordered, self.caught_up = 0, ""
-        self.period = Period(now)
-
-    def _start(self) -> None:
-        self.sampler = Sampler(self.model.signals)
-        self.reset()
-        self.arming.restart()
-
-    def follow(self, rule: Rule) -> None:
-        """Judge by another alarm rule from now on.
-
-        The alarm starts cleared, and one that is raised is latched if the rule asks for it. A rule equal to the
-        present one changes nothing.
-
-        Parameters
-        ----------
-        rule : Rule
-            The alarm rule.
-
-        Raises
-        ------
-        ModelError
-            The rule does not fit; the old one stays.
-        SignalError
-            The condition's field is not in its type.
-        """
-        if rule != self.rule:
-            raised = self.alarm
-            self._follow(rule)
-            self.latched = rule.latch and raised
-
-    def _follow(self, rule: Rule) -> None:
-        monitor, condition, enable_type, reader = self._prepared(rule)
-        self.monitor, self.rule = monitor, rule
-        self.explainer = Explainer(self.model)
-        self.reasons = Reasons(self.model, monitor.alarms.rules)
-        self.enable_type, self._reads_condition = enable_type, reader
-        self.arming = Arming(condition, to_ns(rule.grace), self.arming.said_on(condition))
-        self.enable_topic = condition.topic if condition else ""
-
-    def go_on_from(self, other: Session) -> None:
-        """Keep what the previous session knows: the last values of topics that both read alike, and a latched alarm.
-
-        States start over; controls would not arrive again if they are sent on a change only.
-
-        Parameters
-        ----------
-        other : Session
-            The previous session.
-        """
-        mine, theirs = self.model.signals, other.model.signals
-        for topic in self.types:
-            if topic in other._heard:
-                self._heard[topic] = other._heard[topic]
-        for topic in mine.topics:
-            fields = {theirs.signals[i].field: k for k, i in enumerate(theirs.on(topic))}
-            wanted = [mine.signals[i].field for i in mine.on(topic)]
-            alike = other._model_types.get(topic) == self._model_types[topic] and set(wanted) <= set(fields)
-            clocks = topic in (self.sampler.clock, other.sampler.clock)
-            if clocks or not alike or theirs.time.get(topic) != mine.time[topic]:
-                continue
-            for stamp, arrival, values in other.sampler.kept(topic):
-                self.sampler.push(topic, arrival, stamp or None, [values[fields[field]] for field in wanted])
-        if all(topic in self._heard for topic in self._model_types):
-            self._catches_up = None  # the stream is the same
-        self._came = other._came
-        if other.enable_type and not self.enable_type and other.arming.said_on(self.arming.condition) is not None:
-            self.found_enable_type(other.enable_type)
-        self.latched = self.rule.latch and other.alarm
-
-    def check(self, rule: Rule) -> None:
-        """Raise what `follow` would raise.
-
-        Parameters
-        ----------
-        rule : Rule
-            The alarm rule.
-
-        Raises
-        ------
-        ModelError
-            As `follow`.
-        SignalError
-            As `follow`.
-        """
-        self._prepared(rule)
-
-    def _prepared(self, rule: Rule) -> tuple[EnvelopeMonitor, Condition | None, str, MessageReader | None]:
-        monitor = rule.monitor(self.model)
-        condition = Condition.parse(rule.enable)
-        enable_type, reader = "", None
-        if condition is not None:
-            found = self.enable_type if condition.topic == self.enable_topic else ""
-            enable_type = rule.enable_type or self._model_types.get(condition.topic, found)
-            if enable_type:
-                reader = self._condition_reader(condition, enable_type)
-        return monitor, condition, enable_type, reader
-
-    def _condition_reader(self, condition: Condition, type_name: str) -> MessageReader:
-        if self._model_types.get(condition.topic, type_name) != type_name:
-            raise ModelError(
-                f"parameter enable: {condition.topic} carries {self._model_types[condition.topic]} in the model, and "
-                f"enable_type says {type_name}; leave enable_type empty"
-            )
-        condition.field.check(condition.topic, type_name, self._type_fields)
-        return self._make_reader(type_name, [condition.field])
-
-    def found_enable_type(self, type_name: str) -> None:
-        """Take the type of the condition's topic from the graph.
-
-        Parameters
-        ----------
-        type_name : str
-            As package/msg/Name.
-
-        Raises
-        ------
-        SignalError
-            The condition's field is not in it.
-        ModelError
-            The model has another type for the topic.
-        """
-        assert self.arming.condition is not None
-        self._reads_condition = self._condition_reader(self.arming.condition, type_name)
-        self.enable_type = type_name
-
-    @property
-    def types(self) -> dict[str, str]:
-        """Topics to listen to with their types, as far as these are known."""
-        types = dict(self._model_types)
-        if self.enable_type:
-            types[self.enable_topic] = self.enable_type
-        return types
-
-    @property
-    def decoded(self) -> dict[str, int]:
-        """Messages per topic that were decoded by the middleware, as they fitted no layout."""
-        return {topic: reader.decoded for topic, reader in self._readers.items()}
-
-    @property
-    def alarm(self) -> bool:
-        """The alarm, as published on ~/violation."""
-        return self.monitor.alarm or self.latched
-
-    def reset(self) -> None:
-        """End a latched alarm, and forget the verdicts in its window."""
-        self.monitor.reset()
-        self.latched = False
-        self.reasons.reset()
-
-    def failed(self) -> None:
-        """Start over after an unexpected error: what was half done must not be joined to what follows."""
-        latched, counters = self.latched, self.sampler.counters
-        self._start()
-        self.latched, self.sampler.counters = latched, counters
-        self.failures += 1
-
-    def _catch_up(self, awaited: Sequence[str], start: bool) -> CatchUp:
-        step, max_gap = self.model.sampling.dt_median or 0.0, self.sampler.signals.max_gap
-        return CatchUp(self.sampler.clock, self._stamped, awaited, step, to_ns(max_gap), self._window, start)
-
-    def accept(self, topic: str, arrival_ns: int, data: bytes, now: float) -> Sequence[Waiting]:
-        """Receive one serialised message, and tell which messages are to be taken now.
-
-        That is this message, except at the start and after a stall, when messages wait until topics have caught
-        up with each other (`CatchUp`). Then `release` has to be called every now and then.
-
-        Parameters
-        ----------
-        topic : str
-            Its topic.
-        arrival_ns : int
-            Its arrival, ns.
-        data : bytes
-            The message.
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        sequence of (str, int, bytes)
-            Arguments of `take`, of each message in order.
-        """
-        before, self._came = self._came, now
-        if self._catches_up is None:
-            if now - before <= self._stall:
-                return ((topic, arrival_ns, data),)
-            lately = [t for t in self._stamped if self._heard.get(t, -math.inf) >= before - self._stall]
-            self._catches_up = self._catch_up(lately, start=False)
-        stamp_ns = None
-        if topic in self._readers and self.sampler.signals.time[topic] == "header":
-            try:
-                stamp_ns = self._readers[topic].read(data)[0]
-            except UnreadableError:
-                return ((topic, arrival_ns, data),)  # it decides nothing
-            self._heard[topic] = now
-        self._catches_up.put(topic, arrival_ns, data, stamp_ns, now)
-        return self.release(now)
-
-    def release(self, now: float, all_of_them: bool = False) -> Sequence[Waiting]:
-        """Messages that need not wait any longer.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-        all_of_them : bool, default False
-            Whether those too that should wait: no more messages are accepted.
-
-        Returns
-        -------
-        sequence of (str, int, bytes)
-            Arguments of `take`, of each message in order.
-        """
-        waits = self._catches_up
-        if waits is None:
-            return ()
-        before = waits.reordered
-        released = waits.finish(now) if all_of_them else waits.ready(now)
-        self.reordered += waits.reordered - before
-        if waits.over:
-            self._catches_up = None
-            if waits.reordered:
-                self.caught_up = (
-                    f"topics arrived one after another, up to {waits.behind_ns * 1e-9:.3g} s apart; "
-                    f"{waits.reordered} messages were put in order, for which verdicts waited {waits.took:.2f} s"
-                )
-        return released
-
-    def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[Sequence[Verdict], bool]:
-        """Take one serialised message.
-
-        Parameters
-        ----------
-        topic : str
-            Its topic.
-        arrival_ns : int
-            Its arrival, ns.
-        data : bytes
-            The message.
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        sequence of Verdict
-            Verdicts on the clock messages that it decided.
-        bool
-            Whether it opened a sample.
-        """
-        self.received[topic] += 1
-        self._heard[topic] = now
-        if topic == self.enable_topic and self._reads_condition is not None:
-            self._learn_condition(topic, data)
-        if topic not in self._readers:
-            return _NOTHING, False
-        try:
-            stamp_ns, values = self._readers[topic].read(data)
-        except UnreadableError as error:
-            self._note_unreadable(topic, error)
-            return _NOTHING, False  # as in a recording: it is left out, and the values before it are kept
-        if stamp_ns is not None and stamp_ns > arrival_ns + _FUTURE_NS:
-            self.future[topic] += 1
-        sampler = self.sampler
-        if topic != sampler.clock:
-            sampler.push(topic, arrival_ns, stamp_ns, values)  # decides nothing
-            return _NOTHING, False
-        samples = sampler.counters["samples"]
-        verdicts = []
-        for step in sampler.push(topic, arrival_ns, stamp_ns, values):
-            before = self.alarm
-            if step.status is Status.RESET:
-                self.arming.restart()
-            # a dropped message is no sample and changes nothing; asking every status for that would cost more
-            armed = (step.status is not Status.OK and step.status.dropped) or self.arming.at(step.t_ns)
-            verdict = self.monitor.judge(step, armed)
-            self.latched = self.latched or (self.rule.latch and verdict.alarm)
-            verdicts.append(verdict)
-            self._count(verdict, before, now)
-        return verdicts, sampler.counters["samples"] > samples
-
-    def _learn_condition(self, topic: str, data: bytes) -> None:
-        assert self._reads_condition is not None
-        try:
-            (value,) = self._reads_condition.read(data)[1]
-        except UnreadableError as error:
-            if topic not in self._readers:
-                self._note_unreadable(topic, error)
-            return  # as in a recording: the value before it is kept
-        self.arming.learn(value)
-        if not self.arming.on:
-            self.monitor.reset()
-
-    def _note_unreadable(self, topic: str, error: UnreadableError) -> None:
-        self.unreadable[topic] += 1
-        self.why_unreadable[topic] = str(error)[:200]
-
-    def _count(self, verdict: Verdict, alarm_before: bool, now: float) -> None:
-        period = self.period
-        if verdict.status is not Status.OK:  # looking up one of these is slow
-            period.statuses[verdict.status] += 1
-            if verdict.status in (Status.STEP, Status.MODE, Status.FROZEN):  # the sampler does not know the model
-                self.sampler.counters[verdict.status.value] += 1
-        if verdict.frozen or verdict.repeating:
-            period.frozen |= {moved.state: moved for moved in verdict.frozen}
-            period.repeating |= {moved.state: moved for moved in verdict.repeating}
-        alarm = self.alarm
-        if alarm or not verdict.judged or verdict.unknown_regime or self.reasons.text != QUIET:
-            self.reasons.take(verdict, alarm)
-        self.alarms += alarm and not alarm_before
-        period.alarm |= alarm
-        if not verdict.judged:
-            return
-        self.last, self._judged = verdict, now
-        if verdict.alarm:
-            self.explainer.push(verdict.horizon_utilisation, verdict.lower, verdict.upper)
-        else:
-            self.explainer.quiet()
-        self.verdicts += 1
-        period.verdicts += 1
-        period.outside += verdict.outside_domain
-        if verdict.unknown_regime:
-            period.unknown += 1
-            period.last_unknown = verdict
-        if verdict.violated:
-            if len(period.jumps) < _SHOWN:
-                period.jumps += self.jumps_of(verdict)
-            for i, flag in enumerate(verdict.numbers("flags")):
-                if flag == 1.0:
-                    self.violations[i] += 1
-                    period.violations[i] += 1
-
-    def predict(self) -> Verdict | None:
-        """Bounds for one median step after the open sample, as `EnvelopeMonitor.expect` gives them.
-
-        None where a signal is missing, or the model does not know its median step.
-
-        Returns
-        -------
-        Verdict or None
-            Its `lower` and `upper` are the bounds; None if there are none.
-        """
-        dt, latest = self.model.sampling.dt_median, self.sampler.latest()
-        if dt is None or latest is None:
-            return None
-        t_ns, z = latest
-        return self.monitor.expect(t_ns + round(dt * 1e9), z, dt) if all_finite(z) else None
-
-    def foresee(self) -> Foreseen | None:
-        """Bounds at the end of the longest horizon after the open sample, as `EnvelopeMonitor.foresee` gives them.
-
-        Returns
-        -------
-        Foreseen or None
-            None where `predict` gives None, and without horizons.
-        """
-        dt, latest = self.model.sampling.dt_median, self.sampler.latest()
-        if dt is None or latest is None or not all_finite(latest[1]):
-            return None
-        return self.monitor.foresee(*latest, dt)
-
-    def reason(self, now: float, timeout: float) -> str:
-        """What holds the alarm, or why there is no verdict, as published on ~/reason.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-        timeout : float
-            Time without a verdict, s, after which that is said.
-
-        Returns
-        -------
-        str
-            In words that change only with the cause.
-        """
-        text = self.reasons.text
-        if self.without_verdict(now) <= timeout or "no verdict:" in text:
-            return text
-        silent = self.silent_for(now) > timeout
-        why = f"no message on {self.sampler.clock}" if silent else "no sample could be judged"
-        said = f"no verdict for more than {timeout:g} s: {why}"
-        return f"{text}; {said}" if self.alarm else said
-
-    @property
-    def late(self) -> int:
-        """Messages that arrived after their sample was closed."""
-        return sum(self.sampler.counters.of(LATE).values())
-
-    def heard(self, topic: str) -> float | None:
-        """When the last message of a topic arrived.
-
-        Parameters
-        ----------
-        topic : str
-            The topic.
-
-        Returns
-        -------
-        float or None
-            Steady time, s; None where none has come.
-        """
-        return self._heard.get(topic)
-
-    def held(self, topic: str) -> float:
-        """How long the last values of a topic may be used.
-
-        Parameters
-        ----------
-        topic : str
-            The topic.
-
-        Returns
-        -------
-        float
-            Seconds; infinite where the model sets no limit.
-        """
-        return self._held.get(topic, math.inf)  # infinite for that of the enable condition
-
-    def without_verdict(self, now: float) -> float:
-        """Time since the last verdict, or since the start.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        float
-            Seconds.
-        """
-        return now - max(self._judged, self._began)
-
-    def silent_for(self, now: float) -> float:
-        """Time since the last message of the clock topic.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        float
-            Seconds.
-        """
-        return now - self._heard.get(self.sampler.clock, self._began)
-
-    def pass_over(self, now: float) -> Period:
-        """Begin another period for `report`.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        Period
-            The period that ends.
-        """
-        period, self.period = self.period, Period(now)
-        self.period.alarm = self.alarm
-        self.period.late = self.late
-        self.period.unreadable = self.unreadable.total()
-        self.period.future = self.future.total()
-        self.period.counters = Counter(self.sampler.counters)
-        return period
+class Session(Stream):
+    """A stream that reports on itself, in the words and levels of diagnostics; takes what `Stream` takes."""
 
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
         """Statuses of the monitor and of each state since the last call.
@@ -846,7 +97,7 @@ class Session:
             if period.statuses[status]:
                 which = ""
                 if status is Status.MISSING:
-                    which = f" ({shortlist(self.lacking(period.counters), _SHOWN)})"
+                    which = f" ({shortlist(self.lacking(period.counters), SHOWN)})"
                 complaints.append(f"{period.statuses[status]} samples without a verdict: {WHY[status]}{which}")
         dropped = sum(count for status, count in period.statuses.items() if status.dropped)
         if dropped:
@@ -860,7 +111,7 @@ class Session:
             complaints.append(f"{self.future.total() - period.future} stamps lie over {FUTURE:g} s in the future")
         if off := self.arming.why_off():
             (complaints if self.arming.on is None else calm).append(off)
-        complaints += period.jumps[:_SHOWN]
+        complaints += period.jumps[:SHOWN]
         if self.monitor.masked:
             calm.append(f"masked: {', '.join(self.monitor.masked)}")
         if self.latched and not self.monitor.alarm:
@@ -892,6 +143,29 @@ class Session:
         message = "; ".join([*(complaints or [f"{well}, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
 
+    def reason(self, now: float, timeout: float) -> str:
+        """What holds the alarm, or why there is no verdict, as published on ~/reason.
+
+        Parameters
+        ----------
+        now : float
+            Steady time, s.
+        timeout : float
+            Time without a verdict, s, after which that is said.
+
+        Returns
+        -------
+        str
+            In words that change only with the cause.
+        """
+        text = self.reasons.text
+        if self.without_verdict(now) <= timeout or "no verdict:" in text:
+            return text
+        silent = self.silent_for(now) > timeout
+        why = f"no message on {self.sampler.clock}" if silent else "no sample could be judged"
+        said = f"no verdict for more than {timeout:g} s: {why}"
+        return f"{text}; {said}" if self.alarm else said
+
     def likeness(self) -> Likeness | None:
         """What the alarm that is on, or was on last, looks like.
 
@@ -917,25 +191,6 @@ class Session:
         """
         assert self.model.repeats is not None
         return frozen_words(self.model.state_names[moved.state], moved, self.model.repeats)
-
-    def jumps_of(self, verdict: Verdict) -> list[str]:
-        """What is said of states that left their bounds by a jump larger than any of the fit.
-
-        Parameters
-        ----------
-        verdict : Verdict
-            On a sample.
-
-        Returns
-        -------
-        list of str
-            Names the states; empty if none did.
-        """
-        if not verdict.violated:
-            return []
-        flags = zip(self.model.state_names, verdict.numbers("flags"), strict=True)
-        counted = [0.0 if name in self.monitor.masked else flag for name, flag in flags]
-        return jumps_in_words(self.model, verdict.before, verdict.numbers("state"), counted)
 
     def lacking(self, before: Counter[str]) -> list[str]:
         """Signals that samples had no value of since some counters.

@@ -22,9 +22,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.monitor.envelope_monitor import Verdict
 from uncertain_lti.monitor.outputs import FLAG_TYPE, REASON, RECORDED
 from uncertain_lti.monitor.reason import Reasons
+from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, VerdictMessages, text_message
 from uncertain_lti.recordings.mcap_writer import McapWriter
 
@@ -168,7 +168,8 @@ class Scene:
             The file cannot be written.
         """
         count = 0
-        encode = VerdictMessages(self.names, steps=self.steps, statistics=self.statistics).encode
+        messages = VerdictMessages(self.names, steps=self.steps, statistics=self.statistics)
+        encode = {name: messages.encoder([name]) for name in messages.outputs}
         with open(path, "xb") as stream:
             writer = McapWriter(stream, "uncertain-lti")
             writer.metadata("uncertain_lti", self.notes)
@@ -194,7 +195,7 @@ class Scene:
                         if output.when == "judged" and not verdict.judged:
                             continue
                         alarm = TRUE if entry.alarm else FALSE
-                        data = alarm if output.type == FLAG_TYPE else encode[output.name](verdict)
+                        data = alarm if output.type == FLAG_TYPE else encode[output.name](verdict)[0]
                         writer.message(channel, log_time, data)
                         count += 1
                     if reason is None or self.reasons is None:

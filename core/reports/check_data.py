@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.jumps import jump_words, jumps
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.envelope_monitor import Verdicts
 from uncertain_lti.monitor.frozen import repeat_words
 from uncertain_lti.monitor.likeness import LEAST, over_recording
+from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.regimes import check_regimes, sample_blocks, unknown_in_words
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.status import Status

@@ -29,7 +29,7 @@ from uncertain_lti.base.arrays import Array, Integers
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.drawing import (
     ALARM,
     ENVELOPE,

@@ -24,7 +24,7 @@ from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.files import sha256
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.detectable_text import detectable_data
 from uncertain_lti.reports.plain_data import finite_data, list_of, numbers_of

@@ -18,7 +18,7 @@ import numpy as np
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.drawing import ALARM, NO_VERDICT, VIOLATED, WIDTH, new_figure, patch, short
 from uncertain_lti.reports.figure_columns import DrawnColumns, TimeAxis
 

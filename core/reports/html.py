@@ -30,7 +30,7 @@ from PIL import Image  # which matplotlib brings
 from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.recordings.recording import Progress
 from uncertain_lti.reports import alt_texts, schedule_figures
 from uncertain_lti.reports import figures as plots

@@ -30,7 +30,7 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.envelope_monitor import Verdicts
+from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.figure_columns import DrawnColumns, TimeAxis, forward
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal
