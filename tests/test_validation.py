@@ -394,6 +394,16 @@ def test_calibration_keeps_to_the_target_and_says_what_it_costs(validation, runs
             assert a.margin >= b.margin
 
 
+def test_few_groups_are_enough_for_fewer_rules(validation):
+    """The error is not shared with rules that the groups could not carry even without an alarm."""
+    by_day = replace(validation, parts=tuple(replace(p, group=f"day {i // 4}") for i, p in enumerate(validation.parts)))
+    hours = sum(p.hours for p in by_day.parts)
+    one = rate_interval(np.zeros(by_day.units), 1.0, validation.confidence, one_sided=True)[1] / hours
+    some, none = calibrate(by_day, 1.01 * one), calibrate(by_day, 0.99 * one)
+    assert [(c.violations, c.window) for c in some.candidates] == [(1, 1)] and some.needed_hours < hours
+    assert len(none.candidates) > 1 and none.alarm_rule is None and none.needed_hours > hours
+
+
 def test_calibration_refuses_what_so_little_cannot_show(validation):
     found = calibrate(validation, 0.1)
     assert found.alarm_rule is None and found.hours < found.needed_hours

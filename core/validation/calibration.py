@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -194,7 +194,8 @@ def calibrate(
     For each rule, factors on its margins and thresholds are tried from the largest down, as long as the upper
     confidence limit of the false alarms on the left-out parts stays at or below the target; going in a fixed order and
     stopping at the first failure, the confidence of one test holds for the whole search. No margin goes below 1. The
-    error is shared equally among the candidates, so that choosing among them costs no confidence. A candidate is m of n
+    error is shared equally among the candidates, so that choosing among them costs no confidence; where the recordings
+    could not show the target for so many even without an alarm, the longest m of n are not tried. A candidate is m of n
     violations, or statistics over one window (each of those named, and all together) beside containment of every
     verdict; all of it also over every horizon of the model. The alarms of all together are counted, while one factor
     lowers all thresholds on the scale that the peaks on the other recordings give (`armed`). Chosen is the candidate
@@ -249,10 +250,18 @@ def calibrate(
     if not tried:
         raise FitError("no alarm rule to choose from; give at least one (violations, window)")
     confidence = validation.confidence if confidence is None else confidence
-    each = 1.0 - (1.0 - confidence) / len(tried)
     hours = sum(p.hours for p in parts)
+
+    def without_alarm(candidates: int) -> float:
+        """Time without a false alarm that shows the target, h, where the error is shared among so many."""
+        one = 1.0 - (1.0 - confidence) / candidates
+        return float(rate_interval(np.zeros(validation.units), 1.0, one, one_sided=True)[1]) / target
+
+    if rules is None:
+        tried = _affordable(tried, lambda count: without_alarm(count) <= hours)
+    each = 1.0 - (1.0 - confidence) / len(tried)
     candidates = tuple(_candidate(model, parts, family, target, each, hours, within) for family in tried)
-    needed = rate_interval(np.zeros(validation.units), 1.0, each, one_sided=True)[1] / target
+    needed = without_alarm(len(tried))
     found = [c for c in candidates if c.margin is not None]
     if not found:
         words = _refusal(candidates, target, hours, needed)
@@ -269,6 +278,16 @@ def calibrate(
     one_step = containment(best.rules)
     warning = _insensitive(best.faults, model.state_names)
     return Calibration(one_step, target, confidence, hours, needed, within, candidates, words, warning, best.rules)
+
+
+def _affordable(tried: list[Family], enough: Callable[[int], bool]) -> list[Family]:
+    """As many m of n, the plainest first, as the recordings are enough for; all of them if they never are."""
+    counted = [family for family in tried if not family.kinds]
+    for dropped in range(len(counted)):
+        if enough(len(tried) - dropped):
+            late = counted[len(counted) - dropped :]
+            return [family for family in tried if family not in late]
+    return tried
 
 
 def _candidate(
