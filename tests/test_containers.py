@@ -144,7 +144,7 @@ def test_an_annotated_copy_is_that_of_the_mcap(converted, kind, tmp_path, capsys
     expected, copy = copies
     assert {t: i.count for t, i in copy.topics.items()} == {t: i.count for t, i in expected.topics.items()}
     below = [t for t in copy.topics if t.startswith("/envelope_monitor")]
-    assert len(below) == 6
+    assert {"flags", "lower", "upper", "violation", "reason"} < {t.rsplit("/", 1)[1] for t in below}
     for mine, theirs in zip(copy.raw_messages(below), expected.raw_messages(below), strict=True):
         assert (mine.log_time_ns, mine.data) == (theirs.log_time_ns, theirs.data)
     for mine, theirs in zip(copy.messages(["/engine/state"]), expected.messages(["/engine/state"]), strict=True):
