@@ -335,7 +335,7 @@ def _activity(model: Any, transient: Any, steps: Any) -> Array:
         chosen = np.zeros(len(t), dtype=bool)
         chosen[a : a + _BLOCK] = True
         part, at = steps.take(chosen), t[a : a + _BLOCK]
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             centre, half = np.empty((model.n, len(at))), np.empty((model.n, len(at)))
             z = model.normalised_columns(part)
             model.columns_centre_and_half(z, part.dt, centre, half)
