@@ -23,10 +23,12 @@ from hypothesis import strategies as st
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base import compiled
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.bounds import lower_of, normalised, upper_of
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Horizon, Run
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, SHAPES
+from uncertain_lti.monitor.foreseen import Foreseen
 from uncertain_lti.monitor.verdict import place as place_of
 from uncertain_lti.sampling.sampler import Sampler, Step
 from uncertain_lti.sampling.status import Status
@@ -290,6 +292,48 @@ def test_what_is_foreseen_is_judged_when_the_longest_horizon_ends() -> None:
         assert packed[place_of("lower", model.n)] == found.lower.tobytes()
         assert packed[place_of("upper", model.n)] == found.upper.tobytes()
     assert EnvelopeMonitor(model.replace(horizons=())).foresee(0, [*x[0], *u[0]], dt) is None
+
+
+@settings(max_examples=30, deadline=None)
+@given(streams())
+def test_what_is_foreseen_is_the_envelope_if_nothing_changes(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
+    """By the bits of the arrays, compiled or not; and what is judged does not depend on what was foreseen."""
+    model, transient, steps = case
+    whole = EnvelopeMonitor(model).check(transient).horizon_utilisation
+    ahead = [expected_ahead(model, step) for step in steps[:20]]
+    found = foreseen(model, steps, whole)
+    assert [None if one is None else (one.lower.tobytes(), one.upper.tobytes()) for one in found] == ahead
+    patch = pure()
+    try:
+        other = foreseen(model, steps, whole)
+    finally:
+        patch.undo()
+    for one, two in zip(found, other, strict=True):
+        assert (one is None) == (two is None)
+        assert one is None or two is None or one.packed() == two.packed()
+
+
+def foreseen(model: UncertainLTI, steps: list[Step], whole: Any) -> list[Foreseen | None]:
+    monitor, found, rows = EnvelopeMonitor(model, margin=1.5), list[Foreseen | None](), []
+    for k, step in enumerate(steps):
+        verdict = monitor.judge(step)
+        if not step.status.dropped:
+            rows.append(verdict.horizon_utilisation)
+        if k < 20:
+            found.append(monitor.foresee(step.t_ns, [*step.after, *step.before[model.n :]], 0.01))
+    assert np.array(rows).tobytes() == whole.tobytes()
+    return found
+
+
+def expected_ahead(model: UncertainLTI, step: Step) -> tuple[bytes, bytes] | None:
+    point, count = model.operating_point, model.steps[-1]
+    z = normalised(np.array([*step.after, *step.before[model.n :]]), point.steady, point.scale)
+    z = np.repeat(z[:, None], count, axis=1)
+    if not np.isfinite(z).all() or not model.regime(z)[0].all():
+        return None
+    *_, (_, centre, half) = model.envelopes(np.arange(count), z, np.full(count, 0.01))
+    lower, upper = (point.recorded_x(of(centre[:, 0], half[:, 0], 1.5)) for of in (lower_of, upper_of))
+    return (lower.tobytes(), upper.tobytes()) if np.isfinite([lower, upper]).all() else None
 
 
 @pytest.mark.parametrize("schedule", [None, SPEED])

@@ -402,7 +402,7 @@ def visited(z: Any, least: Any, greatest: Any, occupied: Any) -> Any:
 def ordered_sum(weights: Any, values: Any) -> Any:
     """Sum of weights * values over the first axis, from the first element to the last.
 
-    No BLAS, whose order depends on shapes. Compiled code has the same sum in `Judge._ordered_sums`.
+    No BLAS, whose order depends on shapes. Compiled code has the same sum in `_sum_columns`.
 
     Parameters
     ----------
@@ -416,6 +416,29 @@ def ordered_sum(weights: Any, values: Any) -> Any:
     """
     products = np.multiply(weights, values, order="C")  # the layout decides the order of the sum
     return _sum_of_rows(products.shape)(products)
+
+
+@cython.cfunc
+@cython.exceptval(check=False)
+def _sum_columns(
+    table: cython.p_double,
+    values: cython.p_double,
+    total: cython.p_double,
+    rows: cython.Py_ssize_t,
+    columns: cython.Py_ssize_t,
+) -> cython.void:
+    """`ordered_sum` of a table, column after column, and one value for each: the rows of a column beside each other."""
+    i: cython.Py_ssize_t
+    j: cython.Py_ssize_t
+    value: cython.double = values[0]
+    column: cython.p_double
+    for i in range(rows):
+        total[i] = table[i] * value
+    for j in range(1, columns):
+        value = values[j]
+        column = table + j * rows
+        for i in range(rows):
+            total[i] += column[i] * value
 
 
 @cache
@@ -645,6 +668,7 @@ class Judge:
     _greatest: cython.double[::1]
     _counted: cython.uchar[::1]
     _phi: cython.double[::1]
+    _psi: cython.double[::1]
     _rate: cython.double[::1]
     _spread: cython.double[::1]
     _blank = cython.declare(object)
@@ -729,7 +753,7 @@ class Judge:
             self._steady, self._scale = _doubles(steady), _doubles(scale)
             self._least, self._greatest = _doubles(least), _doubles(greatest)
             self._counted = bytearray(np.asarray(counted, dtype=np.uint8).tobytes())
-            self._phi = _doubles(one)
+            self._phi, self._psi = _doubles(one), _doubles(one)
             self._rate, self._spread = _doubles(np.zeros(self.n)), _doubles(np.zeros(self.n))
             self._blank = array("d", bytes(40 * self.n))
             self._per_unit = _doubles(cells_per_unit(least, greatest, self._cells))
@@ -814,34 +838,25 @@ class Judge:
     def _one(self, before: Any, after: Any, dt: cython.double) -> Judgement | None:
         n: cython.Py_ssize_t = self.n
         i: cython.Py_ssize_t
-        z: cython.double
         left: cython.bint = False
         every: cython.bint = True
         violation: cython.bint = False
         unknown: cython.bint = False
         regime: cython.int = 0
+        regime = self._read(before)
+        if regime < 0:
+            return None
+        left = unknown = regime > 0
         for i in range(self.size):
-            z = before[i]
-            self._phi[i] = z = normalised(z, self._steady[i], self._scale[i])
-            left = left or outside(z, self._least[i], self._greatest[i])
-        if self._axes:
-            for i in range(self.size, self.total):
-                z = before[i]
-                self._z[i] = normalised(z, self._steady[i], self._scale[i])
-            regime = self._blend()
-            if regime < 0:
-                return None
-            unknown = regime > 0
-            left = left or unknown
+            left = left or outside(self._phi[i], self._least[i], self._greatest[i])
         if self._cells and not left:
             left = self._unvisited()
-        self._ordered_sums(
-            cython.address(self._theta[0]),
-            cython.address(self._delta[0]),
-            cython.address(self._phi[0]),
-            cython.address(self._rate[0]),
-            cython.address(self._spread[0]),
-        )
+        for i in range(self.p):
+            self._psi[i] = abs(self._phi[i])
+        rate: cython.p_double = cython.address(self._rate[0])
+        spread: cython.p_double = cython.address(self._spread[0])
+        _sum_columns(cython.address(self._theta[0]), cython.address(self._phi[0]), rate, n, self.p)
+        _sum_columns(cython.address(self._delta[0]), cython.address(self._psi[0]), spread, n, self.p)
         blank = array("d", self._blank)
         values: cython.double[::1] = blank
         x_next: cython.double
@@ -853,7 +868,7 @@ class Judge:
         for i in range(n):
             x_next = after[i]
             x_next = normalised(x_next, self._steady[i], self._scale[i])
-            centre, half = centre_of(self._phi[i], dt, self._rate[i]), half_of(dt, self._spread[i], self._v[i])
+            centre, half = centre_of(self._phi[i], dt, rate[i]), half_of(dt, spread[i], self._v[i])
             lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)
             inside = contained(lower, x_next, upper)
             if not inside:
@@ -865,6 +880,23 @@ class Judge:
             values[3 * n + i] = not inside
             values[4 * n + i] = utilisation_of(x_next - centre, half)
         return Judgement(blank, every, violation, left, unknown)
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    def _read(self, before: Any) -> cython.int:
+        """Normalise [x; u; s], and blend by it what `_blend` does; its result, and 0 without a schedule."""
+        i: cython.Py_ssize_t
+        z: cython.double
+        for i in range(self.size):
+            z = before[i]
+            self._phi[i] = normalised(z, self._steady[i], self._scale[i])
+        if not self._axes:
+            return 0
+        for i in range(self.size, self.total):
+            z = before[i]
+            self._z[i] = normalised(z, self._steady[i], self._scale[i])
+        return self._blend()
 
     @cython.cfunc
     @cython.boundscheck(False)
@@ -977,34 +1009,6 @@ class Judge:
                     return True
                 pair += 1
         return False
-
-    @cython.cfunc
-    @cython.exceptval(check=False)
-    def _ordered_sums(
-        self,
-        theta: cython.p_double,
-        delta: cython.p_double,
-        phi: cython.p_double,
-        rate: cython.p_double,
-        spread: cython.p_double,
-    ) -> cython.void:
-        """`ordered_sum` of Theta phi and Delta |phi|: columns from first to last, the rows of one beside each other."""
-        n: cython.Py_ssize_t = self.n
-        i: cython.Py_ssize_t
-        j: cython.Py_ssize_t
-        value: cython.double
-        size: cython.double
-        for j in range(self.p):
-            value = phi[j]
-            size = abs(value)
-            if j == 0:
-                for i in range(n):
-                    rate[i] = theta[i] * value
-                    spread[i] = delta[i] * size
-            else:
-                for i in range(n):
-                    rate[i] += theta[j * n + i] * value
-                    spread[i] += delta[j * n + i] * size
 
     def advance(
         self, x: Any, time: Any, control: Any, z: Any, dt: Any, begin: Any, a: cython.Py_ssize_t, b: cython.Py_ssize_t
@@ -1133,24 +1137,12 @@ class Judge:
         value: cython.double
         rate: cython.p_double
         state: cython.p_double
-        theta: cython.p_double = cython.address(self._theta[0])
         while low < high:
             width = high - low if high - low < most else most
-            for i in range(n):
-                rate = cython.address(self._rates[i * most])
-                state = cython.address(x[low])
-                value = theta[i]
-                for k in range(width):
-                    rate[k] = value * state[k]
-                for j in range(1, n):
-                    state = cython.address(x[j * stride + low])
-                    value = theta[j * n + i]
-                    for k in range(width):
-                        rate[k] += value * state[k]
-                for j in range(n, self.p):
-                    value = theta[j * n + i] * self._phi[j]
-                    for k in range(width):
-                        rate[k] += value
+            if width == 1:
+                self._rates_of_one(x, stride, low)
+            else:
+                self._rates_of_many(x, stride, low, width)
             for i in range(n):
                 rate = cython.address(self._rates[i * most])
                 state = cython.address(x[i * stride + low])
@@ -1165,6 +1157,53 @@ class Judge:
                 for k in range(width):
                     state[k] += value
             low += width
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _rates_of_many(
+        self, x: cython.double[::1], stride: cython.Py_ssize_t, low: cython.Py_ssize_t, width: cython.Py_ssize_t
+    ) -> cython.void:
+        """`ordered_sum` of the nominal elements and the states of runs beside each other, into `_rates`."""
+        n: cython.Py_ssize_t = self.n
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        k: cython.Py_ssize_t
+        value: cython.double
+        rate: cython.p_double
+        state: cython.p_double
+        theta: cython.p_double = cython.address(self._theta[0])
+        for i in range(n):
+            rate = cython.address(self._rates[i * self._together])
+            state = cython.address(x[low])
+            value = theta[i]
+            for k in range(width):
+                rate[k] = value * state[k]
+            for j in range(1, n):
+                state = cython.address(x[j * stride + low])
+                value = theta[j * n + i]
+                for k in range(width):
+                    rate[k] += value * state[k]
+            for j in range(n, self.p):
+                value = theta[j * n + i] * self._phi[j]
+                for k in range(width):
+                    rate[k] += value
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _rates_of_one(self, x: cython.double[::1], stride: cython.Py_ssize_t, low: cython.Py_ssize_t) -> cython.void:
+        """The same of one run, whose rows are beside each other; its state takes the place of that in `_phi`."""
+        n: cython.Py_ssize_t = self.n
+        i: cython.Py_ssize_t
+        rate: cython.p_double = cython.address(self._rate[0])
+        for i in range(n):
+            self._phi[i] = x[i * stride + low]
+        _sum_columns(cython.address(self._theta[0]), cython.address(self._phi[0]), rate, n, self.p)
+        for i in range(n):
+            self._rates[i * self._together] = rate[i]
 
 
 @cython.cclass
@@ -1218,7 +1257,11 @@ class Runs:
     _rate: cython.double[::1]
     _spread: cython.double[::1]
     _phi: cython.double[::1]  # beyond the states and the mean controls 1
+    _psi: cython.double[::1]
     _blank = cython.declare(object)
+    _ahead: cython.double[::1]  # of the run that is foreseen, as of the others
+    _ahead_time: cython.double[::1]
+    _ahead_control: cython.double[::1]
 
     def __init__(self, judge: Judge, horizons: Sequence[Any], runner: Judge | None = None) -> None:
         n, m = judge.n, judge.size - judge.n
@@ -1238,14 +1281,18 @@ class Runs:
             self._steps = array("q", steps)
             self._x, self._time = _doubles(np.zeros(n * longest)), _doubles(np.zeros(longest))
             self._control, self._start = _doubles(np.zeros(m * longest or 1)), _doubles(np.zeros(n * longest))
-            self._places, self._weights = array("q", bytes(32 * longest)), _doubles(np.zeros(4 * longest))
+            most = longest + 1  # the last one is foreseen
+            self._places, self._weights = array("q", bytes(32 * most)), _doubles(np.zeros(4 * most))
+            self._ahead, self._ahead_time = _doubles(np.zeros(n)), _doubles(np.zeros(1))
+            self._ahead_control = _doubles(np.zeros(m or 1))
             self._modes = _doubles(np.zeros(2))
             columns = [[np.swapaxes(a, -1, -2) for a in table[:2]] for table in tables]
             self._theta = _doubles(np.stack([theta for theta, _ in columns]))
             self._delta = _doubles(np.stack([delta for _, delta in columns]))
             self._v = _doubles(np.stack([v for *_, v in tables]))
             self._one_theta, self._one_delta = _doubles(np.zeros(n * judge.p)), _doubles(np.zeros(n * judge.p))
-            self._one_v, self._phi = _doubles(np.zeros(n)), _doubles(np.ones(judge.p))
+            self._one_v = _doubles(np.zeros(n))
+            self._phi, self._psi = _doubles(np.ones(judge.p)), _doubles(np.ones(judge.p))
             self._rate, self._spread = _doubles(np.zeros(n)), _doubles(np.zeros(n))
             self._blank = array("d", np.full(self.count * n, np.nan).tobytes())
             self.residuals = array("d", self._blank)
@@ -1303,21 +1350,73 @@ class Runs:
         self._time[newest], self._control[:, newest], self._vectors[:, newest] = 0.0, 0.0, s
         self._runner._advance_columns(self._x, self._time, self._control, z, dt)
         found, left = np.full((2, self.count, n), np.nan)
-        for values, residual, steps, (theta, delta, v) in zip(found, left, self._steps, self._tables, strict=True):
+        for h, (values, residual, steps) in enumerate(zip(found, left, self._steps, strict=True)):
             if steps > self._under_way:
                 break
             k = (newest - steps + 1) % self._longest
             run = slice(k, k + 1)
-            time = self._time[run]
-            ones = np.ones((judge.p - judge.size, 1))
-            phi = np.concatenate([self._start[:, run], self._control[:, run] / time, ones])
-            places, weights = (None, None) if schedule is None else schedule.corners(self._vectors[:, run])
-            centre, half = centre_and_half(theta, delta, v, phi, time, places, weights, self._x[:, run])
-            lower, upper = lower_of(centre, half, 1.0)[:, 0], upper_of(centre, half, 1.0)[:, 0]
-            residual[:] = x_next - centre[:, 0]
-            values[:] = settled(utilisation_of(residual, half[:, 0]), contained(lower, x_next, upper))
+            of_run = [a[:, run] for a in (self._start, self._control, self._vectors, self._x)]
+            centre, half = self._centre_and_half(h, self._time[run], *of_run)
+            residual[:] = x_next - centre
+            inside = contained(lower_of(centre, half, 1.0), x_next, upper_of(centre, half, 1.0))
+            values[:] = settled(utilisation_of(residual, half), inside)
         self.residuals = array("d", left.tobytes())
         return array("d", found.tobytes())
+
+    def _centre_and_half(self, h: int, time: Any, start: Any, control: Any, vectors: Any, x: Any) -> Any:
+        """Centre and half-width (n,) of a horizon, from what is kept of a run, in columns."""
+        if cython.compiled:
+            return None  # not called there
+        judge = self._judge
+        phi = np.concatenate([start, control / time, np.ones((judge.p - judge.size, 1))])
+        places, weights = (None, None) if judge._schedule is None else judge._schedule.corners(vectors)
+        theta, delta, v = self._tables[h]
+        centre, half = centre_and_half(theta, delta, v, phi, time, places, weights, x)
+        return centre[:, 0], half[:, 0]
+
+    def foresee(self, before: Sequence[float], dt: cython.double) -> Any:
+        """Bounds at the end of the longest horizon, if controls and further scheduling signals stay as they are.
+
+        Parameters
+        ----------
+        before : sequence of float (n + m + q,)
+            As of `Judge.judge`, which must judge a transition again before the next `push`.
+        dt : float
+            Each step, s.
+
+        Returns
+        -------
+        buffer of doubles (2 n,), or None
+            Lower and upper bound by the margin of the judge, recorded units; None for a mode that is not listed.
+
+        Raises
+        ------
+        ValueError
+            The number of values is not that of the model's signals.
+        """
+        if len(before) != self._judge.total:
+            raise ValueError(f"{len(before)} values for {self._judge.total} signals")
+        if cython.compiled:
+            return self._foreseen(before, dt)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._foreseen_by_arrays(before, dt)
+
+    def _foreseen_by_arrays(self, before: Sequence[float], dt: float) -> Any:
+        """`_foreseen` by numpy."""
+        if cython.compiled:
+            return None  # not called there
+        judge, n, total = self._judge, self._judge.n, self._judge.total
+        steady, scale = judge._steady[:total], judge._scale[:total]
+        z = normalised(np.array(before, dtype=np.float64), steady, scale)[:, None]
+        vectors = z[judge._positions]
+        if judge._schedule is not None and judge._schedule.corners(vectors)[0][0, 0] < 0:
+            return None
+        start, x, time, control = z[:n], z[:n].copy(), np.zeros(1), np.zeros((judge.size - n, 1))
+        for _ in range(self._longest):
+            self._runner._advance_columns(x, time, control, z, dt)
+        centre, half = self._centre_and_half(self.count - 1, time, start, control, vectors, x)
+        bounds = [of(centre, half, judge.margin) for of in (lower_of, upper_of)]
+        return array("d", np.concatenate([recorded(bound, steady[:n], scale[:n]) for bound in bounds]).tobytes())
 
     @cython.cfunc
     @cython.boundscheck(False)
@@ -1339,8 +1438,6 @@ class Runs:
         size: cython.double
         x_next: cython.double
         inside: cython.bint
-        theta: cython.p_double
-        delta: cython.p_double
         v: cython.p_double
         for i in range(judge._axes):
             if not judge._of_modes[i]:
@@ -1387,22 +1484,7 @@ class Runs:
                 self._phi[i] = self._start[i * longest + k]
             for j in range(m):
                 self._phi[n + j] = self._control[j * longest + k] / time
-            i = h * judge.blocks
-            if judge._axes:
-                self._blend(i, k, corners)
-                theta, delta = cython.address(self._one_theta[0]), cython.address(self._one_delta[0])
-                v = cython.address(self._one_v[0])
-            else:
-                theta = cython.address(self._theta[i * n * judge.p])
-                delta = cython.address(self._delta[i * n * judge.p])
-                v = cython.address(self._v[i * n])
-            judge._ordered_sums(
-                theta,
-                delta,
-                cython.address(self._phi[0]),
-                cython.address(self._rate[0]),
-                cython.address(self._spread[0]),
-            )
+            v = self._correct(h, k, corners)
             for i in range(n):
                 x_next = after[i]
                 x_next = normalised(x_next, judge._steady[i], judge._scale[i])
@@ -1412,6 +1494,73 @@ class Runs:
                 self._residual[h * n + i] = x_next - value
                 values[h * n + i] = settled(utilisation_of(x_next - value, size), inside)
         return blank
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    def _foreseen(self, before: Any, dt: cython.double) -> Any:
+        judge: Judge = self._judge
+        runner: Judge = self._runner
+        n: cython.Py_ssize_t = judge.n
+        m: cython.Py_ssize_t = judge.size - n
+        i: cython.Py_ssize_t
+        corners: cython.Py_ssize_t = 1
+        time: cython.double
+        value: cython.double
+        size: cython.double
+        v: cython.p_double
+        if runner._read(before) < 0:
+            return None
+        for i in range(judge._axes):
+            corners *= 1 if judge._of_modes[i] else 2
+        for i in range(corners):
+            self._places[4 * self._longest + i] = runner._places[i]
+            self._weights[4 * self._longest + i] = runner._weights[i]
+        for i in range(n):
+            self._ahead[i] = self._phi[i] = runner._phi[i]
+        self._ahead_time[0] = 0.0
+        for i in range(m):
+            self._ahead_control[i] = 0.0
+        for _ in range(self._longest):
+            runner._advance(self._ahead, self._ahead_time, self._ahead_control, 1, 0, 1, dt)
+        time = self._ahead_time[0]
+        for i in range(m):
+            self._phi[n + i] = self._ahead_control[i] / time
+        v = self._correct(self.count - 1, self._longest, corners)
+        found = array("d", bytes(16 * n))
+        bounds: cython.double[::1] = found
+        for i in range(n):
+            value = centre_of(self._ahead[i], time, self._rate[i])
+            size = half_of(time, self._spread[i], v[i])
+            bounds[i] = recorded(lower_of(value, size, judge.margin), judge._steady[i], judge._scale[i])
+            bounds[n + i] = recorded(upper_of(value, size, judge.margin), judge._steady[i], judge._scale[i])
+        return found
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _correct(self, h: cython.Py_ssize_t, k: cython.Py_ssize_t, corners: cython.Py_ssize_t) -> cython.p_double:
+        """`_rate` and `_spread` of a horizon where run k began, from what is in `_phi`; gives its `v`."""
+        judge: Judge = self._judge
+        n: cython.Py_ssize_t = judge.n
+        i: cython.Py_ssize_t = h * judge.blocks
+        j: cython.Py_ssize_t
+        theta: cython.p_double
+        delta: cython.p_double
+        v: cython.p_double
+        if judge._axes:
+            self._blend(i, k, corners)
+            theta, delta = cython.address(self._one_theta[0]), cython.address(self._one_delta[0])
+            v = cython.address(self._one_v[0])
+        else:
+            theta, delta = cython.address(self._theta[i * n * judge.p]), cython.address(self._delta[i * n * judge.p])
+            v = cython.address(self._v[i * n])
+        for j in range(judge.p):
+            self._psi[j] = abs(self._phi[j])
+        _sum_columns(theta, cython.address(self._phi[0]), cython.address(self._rate[0]), n, judge.p)
+        _sum_columns(delta, cython.address(self._psi[0]), cython.address(self._spread[0]), n, judge.p)
+        return v
 
     @cython.cfunc
     @cython.boundscheck(False)

@@ -43,7 +43,7 @@ from uncertain_lti.monitor.foreseen import Foreseen
 from uncertain_lti.monitor.frozen import Bounds, FrozenWatch
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.monitor.verdicts import Verdicts
-from uncertain_lti.sampling.sampler import Step
+from uncertain_lti.sampling.sampler import Step, all_finite
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient, Transitions
 
@@ -242,20 +242,10 @@ class EnvelopeMonitor:
         Foreseen or None
             By the margin of the one-step rule; None without horizons, and where the nominal run leaves all numbers.
         """
-        if not self.model.horizons:
+        bounds = None if self._runs is None else self._runs.foresee(z, dt)
+        if bounds is None or not all_finite(bounds):
             return None
-        steps, point = max(self.model.steps), self.model.operating_point
-        now = normalised(np.array(z, dtype=np.float64), point.steady, point.scale)
-        columns = np.repeat(now[:, None], steps, axis=1)
-        found = None
-        with np.errstate(over="ignore", invalid="ignore"):
-            for windows, centre, half in self.model.envelopes(np.arange(steps), columns, np.full(steps, dt)):
-                if len(windows.last):
-                    found = tuple(of(centre[:, 0], half[:, 0], self.rule.margin) for of in (lower_of, upper_of))
-        if found is None or not np.isfinite(found).all():
-            return None
-        lower, upper = (point.recorded_x(np.asarray(bound)) for bound in found)
-        return Foreseen(t_ns + steps * round(dt * 1e9), lower, upper)
+        return Foreseen(t_ns + max(self.model.steps) * round(dt * 1e9), bounds)
 
     def look(self, step: Step) -> Verdict:
         """Verdict on a complete step, not counted for the alarm.

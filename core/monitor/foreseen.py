@@ -11,13 +11,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.monitor.verdict import place
 
 
-@dataclass(frozen=True)
 class Foreseen:
     """Bounds at an instant to come.
 
@@ -25,13 +26,24 @@ class Foreseen:
     ----------
     t_ns : int
         The instant, ns.
-    lower, upper : array (n,)
-        The bounds, recorded units.
+    bounds : buffer of doubles (2 n,)
+        The lower bounds and then the upper ones, recorded units.
     """
 
-    t_ns: int
-    lower: Array
-    upper: Array
+    __slots__ = ("_bounds", "_n", "t_ns")
+
+    def __init__(self, t_ns: int, bounds: Any) -> None:
+        self.t_ns, self._bounds, self._n = t_ns, bounds, len(bounds) // 2
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds (n,)."""
+        return np.array(self._bounds[: self._n], dtype=np.float64)
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds (n,)."""
+        return np.array(self._bounds[self._n :], dtype=np.float64)
 
     def packed(self, wanted: frozenset[int] = frozenset()) -> bytes:
         """The bounds, where `Verdict.packed` has them.
@@ -46,8 +58,8 @@ class Foreseen:
         bytes
             Little-endian doubles; zeros for all but lower and upper.
         """
-        n = len(self.lower)
+        n = self._n
         numbers = bytearray(place("utilisation", n).stop)
-        for name, bound in (("lower", self.lower), ("upper", self.upper)):
-            numbers[place(name, n)] = bound.astype("<f8").tobytes()
+        numbers[place("lower", n)] = self._bounds[:n].tobytes()
+        numbers[place("upper", n)] = self._bounds[n:].tobytes()
         return bytes(numbers)
