@@ -110,7 +110,10 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
 
     def residuals() -> Residuals:
         spread = rng.normal(size=(n, n))
-        return Residuals(1e-3 * rng.normal(size=n), 1e-4 * (spread @ spread.T + np.eye(n)))
+        size = (
+            1e-2 if len(lengths) == 1 else 0.3
+        )  # of the residual itself, as in files of before, or of the utilisation
+        return Residuals(0.1 * size * rng.normal(size=n), size**2 * (spread @ spread.T + np.eye(n)), size == 0.3)
 
     horizons = [Horizon(h, **elements(0.4), residuals=residuals()) for h in lengths]
     run = elements(0.9)

@@ -93,7 +93,7 @@ def test_chi2_needs_the_covariance() -> None:
         two_states().replace(residuals=None, alarm=[StatisticRule("chi2", 1.0, 1.0)])
     without = [two_states().horizons[0].with_residuals(None)]
     with pytest.raises(
-        ModelError, match="mewma needs the covariance of the residuals over 4 steps; fit the model again"
+        ModelError, match="mewma needs the covariance of the utilisation over 4 steps; fit the model again"
     ):
         two_states().replace(horizons=without, alarm=[StatisticRule("mewma", 1.0, 1.0, horizon=4)])
     learnt = two_states().replace(horizons=without, residuals=None).with_residuals_of(two_states())
@@ -166,6 +166,10 @@ def test_rules_of_a_file_that_cannot_be_are_refused(rules: Any, words: str) -> N
     ("residuals", "words"),
     [
         ({"mean": [0.0, 0.0]}, "residuals.covariance' is missing"),
+        (
+            {"mean": [0.0, 0.0], "covariance": ZEROS.tolist(), "relative": 1},
+            "residuals.relative' is 1; it must be true",
+        ),
         ({"mean": [0.0], "covariance": [[1.0]]}, "residuals of 1 state for 2 states"),
         ({"mean": [0.0, 0.0], "covariance": [[1.0, 2.0], [0.0, 1.0]]}, "not symmetric"),
         ({"mean": [0.0, 0.0], "covariance": [[1.0, 2.0], [2.0, 1.0]]}, "negative variance"),
@@ -193,18 +197,17 @@ def test_a_state_that_follows_from_others_adds_nothing_to_the_chi_square() -> No
 
 
 @pytest.mark.parametrize("scheduled", [False, True])
-def test_the_fit_stores_mean_and_covariance_of_its_residuals(scheduled: bool) -> None:
+def test_the_fit_stores_mean_and_covariance_of_its_utilisation(scheduled: bool) -> None:
     rng = np.random.default_rng(4)
     x = np.cumsum(rng.normal(size=(300, 2)) * [1.0, 3.0], axis=0) * 0.01
     run = Transient(np.arange(300) * 0.1, x, rng.normal(size=(300, 1)))
     model = fit([run], additive="noise", schedule={"x1": [-0.2, 0.2]} if scheduled else None)
     steps = run.transitions()
-    centre, _ = model.centre_and_half(steps.x, steps.u, steps.dt)
-    r = steps.x_next - centre
-    assert model.residuals is not None
+    centre, half = model.centre_and_half(steps.x, steps.u, steps.dt)
+    r = (steps.x_next - centre) / half
+    assert model.residuals is not None and model.residuals.relative
     assert model.residuals.mean == pytest.approx(r.mean(axis=0), abs=1e-12)
     assert model.residuals.covariance == pytest.approx(np.cov(r.T, bias=True), rel=1e-9)
-    assert model.residuals.covariance[1, 1] > 4 * model.residuals.covariance[0, 0]
 
 
 def test_labels_of_one_alarm_are_all_different() -> None:

@@ -195,12 +195,14 @@ def test_reset_forgets_everything() -> None:
 # --- in the monitor ---
 
 
-def model(rules: Any, n: int = 3) -> UncertainLTI:
-    zeros = np.zeros((n, n)), np.zeros((n, 1))
+def model(rules: Any, n: int = 3, relative: bool = True) -> UncertainLTI:
+    zeros, half, longer = (np.zeros((n, n)), np.zeros((n, 1))), 0.3, 0.5
+    one, four = (half, longer) if relative else (1.0, 1.0)
+    known = Residuals(MEAN[:n] / one, 0.01 * C[:n, :n] / one**2, relative)
+    windows = Residuals(-MEAN[:n] / four, 0.02 * C[:n, :n] / four**2, relative)
     return UncertainLTI(
-        -0.5 * np.eye(n), np.zeros((n, 1)), *zeros, v=np.full(n, 0.3), alarm=rules,
-        residuals=Residuals(MEAN[:n], 0.01 * C[:n, :n]),
-        horizons=[Horizon(4, *zeros, *zeros, v=np.full(n, 0.5), residuals=Residuals(-MEAN[:n], 0.02 * C[:n, :n]))],
+        -0.5 * np.eye(n), np.zeros((n, 1)), *zeros, v=np.full(n, half), alarm=rules, residuals=known,
+        horizons=[Horizon(4, *zeros, *zeros, v=np.full(n, longer), residuals=windows)],
     )  # fmt: skip
 
 
@@ -238,16 +240,16 @@ def steps_of(run: Transient) -> list[Step]:
     return found
 
 
-@pytest.mark.parametrize("masked", [(), ("x2",)])
-def test_offline_is_live(masked: tuple[str, ...]) -> None:
-    monitor = EnvelopeMonitor(model(RULES), masked=masked)
+@pytest.mark.parametrize(("masked", "relative"), [((), True), (("x2",), True), (("x2",), False)])
+def test_offline_is_live(masked: tuple[str, ...], relative: bool) -> None:
+    monitor = EnvelopeMonitor(model(RULES, relative=relative), masked=masked)
     run = a_run(1)
     verdicts = monitor.check(run)
     assert verdicts.alarm.any() and not verdicts.alarm.all()
     assert verdicts.rule_alarms.any(axis=0).all(), "every rule raises the alarm somewhere"
     assert verdicts.statistics.shape == (400, 16) and verdicts.statistic_names[0] == "energy/x1"
     assert verdicts.statistic_names[-4:] == ("chi2/joint", "mewma/joint", "chi2@4/joint", "mewma@4/joint")
-    live = EnvelopeMonitor(model(RULES), masked=masked)
+    live = EnvelopeMonitor(model(RULES, relative=relative), masked=masked)
     for k, step in enumerate(steps_of(run)):
         verdict = live.judge(step)
         assert verdict.alarm == verdicts.alarm[k]
@@ -317,10 +319,11 @@ def test_kinds_are_numbered_in_the_order_of_the_rules() -> None:
     assert (*PER_STATE, *JOINT) == KINDS
 
 
-def test_residuals_at_a_horizon_are_those_of_its_windows() -> None:
-    """chi2 over one verdict is r C^-1 r of x_{k+4} less the centre, the states that count alone."""
+@pytest.mark.parametrize("relative", [True, False])
+def test_chi2_at_a_horizon_is_that_of_its_windows(relative: bool) -> None:
+    """r C^-1 r of x_{k+4} less the centre, over the half-width or as files of before have it; of states that count."""
     rule = StatisticRule("chi2", 0.0, 2.0, horizon=4)
-    given = model([AlarmRule(50, 50), rule])
+    given = model([AlarmRule(50, 50), rule], relative=relative)
     run = a_run(3)
     verdicts = EnvelopeMonitor(given, masked=("x2",)).check(run)
     horizon, known = given.horizons[0], given.residuals_at(4)
@@ -333,13 +336,54 @@ def test_residuals_at_a_horizon_are_those_of_its_windows() -> None:
         x = run.x[k - 4]
         for j in range(k - 4, k):
             x = x + run.dt[j] * (given.A @ x)
-        r = (run.x[k] - x - known.mean)[some]
+        r = ((run.x[k] - x) / (0.5 if relative else 1.0) - known.mean)[some]
         assert verdicts.statistics[k, 0] == pytest.approx(r @ inverse @ r / 2.0, rel=1e-9)
         looked += 1
     assert looked > 300 and horizon.residuals is known
 
 
-def test_a_fit_knows_the_residuals_of_its_windows() -> None:
+def test_joint_statistics_take_the_utilisation_of_each_sample() -> None:
+    """What is twice as far from the centre where the bounds are twice as wide counts the same."""
+    zeros = np.zeros((2, 2)), np.zeros((2, 1))
+    given = UncertainLTI(
+        *zeros, zeros[0], np.array([[3.0], [5.0]]), residuals=Residuals([0.0, 0.0], [[0.2, 0.1], [0.1, 0.3]]),
+        alarm=[AlarmRule(50, 50), StatisticRule("chi2", 0.0, 1.0), StatisticRule("mewma", 0.0, 1.0)],
+    )  # fmt: skip
+    u = np.array([1.0, 2.0, 4.0, 0.5, 1.0])[:, None]
+    moved = 0.1 * u[:-1] * np.array([1.5, -2.0])
+    run = Transient(np.arange(5) * 0.1, np.concatenate([[[0.0, 0.0]], np.cumsum(moved, axis=0)]), u)
+    values = EnvelopeMonitor(given).check(run).statistics[1:]
+    nu = np.array([0.5, -0.4])
+    np.testing.assert_allclose(values, nu @ np.linalg.inv([[0.2, 0.1], [0.1, 0.3]]) @ nu, rtol=1e-12)
+
+
+def test_a_masked_state_without_width_does_not_spoil_the_joint_statistic() -> None:
+    """Its utilisation is infinite, and its share of the sum nothing."""
+    given = model([AlarmRule(50, 50), StatisticRule("chi2", 0.0, 9.0)])
+    given = given.replace(v=[0.3, 0.0, 0.3])
+    x = np.zeros((5, 3))
+    x[:, 1] = np.arange(5)
+    run = Transient(np.arange(5) * 0.01, x, np.zeros((5, 1)))
+    masked, all_count = (EnvelopeMonitor(given, masked=names).check(run) for names in (("x2",), ()))
+    assert np.isinf(masked.utilisation[1:, 1]).all()
+    assert np.isfinite(masked.statistics[1:]).all() and not masked.alarm.any()
+    assert all_count.alarm[1:].all()
+
+
+def test_joint_statistics_of_a_file_of_before_take_the_residual_itself() -> None:
+    given = model(RULES, relative=False)
+    data = given.to_dict()
+    assert "relative" not in data["residuals"] and "relative" not in data["horizons"][0]["residuals"]
+    again = UncertainLTI.from_dict(data)
+    first, second = (EnvelopeMonitor(m).check(a_run(1)) for m in (given, again))
+    assert first.statistics.tobytes() == second.statistics.tobytes() and again.to_dict() == data
+    new = model(RULES)
+    assert new.to_dict()["residuals"]["relative"] is True
+    assert again.with_residuals_of(new, instead=True).residuals is again.residuals, "thresholds are for its form"
+    assert new.with_residuals_of(again).horizons[0].residuals is again.horizons[0].residuals
+
+
+def test_a_fit_knows_the_utilisation_of_its_windows() -> None:
     rng = np.random.default_rng(8)
     x = np.zeros((2001, 2))
     for k in range(2000):
@@ -347,9 +391,9 @@ def test_a_fit_knows_the_residuals_of_its_windows() -> None:
     run = Transient(np.arange(2001) * 0.01, x, np.zeros((2001, 0)))
     fitted = fit(run, additive="noise", horizons=[2, 10], widths="constant")  # type: ignore[arg-type]
     steps = run.transitions()
-    _, residual = fitted.over_horizons(steps.k, fitted.normalised_columns(steps), steps.dt, steps.x_next)
+    used, _ = fitted.over_horizons(steps.k, fitted.normalised_columns(steps), steps.dt, steps.x_next)
     for j, h in enumerate((2, 10)):
-        r = residual[:, j][~np.isnan(residual[:, j, 0])]
+        r = used[:, j][~np.isnan(used[:, j, 0])]
         assert len(r) == 2001 - h
         np.testing.assert_allclose(fitted.residuals_at(h).mean, r.mean(axis=0), rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(fitted.residuals_at(h).covariance, np.cov(r.T, bias=True), rtol=1e-9)

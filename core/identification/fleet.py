@@ -184,7 +184,7 @@ class Fleet:
         return sum(others, first)
 
     def residuals(self, model: Envelope) -> Residuals:
-        """Mean and covariance of what the centre of one step leaves unexplained.
+        """Mean and covariance of the utilisation.
 
         Parameters
         ----------

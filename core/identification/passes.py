@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.cells import Cells, Whole
 from uncertain_lti.identification.problem import Block, Columns, Partition, Regimes, scaled_eigenvalues
 from uncertain_lti.identification.products import gram_of, product
-from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of
+from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of, utilisation_of
 
 
 @dataclass
@@ -765,14 +765,14 @@ def _judged_in_doubt(block: Block, model: Envelope, known: Array, regimes: Regim
 
 
 def residual_sums(part: Partition, model: Envelope) -> tuple[Array, Array]:
-    """Sums of the residual of every transition, r = x_next - centre, and of its products.
+    """Sums of the utilisation of every transition, r = (x_next - centre) / half, and of its products.
 
     Parameters
     ----------
     part : Partition
         The transitions.
     model : Envelope
-        Gives the centre.
+        Gives the centre and the half-width.
 
     Returns
     -------
@@ -783,7 +783,8 @@ def residual_sums(part: Partition, model: Envelope) -> tuple[Array, Array]:
     """
     total, products = np.zeros(part.n), np.zeros((part.n, part.n))
     for block in _pieces(part):
-        r = block.x_next - _centre_and_half(model, block)[0]
+        centre, half = _centre_and_half(model, block)
+        r = np.asarray(utilisation_of(block.x_next - centre, half))
         total += r.sum(axis=1)
         products += gram_of(r, r)
     return total, products

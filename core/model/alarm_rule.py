@@ -31,7 +31,7 @@ CONTAINMENT = "containment"
 PER_STATE = ("energy", "mean", "ewma", "cusum")
 """Kinds of `StatisticRule` that look at the utilisation of each state."""
 JOINT = ("chi2", "mewma")
-"""Kinds of `StatisticRule` that look at the residuals of all states together."""
+"""Kinds of `StatisticRule` that look at the utilisation of all states together."""
 KINDS = (*PER_STATE, *JOINT)
 """Kinds of `StatisticRule`."""
 FADING = ("ewma", "cusum", "mewma")
@@ -117,10 +117,10 @@ class StatisticRule:
     - ``ewma``: :math:`|e_k|` of the low-pass :math:`e_k = e_{k-1} + (u_k - e_{k-1}) Δt_k / (T + Δt_k)`;
     - ``cusum``: the larger of :math:`s_k^± = \max(0, s_{k-1}^± T / (T + Δt_k) + (± u_k - a) Δt_k / T)`, with a the
       allowance: a sum that forgets, so that what it reaches in a session does not grow with its length;
-    - ``chi2``: :math:`\sum (r_k - \bar r)^T C^{-1} (r_k - \bar r) Δt_k / T` of the residuals of all states together,
+    - ``chi2``: :math:`\sum (u_k - \bar u)^T C^{-1} (u_k - \bar u) Δt_k / T` of the utilisation of all states together,
       with the mean and the covariance of `UncertainLTI.residuals` or, at a horizon, of `Horizon.residuals`;
-    - ``mewma``: :math:`e_k^T (s_k C)^{-1} e_k` of the same residuals' low-pass
-      :math:`e_k = e_{k-1} + (r_k - \bar r - e_{k-1}) λ_k`, :math:`λ_k = Δt_k / (T + Δt_k)`, whose covariance is
+    - ``mewma``: :math:`e_k^T (s_k C)^{-1} e_k` of its low-pass
+      :math:`e_k = e_{k-1} + (u_k - \bar u - e_{k-1}) λ_k`, :math:`λ_k = Δt_k / (T + Δt_k)`, whose covariance is
       :math:`s_k C` with :math:`s_k = (1 - λ_k)^2 s_{k-1} + λ_k^2`: at a constant step :math:`λ / (2 - λ)`, where it
       begins (Lowry et al., Technometrics 34, 1992).
 
@@ -133,7 +133,7 @@ class StatisticRule:
     threshold : float or sequence of float (n,)
         What raises the alarm if it is exceeded: of every state, or of each.
     horizon : int, default 1
-        Steps of the bounds whose utilisation or residuals it takes.
+        Steps of the bounds whose utilisation it takes.
     allowance : float, default 0.0
         a of ``cusum``: the utilisation that adds nothing.
 
@@ -219,8 +219,8 @@ class StatisticRule:
             "mean": f"mean of the utilisation{over}",
             "ewma": f"moving average of the utilisation{over}",
             "cusum": f"cumulative sum of the utilisation{over}",
-            "chi2": f"chi-square of the residuals{over}",
-            "mewma": f"joint moving average of the residuals{over}",
+            "chi2": f"chi-square of the utilisation{over}",
+            "mewma": f"joint moving average of the utilisation{over}",
         }[self.kind]
         span = f"over {self.window_s:.3g} s" if self.window_s else "of one verdict"
         limits = self.threshold if isinstance(self.threshold, tuple) else (self.threshold,)

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Residuals: mean and covariance of what the centre of the bounds leaves unexplained of healthy recordings."""
+"""Residuals: mean and covariance of how far healthy recordings lie from the centre of their bounds."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.terms import checked
 
 _KEYS = ("mean", "covariance")
+_RELATIVE = "relative"
 _LEAST = 1e-12
 """Share of the state's own variance below which what the others leave of it counts as none."""
 
 
 class Residuals:
-    """Mean and covariance of r_k = x_{k+1} - centre_k over the transitions of the fit, normalised.
+    """Mean and covariance of the utilisation (x_{k+1} - centre_k) / half_k over the transitions of the fit.
 
-    Of a horizon those of x_{k+h} less the centre of its envelope, over the windows of the fit.
+    Of a horizon those of the utilisation of its envelope, over the windows of the fit. The spread of residuals changes
+    with x, u and the regime, as the half-widths do, so that one covariance describes the utilisation better. Model
+    files of before have that of the residual itself, x_{k+1} - centre_k, normalised.
 
     Parameters
     ----------
@@ -37,6 +40,8 @@ class Residuals:
         Mean of each state.
     covariance : array (n, n)
         Symmetric, with no negative eigenvalue but by rounding.
+    relative : bool, default True
+        Of the utilisation; False: of the residual itself.
 
     Raises
     ------
@@ -44,7 +49,8 @@ class Residuals:
         The shapes do not fit, a number is not finite, or the covariance is none.
     """
 
-    def __init__(self, mean: ArrayLike, covariance: ArrayLike) -> None:
+    def __init__(self, mean: ArrayLike, covariance: ArrayLike, relative: bool = True) -> None:
+        self.relative = relative
         self.mean = checked(mean, "residuals.mean", None)
         n = len(self.mean) if self.mean.ndim == 1 else 0
         if self.mean.ndim != 1 or n == 0:
@@ -98,7 +104,8 @@ class Residuals:
         dict
             Plain data.
         """
-        return {"mean": self.mean.tolist(), "covariance": self.covariance.tolist()}
+        found = {"mean": self.mean.tolist(), "covariance": self.covariance.tolist()}
+        return found | ({_RELATIVE: True} if self.relative else {})
 
     @classmethod
     def from_dict(cls, data: Any, name: str = "residuals") -> Residuals:
@@ -107,7 +114,7 @@ class Residuals:
         Parameters
         ----------
         data : Any
-            What `to_dict` gives.
+            What `to_dict` gives; without `relative` of the residual itself, as files of before have it.
         name : str
             Field, for errors.
 
@@ -124,9 +131,13 @@ class Residuals:
         if not isinstance(data, dict):
             raise ModelError(f"field '{name}' is not an object")
         for key in data:
-            if key not in _KEYS:
-                raise ModelError(f"unknown field '{name}.{reprlib.repr(key)[1:-1]}'; known are {', '.join(_KEYS)}")
+            if key not in (*_KEYS, _RELATIVE):
+                known = ", ".join((*_KEYS, _RELATIVE))
+                raise ModelError(f"unknown field '{name}.{reprlib.repr(key)[1:-1]}'; known are {known}")
         for key in _KEYS:
             if key not in data:
                 raise ModelError(f"field '{name}.{key}' is missing; fit the model again")
-        return cls(**data)
+        relative = data.get(_RELATIVE, False)
+        if not isinstance(relative, bool):
+            raise ModelError(f"field '{name}.{_RELATIVE}' is {reprlib.repr(relative)}; it must be true or false")
+        return cls(data["mean"], data["covariance"], relative)

@@ -240,7 +240,7 @@ class UncertainLTI:
         return rules
 
     def residuals_at(self, horizon: int = 1, kind: str = "a joint statistic") -> Residuals:
-        """Mean and covariance of the healthy residuals of one step, or of a horizon.
+        """Mean and covariance of the healthy utilisation of one step, or of a horizon; see `Residuals`.
 
         Parameters
         ----------
@@ -262,11 +262,14 @@ class UncertainLTI:
         found = self.residuals if horizon == 1 else self.horizons[self.steps.index(horizon)].residuals
         if found is None:
             over = "" if horizon == 1 else f" over {horizon} steps"
-            raise ModelError(f"alarm: {kind} needs the covariance of the residuals{over}; fit the model again")
+            raise ModelError(f"alarm: {kind} needs the covariance of the utilisation{over}; fit the model again")
         return found
 
     def with_residuals_of(self, other: UncertainLTI, instead: bool = False) -> UncertainLTI:
-        """The same model with the residuals of another fit, as far as it has the same horizons.
+        """The same model with the `residuals` of another fit, as far as it has the same horizons.
+
+        Where one of them has the form of model files of before, of the residual itself, that one is taken, as it is
+        what the thresholds of those files are for.
 
         Parameters
         ----------
@@ -282,7 +285,11 @@ class UncertainLTI:
         """
 
         def chosen(own: Residuals | None, given: Residuals | None) -> Residuals | None:
-            return given or own if instead else own or given
+            if own is None or given is None:
+                return own or given
+            if given.relative != own.relative:
+                return own if given.relative else given
+            return given if instead else own
 
         of = {horizon.steps: horizon.residuals for horizon in other.horizons}
         return self.replace(

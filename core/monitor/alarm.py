@@ -260,7 +260,7 @@ class AlarmOverThreshold:
     rule : StatisticRule
         The statistic.
     model : UncertainLTI
-        Gives the residuals.
+        Gives mean and covariance of joint statistics.
     counted : array of bool (n,)
         States that count.
 
@@ -355,7 +355,8 @@ def row_of(rule: Rule, model: UncertainLTI) -> int:
     rule : Rule
         Of the model.
     model : UncertainLTI
-        Its horizons follow one step, and the residuals follow them.
+        Its horizons follow one step, and the residuals follow them: joint statistics of a model file of before take
+        those (`Residuals.relative`).
 
     Returns
     -------
@@ -363,7 +364,8 @@ def row_of(rule: Rule, model: UncertainLTI) -> int:
         0 for the utilisation of one step.
     """
     place = 0 if rule.horizon == 1 else 1 + model.steps.index(rule.horizon)
-    return residual_row(model) + place if rule.kind in JOINT else place
+    own = rule.kind in JOINT and not model.residuals_at(rule.horizon).relative
+    return residual_row(model) + place if own else place
 
 
 def residual_row(model: UncertainLTI) -> int:
@@ -406,6 +408,8 @@ class Alarm:
         Of the statistics, `energy/fan_speed` for example; empty if every rule is containment.
     needs_table : bool
         Whether some rule looks at more than the one-step violation.
+    needs_residual : bool
+        Whether some rule looks at residuals, which follow the utilisation in the table.
     alarm : bool
         Whether some rule raises the alarm.
     """
@@ -425,6 +429,7 @@ class Alarm:
                 names += [f"{label}/{s}" for s in ((EVERY_STATE,) if rule.kind in JOINT else model.state_names)]
         self.parts, self.names = tuple(parts), tuple(names)
         self.needs_table = any(rule.horizon > 1 or rule.kind != "containment" for rule in self.rules)
+        self.needs_residual = any(row_of(rule, model) >= residual_row(model) for rule in self.rules)
         self._only = self.parts[0] if len(self.parts) == 1 else None
 
     def reset(self) -> None:

@@ -307,11 +307,15 @@ class EnvelopeMonitor:
         return Verdict(step, self.alarm, judgement, status, alarms, longer, looked)
 
     def _table(self, judgement: Judgement, longer: Any) -> array[float]:
-        """Utilisation for one step and for each horizon, then the residuals likewise, row by row."""
-        utilisation, residual = array("d", judgement.numbers(UTILISATION)), array("d", judgement.numbers(RESIDUAL))
-        if self._runs is None:
-            return utilisation + residual
-        return utilisation + array("d", longer) + residual + array("d", self._runs.residuals)
+        """Utilisation for one step and for each horizon, then the residuals likewise where they are needed."""
+        table = array("d", judgement.numbers(UTILISATION))
+        if self._runs is not None:
+            table += array("d", longer)
+        if self.alarms.needs_residual:
+            table += array("d", judgement.numbers(RESIDUAL))
+            if self._runs is not None:
+                table += array("d", self._runs.residuals)
+        return table
 
     def check(self, transient: Transient, armed: Armed | None = None) -> Verdicts:
         """Verdicts over a whole transient, from a cleared alarm; the same bits as `judge` step by step.

@@ -33,8 +33,8 @@ from uncertain_lti.base.compiled import use_twin
 ENERGY, MEAN, EWMA, CUSUM, CHI2, MEWMA = range(6)
 """Kinds, in the order of `model.alarm_rule.KINDS`."""
 LIMIT = 10.0
-"""Where ewma and cusum cut the utilisation, and mewma the residuals, uncorrelated and in standard deviations: a jump is
-seen anyway, and must not hold them for long."""
+"""Where ewma and cusum cut the utilisation, and mewma its uncorrelated components, in standard deviations:
+a jump is seen anyway, and must not hold them for long."""
 _MOST = 1e50  # at which the others cut: squares stay finite
 _LONGEST = 1_000_000  # verdicts of a window at most
 
@@ -58,9 +58,9 @@ class Statistic:
     allowance : float
         Of cusum.
     mean : array (n,), optional
-        Of the residuals, for chi2 and mewma.
+        Of what chi2 and mewma take; see `model.residuals`.
     whitening : array (n, n), optional
-        Of the residuals, for chi2 and mewma.
+        Of the same.
 
     Attributes
     ----------
@@ -84,11 +84,11 @@ class Statistic:
     _counted: cython.uchar[::1]
     _mean: cython.double[::1]
     _whitening: cython.double[::1]
-    _terms: cython.double[::1]  # what this verdict adds; of mewma the uncorrelated residuals
+    _terms: cython.double[::1]  # what this verdict adds; of mewma the uncorrelated components
     _values: cython.double[::1]  # the statistic over its threshold
     _up: cython.double[::1]  # sum of the newer half; moving average; sum upwards
-    _down: cython.double[::1]
-    _spread: cython.double  # variance of the moving average of mewma, that of a residual being 1; 0 before the first
+    _down: cython.double[::1]  # the same downwards; of chi2 and mewma this verdict less the mean
+    _spread: cython.double  # variance of the moving average of mewma, that of a verdict being 1; 0 before the first
     _queue: cython.double[::1]  # terms of the newer half, sums of the older one
     _steps: cython.longlong[::1]  # ns
     _begin: cython.Py_ssize_t  # of the window in the queue
@@ -114,7 +114,7 @@ class Statistic:
         if len(thresholds) != size or len(counted) != n:
             raise ValueError("the thresholds or the states that count do not fit the states")
         if joint and (np.shape(mean) != (n,) or np.shape(whitening) != (n, n)):
-            raise ValueError("the residuals do not fit the states")
+            raise ValueError("the mean or the covariance does not fit the states")
         self._kind, self._n, self._size = kind, n, size
         self._window, self._window_ns = window_s, round(window_s * 1e9)
         self._allowance = allowance
@@ -161,7 +161,7 @@ class Statistic:
         dt : float
             Step that it ends, s.
         table : buffer of doubles
-            The utilisation of each state, or the residuals, among others.
+            The utilisation of each state, or the residual, among others.
         begin : int
             Where they begin. If all are NaN there is no verdict, and nothing changes.
 
@@ -295,9 +295,11 @@ class Statistic:
                 value = row[begin + i]
                 if value == value:
                     nothing = False
+                value = _MOST if value > _MOST else -_MOST if value < -_MOST else value  # infinite where half is 0
+                self._down[i] = value - self._mean[i]
                 total = 0.0
                 for j in range(i + 1):
-                    total += self._whitening[i * n + j] * (row[begin + j] - self._mean[j])
+                    total += self._whitening[i * n + j] * self._down[j]
                 if self._kind == MEWMA:
                     self._terms[i] = -LIMIT if total < -LIMIT else total if total <= LIMIT else LIMIT
                 square += total * total

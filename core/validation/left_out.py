@@ -141,6 +141,7 @@ def validate(
             model = fit(pieces, weights=chosen, operating_point=full.operating_point, describe_data=False, **options)  # type: ignore[arg-type]
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
+        model = model.with_residuals_of(full)
         for i in together:
             left, start, stop = cuts[i]
             tested = left if (start, stop) == (0, len(left)) else cut(left, start, stop)
