@@ -84,6 +84,7 @@ from uncertain_lti.plants.turbofan_runs import (  # noqa: E402
     turbofan_signals,
 )
 from uncertain_lti.validation.blocks import cut  # noqa: E402
+from uncertain_lti.validation.false_alarms import allowed_alarms  # noqa: E402
 
 Array = np.ndarray
 CONFIDENCE = 0.9
@@ -512,7 +513,7 @@ def turbofan_case(noise: float, options: argparse.Namespace) -> Case:
         faulty[label] = Faulty(runs, Fault(kind, ONSET).first_sample(DT))
     fitted = Recorded.of(simulated(pulses, keep) + simulated(long, keep), point)
     learnt = healthy_runs(10000, learn)
-    allowed = min(math.floor(options.rate * sum(runs.hours for runs in learnt) + 1e-6), learn - 1)
+    allowed = min(allowed_alarms(options.rate, sum(runs.hours for runs in learnt)), learn - 1)
     return Case(f"Turbofan, noise {noise:g}", fitted, learnt, healthy_runs(20000, healthy), faulty, allowed)
 
 

@@ -22,6 +22,7 @@ from temporal_logic import arrivals, formula_of, gathered, verdicts
 from uncertain_lti import EnvelopeMonitor, OperatingPoint, fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.leibov import transient
+from uncertain_lti.validation.false_alarms import allowed_alarms
 
 POINT = OperatingPoint(np.zeros(3), np.zeros(1), np.ones(3), np.ones(1))
 KINDS = (
@@ -57,6 +58,15 @@ def test_a_rule_raises_the_alarm_where_its_score_exceeds_its_threshold(case):
             raised = monitor.check(t).alarm
             assert raised.any(), kind
             assert np.array_equal(raised, row > threshold), kind
+
+
+def test_five_hours_of_recordings_allow_five_alarms_at_one_per_hour():
+    """Their steps add up to 4.999999999999999 h, of which a calibration once let four alarmed runs through."""
+    empty = np.zeros((120, 1201, 0))
+    learnt = [Recorded(empty, empty, np.full((120, 1200), 0.025)) for _ in range(5)]
+    hours = sum(runs.hours for runs in learnt)
+    assert hours < 5.0 and allowed_alarms(1.0, hours) == 5 and allowed_alarms(2.0, hours) == 10
+    assert allowed_alarms(1.0, hours - 1e-6) == 4 and allowed_alarms(1.0, 0.0) == 0
 
 
 def test_a_threshold_lets_as_many_recordings_through_as_it_may(case):

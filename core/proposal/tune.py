@@ -47,6 +47,7 @@ from uncertain_lti.validation.detectable import (
     detectable,
     typical_within,
 )
+from uncertain_lti.validation.false_alarms import allowed_alarms
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.part import by_unit
@@ -298,7 +299,7 @@ class _Search:
             return Trial(setting, family, refused=self._left[2])
         parts, hours = left.parts, sum(p.hours for p in left.parts)
         try:
-            rules, counts = quiet(family, left.model, parts, math.floor(self.rate * hours))
+            rules, counts = quiet(family, left.model, parts, allowed_alarms(self.rate, hours))
             model = left.model.replace(alarm=rules)
             found = detectable(model, parts, self.within, kinds=COMPARED, cases=COMPARED_CASES)
         except (FitError, ModelError) as error:
@@ -424,7 +425,7 @@ class _Search:
             left = self._validated(trial.setting)
             if left is None:
                 continue
-            for allowed in sorted({math.floor(self.rate * hours), 0, 2, 5, 15, 50}):
+            for allowed in sorted({allowed_alarms(self.rate, hours), 0, 2, 5, 15, 50}):
                 try:
                     rules, counts = quiet(trial.family, left.model, left.parts, allowed)
                     model = left.model.replace(alarm=rules)

@@ -22,6 +22,7 @@ from uncertain_lti.validation.part import Part, by_unit, rising, unit_numbers
 
 NEARBY = 0.75
 """Down to this share of the margin, alarms are assumed to cluster as they do at the margin."""
+_ROUNDING = 1e-9
 
 
 def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> dict[str, Any]:
@@ -55,6 +56,24 @@ def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> d
         "per_hour": sum(counts) / hours if hours else None,
         "interval": [low, high if math.isfinite(high) else None],
     }
+
+
+def allowed_alarms(rate: float, hours: float) -> int:
+    """False alarms that a rate allows in so many hours.
+
+    Parameters
+    ----------
+    rate : float
+        Per hour, at most.
+    hours : float
+        Time under verdict, a sum of steps: short of a whole number by rounding, it counts as that number.
+
+    Returns
+    -------
+    int
+        Whole alarms.
+    """
+    return math.floor(rate * hours * (1.0 + _ROUNDING))
 
 
 def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
