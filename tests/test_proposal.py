@@ -10,6 +10,7 @@
 """`init`: what it proposes can be fitted as it is, holds the signals that matter, and odd recordings get a sentence."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from uncertain_lti.proposal.reading import LONGEST_ARRAY
 from uncertain_lti.proposal.roles import role_by_name
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
+JOINT = "sensor_msgs/msg/JointState"
 MS = 10**6
 
 
@@ -115,14 +117,17 @@ def test_real_recordings_fit_unedited(recordings, name):
         assert len(states) == 1
 
 
-def test_of_many_joints_one_with_its_command(recordings):
+def test_of_many_joints_all_with_their_commands(recordings):
     proposal = propose([recordings / "go2/test_3.mcap"])
-    states, controls = signals_of(proposal)
-    joint = proposal.controls[0].element
-    assert states == [("/go2/joint_states", f"position[{joint}]"), ("/go2/joint_states", f"velocity[{joint}]")]
-    assert controls == [("/go2/joint_command", f"position[{joint}]")]
-    signals = yaml.safe_load(proposal.text)
-    assert signals["controls"][0]["max_hold"] < 0.1, "the commands end long before the states do"
+    assert proposal.members == tuple(f"j{k}" for k in range(12))
+    data = yaml.safe_load(proposal.text)
+    assert data["structure"] == "own" and [s["field"] for s in data["states"]] == ["position[{}]", "velocity[{}]"]
+    assert data["controls"][0]["max_hold"] < 0.1, "the commands end long before the states do"
+    assert {s["steady"] for s in data["states"] + data["controls"]} == {"auto"}, (
+        "each joint rests at an angle of its own"
+    )
+    assert len(SignalMap.from_dict(data).states) == 24
+    assert "position[j1]" not in proposal.text, "what the lists stand for is not left out"
     assert len(propose([recordings / "go2/test_3.mcap"]).text) == len(proposal.text)
 
 
@@ -600,6 +605,7 @@ def test_the_file_of_one_joint_is_that_of_all(recordings):
     proposal = propose([path], like="j5")
     data = yaml.safe_load(proposal.text)
     assert data["structure"] == "own" and len(data["states"]) == 2 and data["states"][0]["for"][-1] == "j11"
+    assert [c.path for c in proposal.controls] == ["position[j5]"]
     signals = SignalMap.from_dict(data)
     assert (len(signals.states), len(signals.controls)) == (24, 12)
     (run,) = read_transients(path, signals)
@@ -625,11 +631,50 @@ def test_commands_that_never_move_are_a_machine_at_rest(recordings, tmp_path, ca
     assert not propose([recordings / "crazyflie" / "rollbag_0.mcap"]).warnings
 
 
-def test_one_of_many_says_how_to_have_all(recordings):
-    proposal = propose([recordings / "go2/test_3.mcap"])
-    joint = proposal.controls[0].element
-    assert "# One of 12 that are alike (j0, j1, j2, j3, j4, j5 and 6 more). `uncertain-lti init" in proposal.text
-    assert f"BAG... --like {joint}` writes one file for all of them.\n" in proposal.text
+def joints(still=""):
+    """Three joints, each driven by a command of its own; one of them may stand still."""
+    rng = np.random.default_rng(3)
+    names, x, u, messages = ["left", "right", "arm"], np.zeros(3), np.zeros(3), []
+    moves = np.array([float(name != still) for name in names])
+    for k in range(500):
+        if k % 20 == 0:
+            u = rng.uniform(-1.0, 1.0, 3) * moves
+        t = 10**18 + k * 20 * MS
+        for topic, values in (("/joint_states", x), ("/joint_commands", u)):
+            data = cdr(JOINT, header=header(t), name=names, position=values, velocity=np.empty(0), effort=np.empty(0))
+            messages.append(Message(topic, t, data, t))
+        x = x + (0.1 * (u - x) + 1e-3 * rng.standard_normal(3)) * moves
+    return messages
+
+
+@pytest.mark.parametrize(("still", "members"), [("", ("left", "right", "arm")), ("right", ("left", "arm"))])
+def test_the_file_is_for_all_that_move_alike(tmp_path, still, members):
+    path = save(tmp_path / "joints.mcap", joints(still), {"/joint_states": JOINT, "/joint_commands": JOINT})
+    proposal = propose([path])
+    assert proposal.members == members
+    assert f"# {len(members)} that are alike: each depends on its own states and controls." in proposal.text
+    assert ("position[right]: always 0" in proposal.text) == bool(still)
+    model = fitted([path], proposal)
+    assert model.state_names == members and model.fit_summary["violations"] == 0
+    assert np.count_nonzero(model.dA - np.diag(np.diag(model.dA))) == 0
+
+
+def test_one_that_is_asked_for_is_no_file_for_all(tmp_path):
+    path = save(tmp_path / "joints.mcap", joints(), {"/joint_states": JOINT, "/joint_commands": JOINT})
+    proposal = propose([path], states=["/joint_states:position[arm]"], controls=["/joint_commands:position[arm]"])
+    assert proposal.members == () and "structure" not in yaml.safe_load(proposal.text)
+
+
+def test_what_a_person_may_want_of_a_body_is_one_letter_away(recordings):
+    """Depth alone holds on left-out data of 15 s; attitude, rates and speed are there to be taken in."""
+    proposal = propose([recordings / "cougars_auv" / "SO_bag_0.mcap"])
+    assert [c.path for c in proposal.states] == ["pose.pose.position.z"]
+    for name in ("roll", "pitch", "yaw", "angular_velocity_y", "linear_x"):
+        assert f"\n  # - {{name: {name}, " in proposal.text
+    taken = re.sub(r"(?m)^  # - (\{name: (pitch|linear_x), )", r"  - \1", proposal.text)
+    signals = SignalMap.from_dict(yaml.safe_load(taken))
+    (run,) = read_transients(recordings / "cougars_auv" / "SO_bag_0.mcap", signals)
+    assert run.x.shape[1] == 3 and run.usable.sum() > 120
 
 
 def trials(path, column, ids, restart=True, rows=60):

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--like",
         metavar="MEMBER",
         default="",
-        help="write the file for all members (joints, motors) that have what this one has, such as j3",
+        help="of many alike (joints, motors) the one that the file is drawn up for, such as j3",
     )
     parser.add_argument("--json", action="store_true", help="print what is proposed as JSON, with the text of the file")
 
@@ -70,6 +70,7 @@ def run(options: argparse.Namespace) -> int:
     BagError
         A recording cannot be read, or holds no state.
     """
+    from uncertain_lti.base.english import shortlist
     from uncertain_lti.base.files import whole_file
     from uncertain_lti.proposal.init import propose
 
@@ -100,11 +101,13 @@ def run(options: argparse.Namespace) -> int:
             ]
             for kind, of_kind in (("states", proposal.states), ("controls", proposal.controls))
         }
-        print_json({"output": output, **proposed, "warnings": list(proposal.warnings), "text": proposal.text})
+        more = {"members": list(proposal.members), "warnings": list(proposal.warnings), "text": proposal.text}
+        print_json({"output": output, **proposed, **more})
         return DONE
+    alike = f"and the same for each of {shortlist(proposal.members, 12)}\n" if proposal.members else ""
     options.progress.say(
         f"states: {', '.join(c.name for c in proposal.states)}\n"
-        f"controls: {', '.join(c.name for c in proposal.controls) or 'none found'}\n"
+        f"controls: {', '.join(c.name for c in proposal.controls) or 'none found'}\n{alike}"
         f"signals file written to {output}: read it and edit it, it says why; then\n"
         f"  uncertain-lti fit {shlex.join(options.bags)} --signals {shlex.quote(output)} --output machine.model.json"
     )

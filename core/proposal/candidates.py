@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.recordings.topic_facts import usual_step
 from uncertain_lti.signals.functions import FUNCTIONS, QUATERNION
 
 FEWEST = 20
@@ -128,11 +130,14 @@ class Source:
         """Messages of all recordings."""
         return sum(len(a) for a in self.arrival)
 
-    @property
+    @cached_property
     def rate(self) -> float:
-        """Messages per second while there are any, 1/s."""
-        span = sum(float(a[-1] - a[0]) for a in self.arrival if len(a) > 1) * 1e-9
-        return sum(len(a) - 1 for a in self.arrival if len(a) > 1) / span if span > 0 else 0.0
+        """Messages per second, by the usual step (`usual_step`), 1/s."""
+        runs = [a for a in self.arrival if len(a) > 1]
+        steps = np.concatenate([np.diff(a) for a in runs]) if runs else np.empty(0)
+        span = sum(float(a[-1] - a[0]) for a in runs)
+        step, _ = usual_step(float(np.median(steps)), span, len(steps)) if span > 0 else (0.0, False)
+        return 1e9 / step if step > 0 else 0.0
 
     def instants(self, clock: Source, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Times of this topic's messages and another one's by one clock: stamps where both have them, else arrival.

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,6 +23,11 @@ from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
 from uncertain_lti.proposal.candidates import FEWEST, OF_QUATERNION, Candidate, Source
 from uncertain_lti.proposal.effects import FAINT, SHOWS, Steps, explained, steps_of
 from uncertain_lti.proposal.redundancy import drop_copies, drop_functions, drop_idle_controls, drop_noise, prefer_rates
+from uncertain_lti.proposal.roles import is_physical
+
+ALIKE = 0.8
+"""Rate of a topic, relative to that of the fastest, from which on both may give states of one model."""
+
 
 PER_UNKNOWN = 20
 """Transitions per signal below which further signals are only listed."""
@@ -52,13 +58,16 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     every = {s.topic: s for s in [*states, *controls]}
     for source in states:
         prefer_rates(source)
-    shown = [s for s in states if not controls or explained(s, controls) > SHOWS] or list(states)
-    main = max(shown, key=lambda s: (s.rate, s.count))
+    shows = {s.topic: explained(s, controls) if controls else math.inf for s in states}
+    shown = [s for s in states if shows[s.topic] > SHOWS] or list(states)
+    fastest = max(s.rate for s in shown)
+    main = max((s for s in shown if s.rate >= ALIKE * fastest), key=lambda s: (shows[s.topic], s.rate, s.count))
     pool = list(main.free)
     for source in states:
         if source is main:
             continue
-        if source in shown and 0.8 * main.rate <= source.rate <= 1.25 * main.rate:
+        at_its_rate = ALIKE * fastest <= source.rate <= fastest / ALIKE
+        if source in shown and at_its_rate:
             pool += source.free
         else:
             source.reason = (
@@ -66,6 +75,9 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
                 if source in shown
                 else "the controls do not show in it"
             )
+            if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
+                for candidate in source.free:
+                    candidate.reason, candidate.ready = source.reason, "state"
     drop_copies(pool)
     pool = [c for c in pool if not c.reason]
     used = [c for s in controls for c in s.free]
@@ -120,7 +132,7 @@ def _one_element(
     best = like if like in shared else max(shared, key=effect)
     for candidate in [*pool, *used]:
         if candidate.element != best:
-            candidate.reason = f"another joint than {best}; one model per joint holds better than one for all"
+            candidate.reason = f"of another member than {best}, which does not move as {best} does"
     return [c for c in pool if not c.reason], [c for c in used if not c.reason]
 
 

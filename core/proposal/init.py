@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,12 +49,15 @@ class Proposal:
         The signals file, with its reasons.
     warnings : tuple of str, optional
         What the reader should know, a sentence each.
+    members : tuple of str, optional
+        Many alike, such as joints, that the file is for; the states and controls are those of one of them.
     """
 
     states: tuple[Candidate, ...]
     controls: tuple[Candidate, ...]
     text: str
     warnings: tuple[str, ...] = ()
+    members: tuple[str, ...] = ()
 
 
 def propose(
@@ -69,7 +72,8 @@ def propose(
 
     Topics are classified by their names and types, and if these say nothing by what helps to predict what; of a
     topic's numbers those are proposed that move, and in whose next step the controls show, or which help to predict
-    such ones. Everything else is listed in comments with the reason.
+    such ones. Everything else is listed in comments with the reason. Where states and commands are of many that are
+    alike, such as the joints of a robot, the file is for all of them, each with states and controls of its own.
 
     Parameters
     ----------
@@ -82,8 +86,8 @@ def propose(
     controls : sequence of str, optional
         Likewise for the controls.
     like : str, default ""
-        A member of many that are alike, such as a joint: the file is for all members that have what this one has, each
-        with a state and controls of its own.
+        The member of many that are alike, such as a joint, that the file is drawn up for; default the one whose command
+        shows most. The file is for all members in which the same numbers move.
 
     Returns
     -------
@@ -105,6 +109,7 @@ def propose(
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     commands, measured = assign_roles(sources)
+    moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         reasons = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])
         raise BagError(f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})")
@@ -125,22 +130,27 @@ def propose(
     for candidate in ready:
         set_own_scale(candidate)
     warnings = (*(warning for bag in bags for warning in bag.warnings), *([doubt] if doubt else []))
-    one = like or (used[0].element if used else "")
-    members = _members(chosen, used, sources, one) if one and {c.element for c in [*chosen, *used]} == {one} else []
+    members = _members(chosen, used, moving)
     memories = _memories(chosen, used, sources)
-    text = signals_file(bags, sources, chosen, used, doubt, memories, members, for_all=bool(like), runs=runs)
-    return Proposal(tuple(chosen), tuple(used), text, warnings)
+    text = signals_file(bags, sources, chosen, used, doubt, memories, members, runs)
+    return Proposal(tuple(chosen), tuple(used), text, warnings, tuple(members))
 
 
 def _members(
-    states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source], like: str
-) -> list[str]:
-    """Members that have every number that a member has, in the order of the messages."""
-    there = {(c.topic, c.path) for s in sources for c in s.candidates if c.values}
-    every = dict.fromkeys(c.element for s in sources for c in s.candidates if c.element)
-    return [
-        m for m in every if all((c.topic, c.path.replace(f"[{like}]", f"[{m}]")) in there for c in [*states, *controls])
-    ]
+    states: Sequence[Candidate], controls: Sequence[Candidate], moving: Mapping[tuple[str, str], Candidate]
+) -> dict[str, list[Candidate]]:
+    """Members in which every number moves that is proposed of one, with these numbers; empty if there is one only."""
+    group = [*states, *controls]
+    one = {c.element for c in group}
+    if len(one) != 1 or "" in one or not controls:
+        return {}
+    (like,) = one
+    found = {}
+    for member in dict.fromkeys(c.element for c in moving.values() if c.element):
+        alike = [moving.get((c.topic, c.path.replace(f"[{like}]", f"[{member}]"))) for c in group]
+        if None not in alike:
+            found[member] = [c for c in alike if c is not None]
+    return found if len(found) > 1 else {}
 
 
 def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[str]:

@@ -29,7 +29,7 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     """Drop candidates that are functions of another one, whatever their topics: copies, other units, squares.
 
     Such a function leaves next to nothing of a candidate, or nothing but noise. Of two that are functions of each
-    other, the one in which the controls show more stays.
+    other, the one in which the controls show clearly more stays, else the first.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     n = len(pool)
     shows = steps.effect(range(n)) if steps.U.shape[1] else np.zeros(n)
     kept: list[int] = []
-    for i in np.argsort(-shows, kind="stable").tolist():
+    for i in np.argsort(-np.log(np.maximum(shows, 1.0)).round(1), kind="stable").tolist():
         source = next((j for j in kept if _function(steps.X[:, j], steps.X[:, i])), None)
         if source is not None:
             pool[i].reason = f"says what {_place(pool[source], pool[i])} says already"

@@ -56,6 +56,22 @@ _APART_TYPES = {
 }  # fmt: skip
 
 
+def is_physical(type_name: str) -> bool:
+    """Whether messages of a type hold how a body or a joint is and moves.
+
+    Parameters
+    ----------
+    type_name : str
+        `pkg/msg/Type`.
+
+    Returns
+    -------
+    bool
+        By the type's name.
+    """
+    return bool(_PHYSICAL.search(type_name.rpartition("/")[2].lower()))
+
+
 def role_by_name(topic: str, type_name: str) -> str:
     """What a topic seems to be by its name, the last word first, else by its type.
 
@@ -76,7 +92,7 @@ def role_by_name(topic: str, type_name: str) -> str:
     name = topic.strip("/").lower()
     last = name.rpartition("/")[2]
     kind = type_name.rpartition("/")[2].lower()
-    if not _PHYSICAL.search(kind) and any(_APART.search(text) for text in (last, name)):
+    if not is_physical(type_name) and any(_APART.search(text) for text in (last, name)):
         return "apart"
     for text in (last, name, kind):
         if _ANSWER.search(text):

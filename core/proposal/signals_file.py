@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.proposal.candidates import Candidate, Source
@@ -26,7 +26,7 @@ _LONGEST_LINE = 1 << 20  # letters
 
 def signals_file(
     bags: Sequence[Recording], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
-    doubt: str, memories: Sequence[str] = (), members: Sequence[str] = (), for_all: bool = False, runs: str = "",
+    doubt: str, memories: Sequence[str] = (), members: Mapping[str, Sequence[Candidate]] | None = None, runs: str = "",
 ) -> str:  # fmt: skip
     """Write the text of the file.
 
@@ -44,10 +44,8 @@ def signals_file(
         A sentence about the states, or an empty text.
     memories : sequence of str, optional
         Lines to add to the states.
-    members : sequence of str, optional
-        Many alike, of which the states and controls are those of one.
-    for_all : bool, default False
-        Whether the file is for all of them; else it says how to get one that is.
+    members : mapping of str to sequence of Candidate, optional
+        Many alike, of which the states and controls are those of one, and what each has; the file is for all of them.
     runs : str, default ""
         Column of tables that tells the recordings in one file apart.
 
@@ -114,27 +112,25 @@ def signals_file(
             "# No topic looks like a command. Without controls the envelope must cover what they do.",
             "controls: []",
         ]
-    left_out = _left_out(sources, {id(c) for c in [*states, *controls]})
+    members = members or {}
+    proposed = [*states, *controls, *(c for alike in members.values() for c in alike)]
+    left_out = _left_out(sources, {id(c) for c in proposed})
     if left_out:
         lines += ["", "# Not proposed, and why:", *left_out]
-    if len(members) > 1 and not for_all:
-        one = _quoted(states[0].element)
-        lines += ["", f"# One of {len(members)} that are alike ({shortlist(members, 6)}). `uncertain-lti init BAG..."]
-        lines[-1] += f" --like {one}` writes one file for all of them."
-    if members and for_all:
-        lines = for_members(lines, [*states, *controls], members)
+    if members:
+        lines = for_members(lines, states[0].element, list(members))
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
 
 
-def for_members(lines: Sequence[str], of: Sequence[Candidate], members: Sequence[str]) -> list[str]:
+def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
     """The lines of one member of many alike as templates for all of them.
 
     Parameters
     ----------
     lines : sequence of str
         Of the file.
-    of : sequence of Candidate
-        Its signals, all of one member.
+    one : str
+        The member that they are of.
     members : sequence of str
         All members.
 
@@ -143,18 +139,23 @@ def for_members(lines: Sequence[str], of: Sequence[Candidate], members: Sequence
     list of str
         The lines, with `structure: own` and `steady: auto`.
     """
-    one = of[0].element
     listed = ", ".join(_quoted(m) for m in members)
     found = []
     for line in lines:
         if line.startswith("states:"):
-            found += ["# Each member depends on its own states and controls.", "structure: own", ""]
+            found += [
+                f"# {len(members)} that are alike: each depends on its own states and controls. Shorten the lists to "
+                "watch fewer.",
+                "structure: own",
+                "",
+            ]
         if re.match(r"  - \{name: ", line) and f"[{one}]" in line:
             line = line.replace(f"[{one}]", "[{}]")
             line = re.sub(
                 r"^  - \{name: ([^,]+),", lambda m: f"  - {{for: [{listed}], name: {_place(m[1], one)},", line
             )
-            line = re.sub(r"steady: (?!0[,}])[^,}]+", "steady: auto", line)
+            if not re.search(r'field: "(rate|diff)\(', line):
+                line = re.sub(r"steady: [^,}]+, scale: [^,}]+", "steady: auto, scale: auto", line)
         found.append(line)
     return found
 
