@@ -764,6 +764,9 @@ def test_metadata_yaml_decides(tmp_path: Path) -> None:
     ]
     (folder / "metadata.yaml").write_text(metadata_yaml(["gone.mcap"]))
     assert "lists gone.mcap, and none of them is there" in error_of(folder)
+    assert error_of(folder).endswith("or name one of those that are there: early.mcap, late.mcap, other.mcap")
+    renamed = write_folder(tmp_path / "renamed", {"mine.mcap": part(0, 9)}, metadata_yaml(["rosbag2_2026_0.mcap"]))
+    assert len(read_all(Bag(renamed))) == 91 and "mine.mcap is read, which is there instead" in Bag(renamed).warnings[0]
     for text in ("", "]", "x: [", "rosbag2_bagfile_information: 3", "\0", metadata_yaml([])):
         alone = write_folder(tmp_path / "alone", {"x.mcap": part(0, 9)}, text)
         assert len(read_all(Bag(alone))) == 91 and "metadata.yaml cannot be used" in Bag(alone).warnings[0]

@@ -110,7 +110,13 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
         warnings += [f"{p}: metadata.yaml does not list this file; it is left out" for p in found if p not in there]
         if there:
             return there, True, warnings
-        raise BagError(f"{folder}: metadata.yaml lists {file_names(listed)}, and none of them is there; copy them here")
+        if len(listed) == len(found) == 1:  # renamed
+            instead = f"{listed[0]}: metadata.yaml lists this file, and {found[0].name} is read, which is there instead"
+            return found, False, [instead]
+        others = f", or name one of those that are there: {file_names(found)}" if found else ""
+        raise BagError(
+            f"{folder}: metadata.yaml lists {file_names(listed)}, and none of them is there; copy them here{others}"
+        )
     if not found:
         raise no_recording(folder, inside)
     stems = {pair[0] if (pair := stem_and_index(p)) else p.name for p in found}
