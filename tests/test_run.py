@@ -13,10 +13,13 @@ import os
 import platform
 import shutil
 import signal
+import ssl
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -139,6 +142,26 @@ def test_no_network(run):
     nowhere = {"PIP_INDEX_URL": "http://127.0.0.1:9", "PIP_RETRIES": "1"}
     sentence = refusal(run("setup", programs={"python3": this_python()}, **nowhere))
     assert "no package index can be reached" in sentence and "connect this machine" in sentence
+
+
+def test_an_index_whose_certificate_is_not_trusted(run, tmp_path):
+    """pip itself ends by blaming the versions that were asked for."""
+    pytest.importorskip("ensurepip", reason="this Python cannot make virtual environments")
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl, which makes the certificate, is not installed")
+    both = tmp_path / "own.pem"
+    make = "openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=own -addext subjectAltName=IP:127.0.0.1"
+    subprocess.run([*make.split(), "-keyout", both, "-out", tmp_path / "c.pem"], check=True, capture_output=True)
+    both.write_text(both.read_text() + (tmp_path / "c.pem").read_text())
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(both)
+    with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
+        server.socket = context.wrap_socket(server.socket, server_side=True)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        index = {"PIP_INDEX_URL": f"https://127.0.0.1:{server.server_address[1]}/simple", "PIP_RETRIES": "0"}
+        sentence = refusal(run("setup", programs={"python3": this_python()}, **index))
+        server.shutdown()
+    assert "certificate of the package index is not trusted" in sentence and "export PIP_CERT=" in sentence
 
 
 PROGRAMS = ("uncertain-lti", "envelope_monitor", "plant", "turbofan")
