@@ -19,10 +19,10 @@ from uncertain_lti.cli.command import (
     ALARM,
     BAD_INPUT,
     DONE,
-    RECORDINGS,
     SILENT,
     Command,
     add_model,
+    add_recordings,
     load_model,
     print_json,
     print_notes,
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     add_model(parser, published=True)
-    parser.add_argument("bags", metavar="BAG", nargs="+", help=RECORDINGS)
+    add_recordings(parser)
     add_rule_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print JSON with a verdict per sample")
     parser.add_argument(

@@ -36,6 +36,7 @@ known whether there is an alarm.
 """
 
 SILENT = "print errors only (and with --json the data): no summary, no notes, no progress"
+RECORDINGS = "recordings (MCAP, .db3, .bag, tables) and folders"
 GROUP = (
     "leave out whole groups of recordings that are alike: folder, hours=H (recordings that follow one another within "
     "H hours), metadata=NAME (of the bag), name=PATTERN (of the file)"
@@ -160,10 +161,6 @@ def load_model(name: str) -> UncertainLTI:
     return UncertainLTI.load(name)
 
 
-RECORDINGS = "recordings (MCAP, .db3, .bag, tables) and folders"
-"""What may be named as recordings."""
-
-
 def add_model(parser: argparse.ArgumentParser, published: bool = False) -> None:
     """Declare the model file that a command takes.
 
@@ -176,6 +173,27 @@ def add_model(parser: argparse.ArgumentParser, published: bool = False) -> None:
     """
     more = ", or leibov2006 for the published one" if published else ""
     parser.add_argument("model", metavar="MODEL", help=f"model file{more}")
+
+
+def add_recordings(
+    parser: argparse.ArgumentParser, more: str = "", *, about: str = "", metavar: str = "BAG", required: bool = True
+) -> None:
+    """Declare the recordings that a command takes, as `options.bags`.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of the command.
+    more : str, default ""
+        What the help says of them besides what they may be.
+    about : str, default ""
+        The whole help, where there may be more than recordings.
+    metavar : str, default "BAG"
+        What the help calls each.
+    required : bool, default True
+        Whether at least one must be named.
+    """
+    parser.add_argument("bags", metavar=metavar, nargs="+" if required else "*", help=about or f"{RECORDINGS}{more}")
 
 
 def add_signals(parser: argparse.ArgumentParser) -> None:

@@ -22,10 +22,10 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.command import (
     DONE,
     GROUP,
-    RECORDINGS,
     SILENT,
     Command,
     add_output,
+    add_recordings,
     add_signals,
     model_target,
     print_json,
@@ -43,12 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument(
-        "bags",
-        metavar="BAG",
-        nargs="+",
-        help=f"{RECORDINGS}; parts of a split bag are one recording",
-    )
+    add_recordings(parser, "; parts of a split bag are one recording")
     add_signals(parser)
     add_output(parser, required=True)
     parser.add_argument("--criterion", choices=("qp", "lp"), default="qp", help="(10) squared or (11) largest width")

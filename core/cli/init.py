@@ -16,7 +16,7 @@ import os
 import shlex
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.cli.command import DONE, Command, print_json, print_notes
+from uncertain_lti.cli.command import DONE, Command, add_recordings, print_json, print_notes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,9 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument(
-        "bags", metavar="BAG", nargs="+", help="recordings (MCAP, .db3, .bag, tables) and folders of the same machine"
-    )
+    add_recordings(parser, " of the same machine")
     parser.add_argument(
         "--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)"
     )

@@ -23,6 +23,7 @@ from uncertain_lti.cli.command import (
     DONE,
     SILENT,
     Command,
+    add_recordings,
     load_model,
     print_json,
     print_notes,
@@ -44,12 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument(
-        "what",
+    add_recordings(
+        parser,
+        about="a model file (an image of its elements), recordings (their signals), or a model file and then "
+        "recordings (states between their bounds)",
         metavar="WHAT",
-        nargs="+",
-        help="a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
-        "(states between their bounds)",
     )
     parser.add_argument("--signals", metavar="FILE", help="signals file: draw its signals, not every number that moves")
     parser.add_argument(
@@ -84,13 +84,13 @@ def run(options: argparse.Namespace) -> int:
     """
     from uncertain_lti.recordings.formats import group_recordings
 
-    named = _names_model(options.what[0])
-    model = load_model(options.what[0]) if named else None
-    paths = options.what[1:] if named else options.what
+    named = _names_model(options.bags[0])
+    model = load_model(options.bags[0]) if named else None
+    paths = options.bags[1:] if named else options.bags
     if model is not None and options.signals:
         raise ModelError(f"--signals {options.signals}: the model has its signals; leave the option out")
     bags = group_recordings(paths, layout=None if model is None else model.signals.table) if paths else []
-    output = _target(options.output or ("plot.html" if bags else "plot.png"), options.what[0] if named else "", bags)
+    output = _target(options.output or ("plot.html" if bags else "plot.png"), options.bags[0] if named else "", bags)
     status = DONE
     if model is not None and not bags:
         _image(_model_figure(model), output)
@@ -166,7 +166,7 @@ def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Rec
     if not checked:
         raise BagError("no recording could be checked, so nothing is drawn; name one that has the topics of the model")
     if page:
-        name = os.path.basename(options.what[0])
+        name = os.path.basename(options.bags[0])
         _write(f"{name}: {_listed(bags)}", plotted, output)
     return ALARM if alarm else BAD_INPUT if checked < len(bags) else DONE
 

@@ -17,10 +17,10 @@ from uncertain_lti.cli.command import (
     ALARM,
     BAD_INPUT,
     DONE,
-    RECORDINGS,
     SILENT,
     Command,
     add_model,
+    add_recordings,
     load_model,
     print_json,
     print_notes,
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     add_model(parser, published=True)
-    parser.add_argument("bags", metavar="BAG", nargs="+", help=f"{RECORDINGS} to check against it")
+    add_recordings(parser, " to check against it")
     add_rule_arguments(parser)
     parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
     parser.add_argument("--json", action="store_true", help="print the same facts as JSON")

@@ -20,6 +20,7 @@ from uncertain_lti.cli.command import (
     Command,
     add_model,
     add_output,
+    add_recordings,
     load_model,
     model_target,
     print_json,
@@ -38,11 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     add_model(parser)
-    parser.add_argument(
-        "labelled",
+    add_recordings(
+        parser,
+        about="a fault, and a recording of it in which the alarm is raised; several recordings may have one label",
         metavar="LABEL=BAG",
-        nargs="+",
-        help="a fault, and a recording of it in which the alarm is raised; several recordings may have one label",
     )
     add_output(parser, required=True)
     add_margin_arguments(parser)
@@ -74,8 +74,8 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti.validation.signatures import learn_signatures
 
     output = model_target(options.output, options.force)
-    pairs = [text.partition("=") for text in options.labelled]
-    for text, (label, _, bag) in zip(options.labelled, pairs, strict=True):
+    pairs = [text.partition("=") for text in options.bags]
+    for text, (label, _, bag) in zip(options.bags, pairs, strict=True):
         if not (label.strip() and bag):
             raise ModelError(f"{text!r} is not LABEL=BAG; write for example stuck_valve=run7.mcap")
     model = load_model(options.model)

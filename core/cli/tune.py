@@ -23,6 +23,7 @@ from uncertain_lti.cli.command import (
     SILENT,
     Command,
     add_output,
+    add_recordings,
     add_signals,
     add_within,
     model_target,
@@ -41,12 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser : argparse.ArgumentParser
         Of the command.
     """
-    parser.add_argument(
-        "bags",
-        metavar="BAG",
-        nargs="+",
-        help="recordings of the healthy machine; LABEL=BAG is one of a machine with the fault LABEL",
-    )
+    add_recordings(parser, " of the healthy machine; LABEL=BAG is one of a machine with the fault LABEL")
     add_signals(parser)
     parser.add_argument(
         "--false-alarms", required=True, type=float, metavar="PER_HOUR", help="false alarms per hour at most"

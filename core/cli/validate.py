@@ -18,11 +18,11 @@ from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli.command import (
     DONE,
     GROUP,
-    RECORDINGS,
     SILENT,
     Command,
     add_force,
     add_model,
+    add_recordings,
     add_within,
     model_target,
     print_json,
@@ -40,12 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         Of the command.
     """
     add_model(parser)
-    parser.add_argument(
-        "bags",
-        metavar="BAG",
-        nargs="*",
-        help=f"{RECORDINGS} (default: those the model was fitted to)",
-    )
+    add_recordings(parser, " (default: those the model was fitted to)", required=False)
     parser.add_argument("--blocks", type=int, help="leave out blocks: their number per recording (a single one: 10)")
     parser.add_argument(
         "--group", metavar="KEY", help=f"{GROUP}; default: that of the fit; none: single recordings all the same"
