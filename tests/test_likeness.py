@@ -119,14 +119,14 @@ def test_live_says_what_check_says(taught: UncertainLTI) -> None:
     from test_frozen import steps_of
 
     transient = run(200, "p stuck")
-    monitor, explainer = EnvelopeMonitor(taught), Explainer(taught)
+    monitor, explainer, quiet = EnvelopeMonitor(taught), Explainer(taught), 0
     for step in steps_of(transient):
         verdict = monitor.judge(step)
         if verdict.judged:
+            quiet += 1
             if verdict.alarm:
-                explainer.push(verdict.horizon_utilisation, verdict.lower, verdict.upper)
-            else:
-                explainer.quiet()
+                explainer.push(verdict.horizon_utilisation, verdict.lower, verdict.upper, quiet - 1)
+                quiet = 0
     live, offline = explainer.likeness(), explained(taught, transient)[-1]
     assert live is not None
     assert (live.words, dict(live.matches)) == (offline["text"], offline["matches"])
@@ -136,7 +136,7 @@ def test_too_few_verdicts_name_nothing(taught: UncertainLTI) -> None:
     explainer = Explainer(taught)
     assert explainer.likeness() is None
     for _ in range(LEAST - 1):
-        explainer.push(np.array([[3.0, 0.0, np.inf]]), -np.ones(3), np.ones(3))
+        explainer.push(np.array([[3.0, 0.0, np.inf]]), -np.ones(3), np.ones(3), 0)
     like = explainer.likeness()
     assert like is not None and not like.label and not like.words
 

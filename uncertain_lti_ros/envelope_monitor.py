@@ -423,31 +423,33 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.inputs.clear()
 
     def _on_message(self, topic: str, data: bytes) -> None:
-        if not self.active or self.session is None:
+        session = self.session
+        if session is None or not self.active:
             return
         now = time.monotonic()
         try:
-            messages = self.session.accept(topic, self._arrival(), data, now)
+            messages = session.accept(topic, self._arrival(), data, now)
         except Exception as error:
             self._note_failed_message(topic, error)
         else:
-            self._take_all(self.session, messages, now)
+            self._take_all(session, messages, now)
 
     def _take_all(self, session: Session, messages: Sequence[Waiting], now: float) -> None:
-        for number, (topic, arrival, data) in enumerate(messages, 1):
+        for number, message in enumerate(messages, 1):
             if number % _AT_ONCE == 0:  # a burst of outputs would drive out what reliable readers have not had yet
                 time.sleep(_PAUSE)
             try:
-                self._take(session, topic, arrival, data, now)
+                self._take(session, message, now)
             except Exception as error:
-                self._note_failed_message(topic, error)
+                self._note_failed_message(message[0], error)
 
     def _note_failed_message(self, topic: str, error: Exception) -> None:
         self.note_failure(f"on a message of {topic}", error)
         assert self.session is not None
         self.session.failed()
 
-    def _take(self, session: Session, topic: str, arrival: int, data: bytes, now: float) -> None:
+    def _take(self, session: Session, message: Waiting, now: float) -> None:
+        topic, arrival, data = message
         alarms, before = session.alarms, session.alarm
         verdicts, opened = session.take(topic, arrival, data, now)
         alarm = session.alarm
@@ -458,7 +460,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.snapshots.add(Entry(now, arrival, topic, data, verdicts, alarm), session.alarms > alarms)
         if turned and not alarm:
             self.snapshots.alarm_over(now)
-        if verdicts or opened or turned:
+        if opened or verdicts or turned:
             self.outputs.publish(session, verdicts, opened, now, turned)
 
     def _arrival(self) -> int:

@@ -125,7 +125,9 @@ class Outputs:
         self.publishers: dict[str, OutputPublisher] = {}
         self.alarm_sent = now
         self._reason_sent = ""
-        self._heard: dict[str, _Heard] = {}  # by what they are published for; empty when it must be made again
+        # By what they are published for, None where nobody listens; empty when it must be made again.
+        self._heard: dict[str, _Heard | None] = {}
+        self._alarm_heard = self._reason_heard = False
 
     def open(self, heartbeat: float) -> None:
         """Make the publishers.
@@ -163,7 +165,9 @@ class Outputs:
         vectors = self._messages.outputs
         for made_for, when in _WHEN.items():
             names = [name for name in vectors if vectors[name].when in when and self.publishers[name].listeners]
-            self._heard[made_for] = [self.publishers[name] for name in names], self._messages.encoder(names)
+            heard = [self.publishers[name] for name in names], self._messages.encoder(names)
+            self._heard[made_for] = heard if names else None
+        self._alarm_heard, self._reason_heard = self._violation.listeners > 0, self._reason.listeners > 0
 
     def poll(self) -> None:
         """Update the numbers of listeners."""
@@ -191,26 +195,26 @@ class Outputs:
         """
         if not self._heard:
             self._listen()
+        heard = self._heard
         messages: list[tuple[OutputPublisher, bytes]] = []
         for verdict in verdicts:
             judged = verdict.judged
-            publishers, encode = self._heard["judged" if judged else "message"]
-            if publishers:
+            if made := heard.get("judged" if judged else "message"):
+                publishers, encode = made
                 messages += zip(publishers, encode(verdict), strict=True)
-            turned |= judged and self._violation.listeners > 0
-        if opened:
-            publishers, encode = self._heard["predicted"]
-            if publishers and (expected := session.predict()) is not None:
-                messages += zip(publishers, encode(expected), strict=True)
-            publishers, encode = self._heard["predicted over"]
-            if publishers and (foreseen := session.foresee()) is not None:
-                messages += zip(publishers, encode(foreseen), strict=True)
+            turned = turned or (judged and self._alarm_heard)
+        if opened and (made := heard.get("predicted")) and (expected := session.predict()) is not None:
+            publishers, encode = made
+            messages += zip(publishers, encode(expected), strict=True)
+        if opened and (made := heard.get("predicted over")) and (foreseen := session.foresee()) is not None:
+            publishers, encode = made
+            messages += zip(publishers, encode(foreseen), strict=True)
         if turned:
             self.alarm_sent = now
             messages.append((self._violation, TRUE if session.alarm else FALSE))
         for publisher, message in messages:
             publisher.send(message)
-        if self._reason.listeners:
+        if self._reason_heard:
             self.send_reason(session.reasons.text)
 
     def send_alarm(self, alarm: bool, now: float) -> None:

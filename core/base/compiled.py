@@ -26,9 +26,12 @@ from zlib import crc32
 
 MODULES = (
     "model.bounds",
+    "monitor.envelope_monitor",
     "monitor.statistics",
+    "monitor.stream",
     "monitor.verdict",
     "monitor.verdict_messages",
+    "recordings.message_reader",
     "sampling.sampler",
 )
 """Modules that have a twin where they were compiled; setup.py builds them."""

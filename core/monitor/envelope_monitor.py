@@ -16,10 +16,16 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+try:
+    import cython
+except ImportError:  # Cython is not needed to run
+    from uncertain_lti.base import uncompiled as cython
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.limits import LARGEST
@@ -62,6 +68,7 @@ def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int
     return [(int(a), int(b)) for a, b in zip(edges, [*edges[1:], count], strict=True) if counts[a]]
 
 
+@cython.cclass
 class EnvelopeMonitor:
     """Judges one-step transitions by the bounds of a model, and raises the alarm while one of its rules does.
 
@@ -100,6 +107,20 @@ class EnvelopeMonitor:
         what a rule needs.
     """
 
+    model: UncertainLTI = cython.declare(object, visibility="readonly")
+    rule: AlarmRule = cython.declare(object, visibility="readonly")
+    alarms: Alarm = cython.declare(object, visibility="readonly")
+    masked: tuple[str, ...] = cython.declare(object, visibility="readonly")
+    frozen_watch: FrozenWatch | None = cython.declare(object, visibility="readonly")
+    _counted: Any
+    _judge: Any
+    _runs: Any
+    _nothing: Any
+    _own: Any
+    _frozen_alarm: cython.bint
+    _shortest: cython.double
+    _longest: cython.double
+
     def __init__(
         self,
         model: UncertainLTI,
@@ -119,7 +140,7 @@ class EnvelopeMonitor:
             rule.window if window is None else window,
             rule.margin if margin is None else margin,
         )
-        other = any(given is not None for given in (violations, window, margin))
+        other = (violations, window, margin) != (None, None, None)
         every = with_containment(model.alarm, self.rule) if other else model.alarm
         names = model.state_names
         for name in masked:
@@ -135,8 +156,7 @@ class EnvelopeMonitor:
         self._nothing = None if self._runs is None else np.full(model.n * len(model.horizons), np.nan)
         self.frozen_watch = self._watch()
         self._frozen_alarm = False
-        own = np.diagonal(model.A).tolist() if model.schedule is None else None
-        self._own: list[float] | None = own
+        self._own = np.diagonal(model.A).tolist() if model.schedule is None else None
         self._shortest, self._longest = model.sampling.step_range
 
     def __repr__(self) -> str:
@@ -167,6 +187,7 @@ class EnvelopeMonitor:
             return None
         return FrozenWatch(self.model.repeats, self.rule.margin, self._counted.tolist())
 
+    @cython.cfunc
     def _forget_repeats(self) -> None:
         self._frozen_alarm = False
         if self.frozen_watch is not None:
@@ -294,7 +315,7 @@ class EnvelopeMonitor:
             self._frozen_alarm = armed and bool(looked.frozen)
             if looked.no_verdict:
                 judgement, status = None, Status.FROZEN
-        elif not status.dropped:
+        elif judgement is None and not status.dropped:
             self._forget_repeats()
         longer = self._nothing
         if self._runs is not None:
@@ -304,8 +325,9 @@ class EnvelopeMonitor:
                 self._runs.reset()
         if judgement is not None and armed:
             alarms.push(step.dt, judgement.violation, self._table(judgement, longer) if alarms.needs_table else None)
-        return Verdict(step, self.alarm, judgement, status, alarms, longer, looked)
+        return Verdict(step, alarms.alarm or self._frozen_alarm, judgement, status, alarms, longer, looked)
 
+    @cython.cfunc
     def _table(self, judgement: Judgement, longer: Any) -> array[float]:
         """Utilisation for one step and for each horizon, then the residuals likewise where they are needed."""
         table = array("d", judgement.numbers(UTILISATION))
@@ -457,3 +479,7 @@ class EnvelopeMonitor:
         flags = np.where(contained(lower, x_next, upper), 0.0, 1.0)
         residual = x_next - centre
         return flags, np.asarray(lower), np.asarray(upper), np.asarray(utilisation_of(residual, half)), residual
+
+
+if not cython.compiled:
+    use_twin(globals(), ("EnvelopeMonitor",))

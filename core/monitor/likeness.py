@@ -244,13 +244,8 @@ class Explainer:
         """Forget every alarm."""
         self.pattern: Pattern | None = None
         self._first: tuple[str, ...] = ()
-        self._quiet = 0
 
-    def quiet(self) -> None:
-        """Take a verdict without an alarm."""
-        self._quiet += 1
-
-    def push(self, table: Array, lower: Array, upper: Array) -> bool:
+    def push(self, table: Array, lower: Array, upper: Array, quiet: int) -> bool:
         """Take a verdict with an alarm.
 
         Parameters
@@ -259,18 +254,19 @@ class Explainer:
             Utilisation for one step and for each horizon.
         lower, upper : array (n,)
             Bounds of one step, recorded units.
+        quiet : int
+            Verdicts without an alarm since the last one with.
 
         Returns
         -------
         bool
             Another pattern begins with it.
         """
-        begins = self.pattern is None or self._quiet > APART
+        begins = self.pattern is None or quiet > APART
         if begins:
             self.pattern = Pattern(self._steps, self._model.n)
             outside = np.any(np.abs(table) > 1.0, axis=0).tolist()
             self._first = tuple(n for n, out in zip(self._model.state_names, outside, strict=True) if out)
-        self._quiet = 0
         assert self.pattern is not None
         if self.pattern.verdicts < MOST:
             with np.errstate(over="ignore", invalid="ignore"):
@@ -319,10 +315,11 @@ def over_recording(
     explainer, begin, last, before = Explainer(model), -1, -1, 0
     count = np.cumsum(judged)
     for k in np.flatnonzero(judged & alarm).tolist():
-        if begin >= 0 and count[k] - before - 1 > APART:
+        quiet = int(count[k]) - before - 1
+        if begin >= 0 and quiet > APART:
             yield begin, last, explainer
             explainer, begin = Explainer(model), -1
-        explainer.push(table[k], lower[k], upper[k])
+        explainer.push(table[k], lower[k], upper[k], quiet)
         begin, last, before = (k if begin < 0 else begin), k, int(count[k])
     if begin >= 0:
         yield begin, last, explainer

@@ -86,7 +86,7 @@ class Session(Stream):
     def _report_monitor(
         self, period: Period, now: float, without: float, timeout: float, problems: Sequence[str]
     ) -> Report:
-        never = [topic for topic in self.types if topic not in self._heard]
+        never = [topic for topic in self.types if self.heard(topic) is None]
         complaints, calm = list(problems), list[str]()
         if period.last_unknown is not None:
             why = self.model.why_unknown(period.last_unknown.before)
@@ -125,7 +125,7 @@ class Session(Stream):
             level = ERROR if self.latched else STALE
             if self.monitor.alarm:
                 complaints.insert(0, "alarm: it was on at the last verdict")
-            if silent > timeout and self.sampler.clock in self._heard:
+            if silent > timeout and self.heard(self.sampler.clock) is not None:
                 complaints.insert(0, f"no message on {self.sampler.clock} for {silent:.1f} s")
             else:
                 complaints.insert(0, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet")
@@ -309,6 +309,6 @@ class Session(Stream):
                 counts[f"unreadable {topic}"] = str(self.unreadable[topic])
             if self.future[topic]:
                 counts[f"future {topic}"] = str(self.future[topic])
-            if topic in self._heard:
-                counts[f"age {topic}"] = repr(round(now - self._heard[topic], 3))
+            if (heard := self.heard(topic)) is not None:
+                counts[f"age {topic}"] = repr(round(now - heard, 3))
         return counts

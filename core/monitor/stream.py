@@ -14,8 +14,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from typing import Any
 
+try:
+    import cython
+except ImportError:  # Cython is not needed to run
+    from uncertain_lti.base import uncompiled as cython
+
+from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.jumps import jumps_in_words
 from uncertain_lti.model.repeats import Moved
@@ -41,6 +47,7 @@ SHOWN = 5
 FUTURE = 1.0
 """s that a stamp may be ahead of the clock before it is reported."""
 
+_OK, _RESET = Status.OK, Status.RESET  # looking up one of an enumeration is slow
 _FUTURE_NS = to_ns(FUTURE)
 _NOTHING: tuple[Verdict, ...] = ()
 
@@ -48,7 +55,7 @@ MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
 """Type name and paths -> reader."""
 
 
-@dataclass
+@cython.cclass
 class Period:
     """What has happened since the last report.
 
@@ -56,15 +63,18 @@ class Period:
     ----------
     began : float
         Steady time, s.
-    verdicts : int, default 0
+
+    Attributes
+    ----------
+    verdicts : int
         Verdicts given in it.
-    outside : int, default 0
+    outside : int
         Those from outside the fitted domain.
-    unknown : int, default 0
+    unknown : int
         Those of a regime that was not fitted.
-    last_unknown : Verdict or None, optional
+    last_unknown : Verdict or None
         The last of these.
-    alarm : bool, default False
+    alarm : bool
         The alarm was raised at some time in it.
     frozen, repeating : dict of int to Moved
         By number of the state, the last repeat of those that were frozen, and of others that repeat for longer than
@@ -77,29 +87,37 @@ class Period:
         Of the samples in it.
     counters : Counter of str
         Those of the sampler when it began.
-    late : int, default 0
+    late : int
         Late messages when it began.
-    unreadable : int, default 0
+    unreadable : int
         Unreadable messages when it began.
-    future : int, default 0
+    future : int
         Messages with a stamp in the future when it began.
     """
 
-    began: float
-    verdicts: int = 0
-    outside: int = 0
-    unknown: int = 0
-    last_unknown: Verdict | None = None
-    alarm: bool = False
-    frozen: dict[int, Moved] = field(default_factory=dict)
-    repeating: dict[int, Moved] = field(default_factory=dict)
-    violations: Counter[int] = field(default_factory=Counter)
-    jumps: list[str] = field(default_factory=list)
-    statuses: Counter[Status] = field(default_factory=Counter)
-    counters: Counter[str] = field(default_factory=Counter)
-    late: int = 0
-    unreadable: int = 0
-    future: int = 0
+    began: float = cython.declare(cython.double, visibility="readonly")
+    verdicts: int = cython.declare(cython.Py_ssize_t, visibility="public")
+    outside: int = cython.declare(cython.Py_ssize_t, visibility="public")
+    unknown: int = cython.declare(cython.Py_ssize_t, visibility="public")
+    last_unknown: Verdict | None = cython.declare(object, visibility="public")
+    alarm: bool = cython.declare(cython.bint, visibility="public")
+    frozen: dict[int, Moved] = cython.declare(object, visibility="readonly")
+    repeating: dict[int, Moved] = cython.declare(object, visibility="readonly")
+    violations: Counter[int] = cython.declare(object, visibility="readonly")
+    jumps: list[str] = cython.declare(object, visibility="readonly")
+    statuses: Counter[Status] = cython.declare(object, visibility="readonly")
+    counters: Counter[str] = cython.declare(object, visibility="public")
+    late: int = cython.declare(cython.Py_ssize_t, visibility="public")
+    unreadable: int = cython.declare(cython.Py_ssize_t, visibility="public")
+    future: int = cython.declare(cython.Py_ssize_t, visibility="public")
+
+    def __init__(self, began: float) -> None:
+        self.began, self.last_unknown, self.alarm = began, None, False
+        self.verdicts = self.outside = self.unknown = 0
+        self.frozen, self.repeating = {}, {}
+        self.violations, self.statuses, self.counters = Counter(), Counter(), Counter()
+        self.jumps = []
+        self.late = self.unreadable = self.future = 0
 
 
 def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> dict[str, str]:
@@ -150,6 +168,7 @@ def _held(model: UncertainLTI, signals: Sequence[int]) -> float:
     return max(math.inf if hold is None else hold for hold in holds)
 
 
+@cython.cclass
 class Stream:
     """Samples and judges the messages of one model, and keeps count.
 
@@ -192,6 +211,44 @@ class Stream:
     SignalError
         The model does not state how samples are cut.
     """
+
+    model: UncertainLTI = cython.declare(object, visibility="public")
+    rule: Rule = cython.declare(object, visibility="readonly")
+    monitor: EnvelopeMonitor = cython.declare(object, visibility="readonly")
+    sampler: Sampler = cython.declare(object, visibility="readonly")
+    explainer: Explainer = cython.declare(object, visibility="public")
+    reasons: Reasons = cython.declare(object, visibility="readonly")
+    arming: Arming = cython.declare(object, visibility="readonly")
+    period: Period = cython.declare(object, visibility="readonly")
+    received: Counter[str] = cython.declare(object, visibility="readonly")
+    unreadable: Counter[str] = cython.declare(object, visibility="readonly")
+    future: Counter[str] = cython.declare(object, visibility="readonly")
+    why_unreadable: dict[str, str] = cython.declare(object, visibility="readonly")
+    violations: list[int] = cython.declare(list, visibility="readonly")
+    last: Verdict | None = cython.declare(object, visibility="readonly")
+    latched: bool = cython.declare(cython.bint, visibility="public")
+    enable_topic: str = cython.declare(object, visibility="readonly")
+    enable_type: str = cython.declare(object, visibility="readonly")
+    caught_up: str = cython.declare(object, visibility="readonly")
+    verdicts: int = cython.declare(object, visibility="readonly")
+    alarms: int = cython.declare(object, visibility="readonly")
+    failures: int = cython.declare(object, visibility="readonly")
+    reordered: int = cython.declare(object, visibility="readonly")
+    _model_types: Mapping[str, str] = cython.declare(object, visibility="readonly")
+    _type_fields: TypeFields = cython.declare(object, visibility="readonly")
+    _make_reader: MakeReader = cython.declare(object, visibility="readonly")
+    _readers: dict[str, MessageReader]
+    _held: dict[str, float]
+    _heard: dict[str, float]
+    _stamped: list[str]
+    _window: cython.double
+    _stall: cython.double
+    _began: cython.double
+    _judged: cython.double
+    _came: cython.double
+    _quiet: cython.Py_ssize_t  # verdicts without an alarm since the last one with
+    _catches_up: Any
+    _reads_condition: Any
 
     def __init__(
         self,
@@ -275,7 +332,7 @@ class Stream:
     def _follow(self, rule: Rule) -> None:
         monitor, condition, enable_type, reader = self._prepared(rule)
         self.monitor, self.rule = monitor, rule
-        self.explainer = Explainer(self.model)
+        self.explainer, self._quiet = Explainer(self.model), 0
         self.reasons = Reasons(self.model, monitor.alarms.rules)
         self.enable_type, self._reads_condition = enable_type, reader
         self.arming = Arming(condition, to_ns(rule.grace), self.arming.said_on(condition))
@@ -383,7 +440,7 @@ class Stream:
     @property
     def alarm(self) -> bool:
         """The alarm, as published on ~/violation."""
-        return self.monitor.alarm or self.latched
+        return self.latched or self.monitor.alarm
 
     def reset(self) -> None:
         """End a latched alarm, and forget the verdicts in its window."""
@@ -512,16 +569,17 @@ class Stream:
         verdicts = []
         for step in sampler.push(topic, arrival_ns, stamp_ns, values):
             before = self.alarm
-            if step.status is Status.RESET:
+            if step.status is _RESET:
                 self.arming.restart()
             # a dropped message is no sample and changes nothing; asking every status for that would cost more
-            armed = (step.status is not Status.OK and step.status.dropped) or self.arming.at(step.t_ns)
+            armed = (step.status is not _OK and step.status.dropped) or self.arming.at(step.t_ns)
             verdict = self.monitor.judge(step, armed)
             self.latched = self.latched or (self.rule.latch and verdict.alarm)
             verdicts.append(verdict)
             self._count(verdict, before, now)
         return verdicts, sampler.counters["samples"] > samples
 
+    @cython.cfunc
     def _learn_condition(self, topic: str, data: bytes) -> None:
         assert self._reads_condition is not None
         try:
@@ -534,40 +592,47 @@ class Stream:
         if not self.arming.on:
             self.monitor.reset()
 
+    @cython.cfunc
     def _note_unreadable(self, topic: str, error: UnreadableError) -> None:
         self.unreadable[topic] += 1
         self.why_unreadable[topic] = str(error)[:200]
 
-    def _count(self, verdict: Verdict, alarm_before: bool, now: float) -> None:
-        period = self.period
-        if verdict.status is not Status.OK:  # looking up one of these is slow
+    @cython.cfunc
+    def _count(self, verdict: Verdict, alarm_before: cython.bint, now: cython.double) -> None:
+        period: Period = self.period
+        judged: cython.bint = verdict.judged
+        if judged:
+            self.last, self._judged = verdict, now
+            self.verdicts += 1
+            period.verdicts += 1
+        if verdict.ordinary and not self.latched and self.reasons.text == QUIET:
+            self._quiet += 1
+            return
+        if verdict.status is not _OK:
             period.statuses[verdict.status] += 1
             if verdict.status in (Status.STEP, Status.MODE, Status.FROZEN):  # the sampler does not know the model
                 self.sampler.counters[verdict.status.value] += 1
-        if verdict.frozen or verdict.repeating:
-            period.frozen |= {moved.state: moved for moved in verdict.frozen}
-            period.repeating |= {moved.state: moved for moved in verdict.repeating}
-        alarm = verdict.alarm or self.latched
-        if alarm or not verdict.judged or verdict.unknown_regime or self.reasons.text != QUIET:
-            self.reasons.take(verdict, alarm)
-        self.alarms += alarm and not alarm_before
-        period.alarm |= alarm
-        if not verdict.judged:
+        period.frozen.update({moved.state: moved for moved in verdict.frozen})
+        period.repeating.update({moved.state: moved for moved in verdict.repeating})
+        alarm: cython.bint = verdict.alarm or self.latched
+        self.reasons.take(verdict, alarm)
+        if alarm:
+            period.alarm = True
+            self.alarms += not alarm_before
+        if not judged:
             return
-        self.last, self._judged = verdict, now
         if verdict.alarm:
-            self.explainer.push(verdict.horizon_utilisation, verdict.lower, verdict.upper)
+            self.explainer.push(verdict.horizon_utilisation, verdict.lower, verdict.upper, self._quiet)
+            self._quiet = 0
         else:
-            self.explainer.quiet()
-        self.verdicts += 1
-        period.verdicts += 1
+            self._quiet += 1
         period.outside += verdict.outside_domain
         if verdict.unknown_regime:
             period.unknown += 1
             period.last_unknown = verdict
         if verdict.violated:
             if len(period.jumps) < SHOWN:
-                period.jumps += self.jumps_of(verdict)
+                period.jumps.extend(self.jumps_of(verdict))
             for i, flag in enumerate(verdict.numbers("flags")):
                 if flag == 1.0:
                     self.violations[i] += 1
@@ -706,3 +771,7 @@ class Stream:
         self.period.future = self.future.total()
         self.period.counters = Counter(self.sampler.counters)
         return period
+
+
+if not cython.compiled:
+    use_twin(globals(), ("Period", "Stream"))

@@ -109,6 +109,9 @@ class Verdict:
     ----------
     frozen, repeating : tuple of Moved
         States that are frozen, and others that repeat for longer than ever in the fit.
+    ordinary : bool
+        There is a verdict, and it says that every state is contained, within the fitted domain, without an alarm and
+        without a state that repeats for longer than ever.
     """
 
     t_ns = cython.declare(object, visibility="readonly")
@@ -117,6 +120,7 @@ class Verdict:
     outside_domain = cython.declare(cython.bint, visibility="readonly")
     unknown_regime = cython.declare(cython.bint, visibility="readonly")
     alarm = cython.declare(cython.bint, visibility="readonly")
+    ordinary = cython.declare(cython.bint, visibility="readonly")
     frozen = cython.declare(object, visibility="readonly")
     repeating = cython.declare(object, visibility="readonly")
     _after = cython.declare(object)
@@ -140,8 +144,10 @@ class Verdict:
         self.frozen, self.repeating = (looked.frozen, looked.repeating) if looked is not None else ((), ())
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, status or step.status
         self._after, self._before = step.after, step.before
-        self.outside_domain = judgement is not None and judgement.outside_domain
-        self.unknown_regime = judgement is not None and judgement.unknown_regime
+        self.outside_domain = self.unknown_regime = self.ordinary = False
+        if judgement is not None:
+            self.outside_domain, self.unknown_regime = judgement.outside_domain, judgement.unknown_regime
+            self.ordinary = judgement.contained and not (self.outside_domain or alarm or self.frozen or self.repeating)
         self.alarm = alarm
         self._judgement, self._longer = judgement, longer
         self._alarms = alarms

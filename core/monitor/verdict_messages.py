@@ -253,7 +253,12 @@ class VerdictMessages:
         statistics: Sequence[str] = (),
     ) -> None:
         every, self._n = names_of(names, steps, statistics), len(names)
-        self.outputs = {output.name: output for output in OUTPUTS if output.position and every[output.of]}
+        foresees = bool(steps)
+        self.outputs = {
+            output.name: output
+            for output in OUTPUTS
+            if output.position and every[output.of] and (foresees or output.when != "predicted over")
+        }
         kinds = {(output.of, bool(output.velocity)) for output in self.outputs.values()}
         self._vectors = {(of, marked): (make_vector or NamedVector)(every[of], marked) for of, marked in sorted(kinds)}
 

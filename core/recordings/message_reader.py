@@ -23,6 +23,12 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
+try:
+    import cython
+except ImportError:  # Cython is not needed to run
+    from uncertain_lti.base import uncompiled as cython
+
+from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.recordings.cdr_layout import SIZES, STAMP, CutError, Role, UnfitError, Walk, Wanted, wanted
 from uncertain_lti.recordings.stamps import header_stamp_ns
@@ -41,6 +47,7 @@ class UnreadableError(Exception):
     """The middleware cannot decode a message, or a field is filled so that it is no number."""
 
 
+@cython.cclass
 class MessageReader:
     """Stamp and values of the messages of one topic.
 
@@ -61,6 +68,15 @@ class MessageReader:
         Messages that fitted no layout.
     """
 
+    type_name: str = cython.declare(object, visibility="readonly")
+    decoded: int = cython.declare(object, visibility="readonly")
+    _paths: tuple[FieldPath, ...]
+    _fields: Any
+    _decode: Any
+    _wanted: Any
+    _layouts: list[_Layout]
+    _budget: cython.Py_ssize_t
+
     def __init__(
         self, type_name: str, paths: Sequence[FieldPath], type_fields: TypeFields, decode: Callable[[bytes], Any]
     ) -> None:
@@ -68,12 +84,12 @@ class MessageReader:
         self.decoded = 0
         self._paths = tuple(paths)
         self._fields, self._decode = type_fields, decode
-        self._wanted: Wanted | None = None
+        self._wanted = None
         try:
             self._wanted = wanted(type_name, self._paths, type_fields)
         except (UnfitError, SignalError):
             pass
-        self._layouts: list[_Layout] = []
+        self._layouts = []
         self._budget = _BUDGET
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]]:
@@ -96,6 +112,7 @@ class MessageReader:
         UnreadableError
             The bytes are no message of the type, or a wanted field cannot be read; says why.
         """
+        layout: _Layout
         for position, layout in enumerate(self._layouts):
             if (found := layout.read(data)) is not None:
                 if position:
@@ -155,8 +172,17 @@ def _same(some: Sequence[float], others: Sequence[float]) -> bool:
     return len(some) == len(others) and pack(*some) == pack(*others)
 
 
+@cython.cclass
 class _Layout:
     """Places of the wanted numbers in messages that look like the one that was walked."""
+
+    _size: cython.Py_ssize_t
+    _first: cython.Py_ssize_t
+    _plain: cython.bint
+    _shape: list[tuple[int, int, int, int]]
+    _picks: list[int]
+    _computed: list[tuple[Any, int, bool]]
+    _unpack: Any
 
     def __init__(self, walk: Walk, data: bytes, paths: Sequence[FieldPath]) -> None:
         self._size = len(data)
@@ -191,7 +217,7 @@ class _Layout:
                 return None
         numbers = self._unpack(data)
         stamp = None
-        first = self._first
+        first: cython.Py_ssize_t = self._first
         if self._plain:
             if first:
                 stamp = numbers[0] * 1_000_000_000 + numbers[1] or None
@@ -237,3 +263,7 @@ def _shape(data: bytes, places: list[tuple[int, int, int]]) -> list[tuple[int, i
         number = int.from_bytes(mask, "little")
         found.append((begin, end, number, int.from_bytes(data[begin:end], "little") & number))
     return found
+
+
+if not cython.compiled:
+    use_twin(globals(), ("MessageReader", "UnreadableError"))

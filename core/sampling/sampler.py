@@ -42,9 +42,17 @@ REMEMBERED_SAMPLES = 100
 KEPT_OVER_A_JUMP = 100
 """Messages kept per topic, whatever has been chosen, once its time has stepped back and the clock's has not yet."""
 
+_OK, _FIRST, _GAP, _RESET, _MISSING = (
+    Status.OK,
+    Status.FIRST,
+    Status.GAP,
+    Status.RESET,
+    Status.MISSING,
+)  # looking up one of an enumeration is slow
 _LAG, _DIFF, _RATE = 0, 1, 2
 
 
+@cython.cclass
 class Step:
     """One decided clock message: the sample k+1 and the transition that ends in it.
 
@@ -67,10 +75,15 @@ class Step:
         x of sample k+1.
     """
 
-    __slots__ = ("status", "t_ns", "arrival_ns", "dt", "before", "after")
+    status: Status = cython.declare(object, visibility="readonly")
+    t_ns: int = cython.declare(object, visibility="readonly")
+    arrival_ns: int = cython.declare(object, visibility="readonly")
+    dt: float = cython.declare(cython.double, visibility="readonly")
+    before: Sequence[float] = cython.declare(object, visibility="readonly")
+    after: Sequence[float] = cython.declare(object, visibility="readonly")
 
     def __init__(
-        self, status: Status, t_ns: int, arrival_ns: int, dt: float, before: Sequence[float], after: Sequence[float]
+        self, status: Status, t_ns: Any, arrival_ns: Any, dt: float, before: Sequence[float], after: Sequence[float]
     ) -> None:
         self.status, self.t_ns, self.arrival_ns, self.dt = status, t_ns, arrival_ns, dt
         self.before, self.after = before, after
@@ -362,7 +375,7 @@ class Sampler:
         self._period = 0.0 if isinstance(signals.step, str) else signals.step
         self.counters = Counters()
         self._open = self._before = None
-        self._open_status, self._open_dt = Status.FIRST, math.nan
+        self._open_status, self._open_dt = _FIRST, math.nan
         self._history = {}
 
     def push(self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]) -> list[Step]:
@@ -423,7 +436,7 @@ class Sampler:
         if state.header and not instant:
             return [self._dropped(Status.UNSTAMPED, message.arrival, message)]
         steps: list[Step] = []
-        status = Status.FIRST
+        status = _FIRST
         closing = self._open
         if closing is not None:
             step = instant - _instant(closing)
@@ -433,17 +446,17 @@ class Sampler:
                 return [self._dropped(Status.SHORT, instant, message)]
             if -self.max_gap_ns <= step < 0:
                 return [self._dropped(Status.LATE, instant, message)]
-            status = Status.OK if 0 < step <= self.max_gap_ns else Status.GAP if step > 0 else Status.RESET
+            status = _OK if 0 < step <= self.max_gap_ns else _GAP if step > 0 else _RESET
             dt = step * 1e-9 if step > 0 else math.nan
-            if self._period > 0.0 and status is Status.OK:
+            if self._period > 0.0 and status is _OK:
                 dt = self._period
-        opens = status is not Status.OK  # a segment
+        opens = status is not _OK  # a segment
         if opens:
             state.previous = list(state.steady)
         if state.unwrap:
             state.unwrapped(message.values)
         if closing is not None:
-            z = self._fix(closing, True, status is Status.RESET)
+            z = self._fix(closing, True, status is _RESET)
             if not self._one_topic:
                 steps.append(self._step(self._open_status, closing, self._open_dt, z[: self._n]))
             self._before = z
@@ -454,9 +467,9 @@ class Sampler:
             steps.append(self._step(status, message, dt, x_next))
         self._open, self._open_status, self._open_dt = message, status, dt
         self.counters["samples"] += 1
-        if status is Status.GAP:
+        if status is _GAP:
             self.counters["gaps"] += 1
-        elif status is Status.RESET:
+        elif status is _RESET:
             self.counters["resets"] += 1
         return steps
 
@@ -477,10 +490,10 @@ class Sampler:
     @cython.cfunc
     def _step(self, status: Status, message: _Message, dt: cython.double, x_next: list[float]) -> Step:
         before = self._before
-        if before is None or status is Status.FIRST or status is Status.RESET:
+        if before is None or status is _FIRST or status is _RESET:
             before = self._unknown
-        if status is Status.OK and not (all_finite(before) and all_finite(x_next)):
-            status = Status.MISSING
+        if status is _OK and not (all_finite(before) and all_finite(x_next)):
+            status = _MISSING
             self.counters["missing"] += 1
         return Step(status, _instant(message), message.arrival, dt, before, x_next)
 
