@@ -27,7 +27,7 @@ from uncertain_lti.model.bounds import lower_of, normalised, upper_of
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Horizon, Run
 from uncertain_lti.model.schedule import Axis, Schedule
-from uncertain_lti.model.terms import ARRAYS, SHAPES
+from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.monitor.foreseen import Foreseen
 from uncertain_lti.monitor.verdict import place as place_of
 from uncertain_lti.sampling.sampler import Sampler, Step
@@ -89,7 +89,7 @@ def test_a_model_of_one_step_has_none_and_stays_in_its_format() -> None:
         ({"widths": "constant"}, "dA, dB or dc is not 0"),
         ({"blocks": []}, r"horizons\[0\].blocks"),
         ({"odd": 1}, "odd"),
-        ({"blocks": [{"A": [[1.0]]}]}, r"horizons\[0\].blocks\[0\].A"),
+        ({"blocks": [dict.fromkeys(REQUIRED, [[1.0]])]}, r"horizons\[0\].blocks\[0\].A"),
         ({"blocks": [{}]}, r"horizons\[0\].blocks\[0\].A' is missing"),
     ],
 )

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.horizon import MOST_STEPS
+from uncertain_lti.model.objects import object_of
 
 LONGEST_WINDOW = 1_000_000
 """Verdicts that the alarm looks at, at most."""
@@ -347,8 +348,7 @@ def rule_from_dict(data: Any, name: str = "alarm.rules") -> Rule:
     ModelError
         It is not of that form; names the field.
     """
-    if not isinstance(data, Mapping):
-        raise ModelError(f"field '{name}' is not an object")
+    data = object_of(data, name)
     kind = data.get("kind")
     if kind not in (CONTAINMENT, *KINDS):
         raise ModelError(
@@ -356,12 +356,7 @@ def rule_from_dict(data: Any, name: str = "alarm.rules") -> Rule:
         )
     needed = ("violations", "window", "margin") if kind == CONTAINMENT else ("window_s", "threshold")
     known = {"kind", "horizon", *needed} | ({"allowance"} if kind == "cusum" else set())
-    for key in data:
-        if key not in known:
-            raise ModelError(f"unknown field '{name}.{reprlib.repr(key)[1:-1]}'; known are {', '.join(sorted(known))}")
-    for key in needed:
-        if key not in data:
-            raise ModelError(f"field '{name}.{key}' is missing; {kind} needs {' and '.join(needed)}")
+    object_of(data, name, known, needed, remedy=f"{kind} needs {' and '.join(needed)}")
     for key in ("violations", "window", "horizon"):
         if key in data and (isinstance(data[key], bool) or not isinstance(data[key], int)):
             raise ModelError(f"field '{name}.{key}' is {reprlib.repr(data[key])}; it must be a whole number")

@@ -29,6 +29,7 @@ from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.horizon import Horizon, Run
+from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
@@ -169,21 +170,16 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     known = {"format", "states", "controls", "sampling", "domain", "alarm", "fit", "validation"}
     known |= {"schedule", "scheduling", "blocks"} if scheduled else set(ARRAYS)
     known |= {"horizons", "run", "residuals", "frozen", "signatures"} if data["format"] != FORMATS[0] else set()
-    for name in ("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)):
-        if name not in data:
-            raise ModelError(f"field '{name}' is missing; fit the model again")
-    for name in data:
-        if name not in known:
-            raise ModelError(f"unknown field {reprlib.repr(name)}; known are {', '.join(sorted(known))}")
+    object_of(data, "", known, needed=("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)))
     older = data["format"] == FORMATS[0]
     own = {f.name for f in fields(Sampling)}
-    said = _object(data["sampling"], "sampling", own - {"step"} if older else own | {"table"})
+    said = object_of(data["sampling"], "sampling", own - {"step"} if older else own | {"table"})
     sampling = Sampling(
         clock=_text(said.get("clock", ""), "sampling.clock"),
         clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
         time={
             _text(k, "sampling.time"): _text(v, f"sampling.time[{k}]")
-            for k, v in _object(said.get("time", {}), "sampling.time").items()
+            for k, v in object_of(said.get("time", {}), "sampling.time").items()
         },
         min_step=_positive(said.get("min_step", 0.0), "sampling.min_step", zero=True) or 0.0,
         **{
@@ -221,7 +217,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     if "domain" in data:
         sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
         newer = {"measure", "step_max"} if data["format"] != FORMATS[0] else set()
-        box = _object(data["domain"], "domain", set(sizes) | newer)
+        box = object_of(data["domain"], "domain", set(sizes) | newer)
         for name in sizes:
             if name not in box:
                 raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
@@ -243,19 +239,19 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         "residuals": Residuals.from_dict(data["residuals"]) if "residuals" in data else None,
         "signatures": Signature.list_from(data.get("signatures", [])),
         "repeats": Repeats.from_dict(data["frozen"]) if data.get("frozen") is not None else None,
-        "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in _object(data.get("fit", {}), "fit").items()},
-        "validation": _object(data.get("validation", {}), "validation"),
+        "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in object_of(data.get("fit", {}), "fit").items()},
+        "validation": object_of(data.get("validation", {}), "validation"),
     }
 
 
 def _alarm(data: Any, newer: bool) -> tuple[Rule, ...]:
     """Rules of the alarm: a list of them, or the one of format 1."""
     if newer and isinstance(data, dict) and "rules" in data:
-        rules = _object(data, "alarm", {"rules"})["rules"]
+        rules = object_of(data, "alarm", {"rules"})["rules"]
         if not isinstance(rules, list):
             raise ModelError("field 'alarm.rules' must be a list of rules")
         return checked_rules([rule_from_dict(rule, f"alarm.rules[{i}]") for i, rule in enumerate(rules)])
-    alarm = _object(data, "alarm", {"violations", "window", "margin"})
+    alarm = object_of(data, "alarm", {"violations", "window", "margin"})
     for key in ("violations", "window"):
         if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
             raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
@@ -273,7 +269,7 @@ def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[
     found: dict[str, list[Array]] = {name: [] for name in ARRAYS}
     facts = []
     for r, block in enumerate(blocks):
-        block = _object(block, f"blocks[{r}]", {*ARRAYS, "transitions", "tied_to"})
+        block = object_of(block, f"blocks[{r}]", {*ARRAYS, "transitions", "tied_to"})
         for name in ARRAYS:
             shape = SHAPES[name].shape(n, m)
             if name not in block and name in REQUIRED:
@@ -381,15 +377,6 @@ def read_rules(path: str | os.PathLike[str]) -> tuple[Rule, ...]:
         return _alarm(data, newer=True)
     except ModelError as error:
         raise ModelError(f"{os.fspath(path)}: {error}") from None
-
-
-def _object(value: Any, name: str, known: set[str] | None = None) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ModelError(f"field '{name}' is not an object")
-    for key in value:
-        if known is not None and key not in known:
-            raise ModelError(f"unknown field '{name}.{key}'; known are {', '.join(sorted(known))}")
-    return dict(value)
 
 
 def _text(value: Any, name: str) -> str:

@@ -34,6 +34,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.bounds import Judge, centre_and_half
+from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked, regressors, tables
@@ -427,23 +428,15 @@ class Horizon:
             here = f"horizons[{i}]"
             if not isinstance(entry, dict) or "steps" not in entry or "blocks" not in entry:
                 raise ModelError(f"field '{here}' must be an object with 'steps', 'widths' and 'blocks'")
-            if unknown := set(entry) - {"steps", "widths", "blocks", "residuals"}:
-                raise ModelError(f"unknown field '{here}.{min(unknown)}'; known are blocks, residuals, steps, widths")
+            object_of(entry, here, known=("blocks", "residuals", "steps", "widths"))
             parts = entry["blocks"]
             if not isinstance(parts, list) or len(parts) != (blocks or 1):
                 raise ModelError(f"field '{here}.blocks' must be a list of {plural(blocks or 1, 'block')}")
             arrays: dict[str, list[Array]] = {name: [] for name in ARRAYS}
             for r, part in enumerate(parts):
-                if not isinstance(part, dict):
-                    raise ModelError(f"field '{here}.blocks[{r}]' is not an object")
-                if unknown := set(part) - set(ARRAYS):
-                    raise ModelError(
-                        f"unknown field '{here}.blocks[{r}].{min(unknown)}'; known are {', '.join(ARRAYS)}"
-                    )
+                object_of(part, f"{here}.blocks[{r}]", known=ARRAYS, needed=REQUIRED)
                 for name in ARRAYS:
                     shape = SHAPES[name].shape(n, m)
-                    if name not in part and name in REQUIRED:
-                        raise ModelError(f"field '{here}.blocks[{r}].{name}' is missing; fit the model again")
                     value = np.zeros(shape) if part.get(name) is None else part[name]
                     arrays[name].append(checked(value, f"{here}.blocks[{r}].{name}", shape, name in HALF_WIDTHS))
             stacked = {name: values[0] if blocks is None else np.stack(values) for name, values in arrays.items()}

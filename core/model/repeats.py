@@ -25,7 +25,6 @@ is in the median second in which the state changes, and while it repeated.
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -36,6 +35,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.bounds import lower_of, upper_of
+from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.terms import checked
 
 _KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond")
@@ -124,10 +124,7 @@ class Repeats:
         """
         if not isinstance(data, Mapping) or _KEYS[0] not in data:
             raise ModelError("field 'frozen' must be an object with longest_repeat_s; fit the model again")
-        for key in data:
-            if key not in _KEYS:
-                raise ModelError(f"unknown field {reprlib.repr(f'frozen.{key}')}; known are {', '.join(_KEYS)}")
-        return cls(**data)
+        return cls(**object_of(data, "frozen", known=_KEYS))
 
 
 class Moved(NamedTuple):

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.terms import checked
 
 _KEYS = ("mean", "covariance")
@@ -128,15 +129,7 @@ class Residuals:
         ModelError
             It is not that; names the field.
         """
-        if not isinstance(data, dict):
-            raise ModelError(f"field '{name}' is not an object")
-        for key in data:
-            if key not in (*_KEYS, _RELATIVE):
-                known = ", ".join((*_KEYS, _RELATIVE))
-                raise ModelError(f"unknown field '{name}.{reprlib.repr(key)[1:-1]}'; known are {known}")
-        for key in _KEYS:
-            if key not in data:
-                raise ModelError(f"field '{name}.{key}' is missing; fit the model again")
+        data = object_of(data, name, known=(*_KEYS, _RELATIVE), needed=_KEYS)
         relative = data.get(_RELATIVE, False)
         if not isinstance(relative, bool):
             raise ModelError(f"field '{name}.{_RELATIVE}' is {reprlib.repr(relative)}; it must be true or false")

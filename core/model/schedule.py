@@ -35,6 +35,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.bounds import recorded, weight_between
+from uncertain_lti.model.objects import object_of
 from uncertain_lti.signals.signal_map import Signal
 
 MOST_AXES = 2
@@ -401,8 +402,7 @@ class Schedule:
             here = f"schedule[{i}]"
             if not isinstance(entry, dict) or not isinstance(entry.get("signal"), str):
                 raise ModelError(f"field '{here}' must be an object with 'signal' and 'knots' or 'modes'")
-            if unknown := set(entry) - {"signal", "knots", "modes"}:
-                raise ModelError(f"unknown field '{here}.{min(unknown)}'; known are knots, modes, signal")
+            object_of(entry, here, known=("knots", "modes", "signal"))
             values = {k: entry[k] for k in ("knots", "modes") if k in entry}
             for key, value in values.items():
                 if not isinstance(value, list) or any(isinstance(v, (bool, str)) or v is None for v in value):
