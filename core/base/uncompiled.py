@@ -59,4 +59,4 @@ class _Type:
         return self
 
 
-double = longlong = int = bint = uchar = char = Py_ssize_t = p_double = p_uchar = _Type()
+double = longlong = int = bint = uchar = char = Py_ssize_t = p_double = p_longlong = p_uchar = _Type()

@@ -402,7 +402,7 @@ def visited(z: Any, least: Any, greatest: Any, occupied: Any) -> Any:
 def ordered_sum(weights: Any, values: Any) -> Any:
     """Sum of weights * values over the first axis, from the first element to the last.
 
-    No BLAS, whose order depends on shapes. Compiled code has the same sum in `_sum_columns`.
+    No BLAS, whose order depends on shapes. Compiled code has the same sum in `_Elements.sum`.
 
     Parameters
     ----------
@@ -416,29 +416,6 @@ def ordered_sum(weights: Any, values: Any) -> Any:
     """
     products = np.multiply(weights, values, order="C")  # the layout decides the order of the sum
     return _sum_of_rows(products.shape)(products)
-
-
-@cython.cfunc
-@cython.exceptval(check=False)
-def _sum_columns(
-    table: cython.p_double,
-    values: cython.p_double,
-    total: cython.p_double,
-    rows: cython.Py_ssize_t,
-    columns: cython.Py_ssize_t,
-) -> cython.void:
-    """`ordered_sum` of a table, column after column, and one value for each: the rows of a column beside each other."""
-    i: cython.Py_ssize_t
-    j: cython.Py_ssize_t
-    value: cython.double = values[0]
-    column: cython.p_double
-    for i in range(rows):
-        total[i] = table[i] * value
-    for j in range(1, columns):
-        value = values[j]
-        column = table + j * rows
-        for i in range(rows):
-            total[i] += column[i] * value
 
 
 @cache
@@ -470,7 +447,7 @@ def _accumulated(rows: Any) -> Any:
 def blended(blocks: Any, places: Any, weights: Any) -> Any:
     """Elements of a scheduled model at K samples: Σ_r w_r θ_r over the blocks that hold, in their order.
 
-    Compiled code has the same sum in `Judge._blend`.
+    Compiled code has the same sum in `_Elements.blend`.
 
     Parameters
     ----------
@@ -541,6 +518,140 @@ LOWER, UPPER, RESIDUAL, FLAGS, UTILISATION = range(5)
 """What a `Judgement` holds of each state."""
 _TOGETHER = 64  # runs that one compiled loop advances: they stay in the cache
 _FEW = 8192  # runs that one numpy operation advances
+
+
+@cython.cclass
+class _Elements:
+    """Elements of one model, or of one of its horizons, and the sums of one sample in compiled code.
+
+    Parameters
+    ----------
+    theta, delta : array (n, p), or (R, n, p) with a schedule
+        Nominal elements and half-widths of the rates, 1/s.
+    v : array (n,), or (R, n)
+        Half-width that dt does not multiply.
+    """
+
+    n: cython.Py_ssize_t
+    p: cython.Py_ssize_t
+    theta: cython.double[::1]  # block after block, column after column, as the sums walk
+    delta: cython.double[::1]
+    v: cython.double[::1]
+    rate: cython.double[::1]  # of the last sample, as the three below
+    spread: cython.double[::1]
+    still: cython.double[::1]  # what dt does not multiply
+    nominal: cython.double[::1]  # theta, where it was asked for
+    _psi: cython.double[::1]
+    _column: cython.double[::1]
+
+    def __init__(self, theta: Any, delta: Any, v: Any) -> None:
+        self.n, self.p = theta.shape[-2:]
+        self.theta, self.delta = _doubles(np.swapaxes(theta, -1, -2)), _doubles(np.swapaxes(delta, -1, -2))
+        self.v = _doubles(v)
+        self.rate, self.spread = _doubles(np.zeros(self.n)), _doubles(np.zeros(self.n))
+        self.still, self._column = _doubles(np.zeros(self.n)), _doubles(np.zeros(self.n))
+        self.nominal, self._psi = _doubles(np.zeros(self.n * self.p)), _doubles(np.zeros(self.p))
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def sum(
+        self, phi: cython.p_double, places: cython.p_longlong, weights: cython.p_double, corners: cython.Py_ssize_t
+    ) -> cython.void:
+        """`rate`, `spread` and `still` of regressors, with the blocks in their places by their weights."""
+        j: cython.Py_ssize_t
+        for j in range(self.p):
+            self._psi[j] = abs(phi[j])
+        self._blend(self.v, self.n, 0, self.n, places, weights, corners, cython.address(self.still[0]))
+        self.sum_columns(self.theta, phi, places, weights, corners, cython.address(self.rate[0]))
+        psi: cython.p_double = cython.address(self._psi[0])
+        self.sum_columns(self.delta, psi, places, weights, corners, cython.address(self.spread[0]))
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def sum_columns(
+        self,
+        table: cython.double[::1],
+        values: cython.p_double,
+        places: cython.p_longlong,
+        weights: cython.p_double,
+        corners: cython.Py_ssize_t,
+        total: cython.p_double,
+    ) -> cython.void:
+        """`ordered_sum` of a table and one value for each column: the rows of a column beside each other."""
+        n: cython.Py_ssize_t = self.n
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        value: cython.double
+        column: cython.p_double = cython.address(self._column[0])
+        for j in range(self.p):
+            value = values[j]
+            if corners == 0:
+                column = cython.address(table[j * n])
+            else:
+                self._blend(table, n * self.p, j * n, n, places, weights, corners, column)
+            if j == 0:
+                for i in range(n):
+                    total[i] = column[i] * value
+            else:
+                for i in range(n):
+                    total[i] += column[i] * value
+
+    @cython.cfunc
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def blend_nominal(
+        self, places: cython.p_longlong, weights: cython.p_double, corners: cython.Py_ssize_t
+    ) -> cython.void:
+        """`nominal` with the blocks in their places by their weights."""
+        size: cython.Py_ssize_t = self.n * self.p
+        self._blend(self.theta, size, 0, size, places, weights, corners, cython.address(self.nominal[0]))
+
+    @cython.cfunc
+    @cython.inline
+    @cython.boundscheck(False)
+    @cython.wraparound(False)
+    @cython.exceptval(check=False)
+    def _blend(
+        self,
+        table: cython.double[::1],
+        size: cython.Py_ssize_t,
+        begin: cython.Py_ssize_t,
+        count: cython.Py_ssize_t,
+        places: cython.p_longlong,
+        weights: cython.p_double,
+        corners: cython.Py_ssize_t,
+        total: cython.p_double,
+    ) -> cython.void:
+        """`blended` of some elements in blocks of a size; of no schedule, which has no corners, the elements."""
+        i: cython.Py_ssize_t
+        a: cython.p_double = cython.address(table[begin])
+        if corners == 0:
+            for i in range(count):
+                total[i] = a[i]
+            return
+        first: cython.double = weights[0]
+        a = cython.address(table[places[0] * size + begin])
+        if corners == 1:
+            for i in range(count):
+                total[i] = a[i] * first
+            return
+        second: cython.double = weights[1]
+        b: cython.p_double = cython.address(table[places[1] * size + begin])
+        if corners == 2:
+            for i in range(count):
+                total[i] = a[i] * first + b[i] * second
+            return
+        third: cython.double = weights[2]
+        fourth: cython.double = weights[3]
+        c: cython.p_double = cython.address(table[places[2] * size + begin])
+        d: cython.p_double = cython.address(table[places[3] * size + begin])
+        for i in range(count):
+            total[i] = a[i] * first + b[i] * second + c[i] * third + d[i] * fourth
 
 
 @cython.cclass
@@ -659,18 +770,13 @@ class Judge:
     p: cython.Py_ssize_t
     blocks: cython.Py_ssize_t
     margin: cython.double
-    _theta: cython.double[::1]  # column after column, as the sums walk
-    _delta: cython.double[::1]
-    _v: cython.double[::1]
+    _elements = cython.declare(_Elements)
     _steady: cython.double[::1]
     _scale: cython.double[::1]
     _least: cython.double[::1]
     _greatest: cython.double[::1]
     _counted: cython.uchar[::1]
     _phi: cython.double[::1]
-    _psi: cython.double[::1]
-    _rate: cython.double[::1]
-    _spread: cython.double[::1]
     _blank = cython.declare(object)
     _cells: cython.int
     _per_unit: cython.double[::1]
@@ -685,9 +791,7 @@ class Judge:
     _known: cython.uchar[::1]
     _places: cython.longlong[::1]
     _weights: cython.double[::1]
-    _all_theta: cython.double[::1]  # block after block; the three above hold what is blended from them
-    _all_delta: cython.double[::1]
-    _all_v: cython.double[::1]
+    _corners: cython.Py_ssize_t  # blocks that hold at a time; 0 without a schedule
     _rates: cython.double[::1]
     _together: cython.Py_ssize_t
 
@@ -727,19 +831,10 @@ class Judge:
             raise ValueError("the occupied cells do not fit the signals")
         one = np.ones(self.p)  # beyond z the regressors are 1
         if cython.compiled:
-            self._all_theta, self._all_delta = (
-                _doubles(np.swapaxes(theta, -1, -2)),
-                _doubles(np.swapaxes(delta, -1, -2)),
-            )
-            self._all_v = _doubles(v)
-            first = self.n * self.p
-            self._theta, self._delta = self._all_theta[:first], self._all_delta[:first]
-            self._v = self._all_v[: self.n]
+            self._elements = _Elements(theta, delta, v)
             axes = () if schedule is None else schedule.axes
             self._axes = len(axes)
-            if self._axes:  # blended into arrays of their own
-                self._theta, self._delta = _doubles(np.zeros(first)), _doubles(np.zeros(first))
-                self._v = _doubles(np.zeros(self.n))
+            self._corners = 2 ** sum(not axis.modes for axis in axes) if axes else 0
             self._of_modes = bytearray([int(bool(axis.modes)) for axis in axes] or [0])
             self._positions = array("i", list(positions) or [0])
             begins = [0]
@@ -753,8 +848,7 @@ class Judge:
             self._steady, self._scale = _doubles(steady), _doubles(scale)
             self._least, self._greatest = _doubles(least), _doubles(greatest)
             self._counted = bytearray(np.asarray(counted, dtype=np.uint8).tobytes())
-            self._phi, self._psi = _doubles(one), _doubles(one)
-            self._rate, self._spread = _doubles(np.zeros(self.n)), _doubles(np.zeros(self.n))
+            self._phi = _doubles(one)
             self._blank = array("d", bytes(40 * self.n))
             self._per_unit = _doubles(cells_per_unit(least, greatest, self._cells))
             flat = np.zeros(1, bool) if occupied is None else occupied
@@ -851,12 +945,13 @@ class Judge:
             left = left or outside(self._phi[i], self._least[i], self._greatest[i])
         if self._cells and not left:
             left = self._unvisited()
-        for i in range(self.p):
-            self._psi[i] = abs(self._phi[i])
-        rate: cython.p_double = cython.address(self._rate[0])
-        spread: cython.p_double = cython.address(self._spread[0])
-        _sum_columns(cython.address(self._theta[0]), cython.address(self._phi[0]), rate, n, self.p)
-        _sum_columns(cython.address(self._delta[0]), cython.address(self._psi[0]), spread, n, self.p)
+        elements: _Elements = self._elements
+        elements.sum(
+            cython.address(self._phi[0]),
+            cython.address(self._places[0]),
+            cython.address(self._weights[0]),
+            self._corners,
+        )
         blank = array("d", self._blank)
         values: cython.double[::1] = blank
         x_next: cython.double
@@ -868,7 +963,10 @@ class Judge:
         for i in range(n):
             x_next = after[i]
             x_next = normalised(x_next, self._steady[i], self._scale[i])
-            centre, half = centre_of(self._phi[i], dt, rate[i]), half_of(dt, spread[i], self._v[i])
+            centre, half = (
+                centre_of(self._phi[i], dt, elements.rate[i]),
+                half_of(dt, elements.spread[i], elements.still[i]),
+            )
             lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)
             inside = contained(lower, x_next, upper)
             if not inside:
@@ -885,7 +983,7 @@ class Judge:
     @cython.boundscheck(False)
     @cython.wraparound(False)
     def _read(self, before: Any) -> cython.int:
-        """Normalise [x; u; s], and blend by it what `_blend` does; its result, and 0 without a schedule."""
+        """Normalise [x; u; s] and find the blocks that hold there: -1 for no mode that is listed, 1 if unknown."""
         i: cython.Py_ssize_t
         z: cython.double
         for i in range(self.size):
@@ -896,14 +994,14 @@ class Judge:
         for i in range(self.size, self.total):
             z = before[i]
             self._z[i] = normalised(z, self._steady[i], self._scale[i])
-        return self._blend()
+        return self._find_blocks()
 
     @cython.cfunc
     @cython.boundscheck(False)
     @cython.wraparound(False)
     @cython.exceptval(check=False)
-    def _blend(self) -> cython.int:
-        """`blended` for one sample, into `_theta`, `_delta` and `_v`: -1 for no mode that is listed, 1 if unknown."""
+    def _find_blocks(self) -> cython.int:
+        """`Schedule.corners` of one sample, into `_places` and `_weights`, and what `_read` gives."""
         axis: cython.Py_ssize_t
         corner: cython.Py_ssize_t
         corners: cython.Py_ssize_t = 1
@@ -949,45 +1047,7 @@ class Judge:
         for corner in range(corners):
             if weights[corner] > 0.0 and not self._known[places[corner]]:
                 unknown = 1
-        self._sum_blocks(corners)
         return unknown
-
-    @cython.cfunc
-    @cython.boundscheck(False)
-    @cython.wraparound(False)
-    @cython.exceptval(check=False)
-    def _sum_blocks(self, corners: cython.Py_ssize_t) -> cython.void:
-        """Elements of the blocks in `_places` with their weights, into `_theta`, `_delta` and `_v`."""
-        corner: cython.Py_ssize_t
-        size: cython.Py_ssize_t = self.n * self.p
-        places: cython.longlong[::1] = self._places
-        weights: cython.double[::1] = self._weights
-        for corner in range(corners):
-            self._add(self._theta, self._all_theta, size, corner, places[corner] * size, weights[corner])
-            self._add(self._delta, self._all_delta, size, corner, places[corner] * size, weights[corner])
-            self._add(self._v, self._all_v, self.n, corner, places[corner] * self.n, weights[corner])
-
-    @cython.cfunc
-    @cython.boundscheck(False)
-    @cython.wraparound(False)
-    @cython.exceptval(check=False)
-    def _add(
-        self,
-        total: cython.double[::1],
-        blocks: cython.double[::1],
-        size: cython.Py_ssize_t,
-        corner: cython.Py_ssize_t,
-        begin: cython.Py_ssize_t,
-        weight: cython.double,
-    ) -> cython.void:
-        """Weighted elements of one block, to those of the corners before it."""
-        i: cython.Py_ssize_t
-        if corner == 0:
-            for i in range(size):
-                total[i] = blocks[begin + i] * weight
-        else:
-            for i in range(size):
-                total[i] += blocks[begin + i] * weight
 
     @cython.cfunc
     @cython.boundscheck(False)
@@ -1110,7 +1170,7 @@ class Judge:
             for j in range(self.size, self.total):
                 self._z[j] = rows[i * self.total + j]
             if self._axes:
-                self._blend()
+                self._find_blocks()
             self._advance(x, time, control, count, low, i - a + 1, dt[i])
 
     @cython.cfunc
@@ -1127,7 +1187,7 @@ class Judge:
         high: cython.Py_ssize_t,
         dt: cython.double,
     ) -> cython.void:
-        """One step of the runs low to high - 1 by the transition in `_phi`, with its elements in `_theta`."""
+        """One step of the runs low to high - 1 by the transition in `_phi`, with the blocks in `_places`."""
         n: cython.Py_ssize_t = self.n
         i: cython.Py_ssize_t
         j: cython.Py_ssize_t
@@ -1137,6 +1197,10 @@ class Judge:
         value: cython.double
         rate: cython.p_double
         state: cython.p_double
+        if high - low > 1 and self._corners:
+            self._elements.blend_nominal(
+                cython.address(self._places[0]), cython.address(self._weights[0]), self._corners
+            )
         while low < high:
             width = high - low if high - low < most else most
             if width == 1:
@@ -1173,7 +1237,7 @@ class Judge:
         value: cython.double
         rate: cython.p_double
         state: cython.p_double
-        theta: cython.p_double = cython.address(self._theta[0])
+        theta: cython.double[::1] = self._elements.nominal if self._corners else self._elements.theta
         for i in range(n):
             rate = cython.address(self._rates[i * self._together])
             state = cython.address(x[low])
@@ -1198,12 +1262,19 @@ class Judge:
         """The same of one run, whose rows are beside each other; its state takes the place of that in `_phi`."""
         n: cython.Py_ssize_t = self.n
         i: cython.Py_ssize_t
-        rate: cython.p_double = cython.address(self._rate[0])
+        elements: _Elements = self._elements
         for i in range(n):
             self._phi[i] = x[i * stride + low]
-        _sum_columns(cython.address(self._theta[0]), cython.address(self._phi[0]), rate, n, self.p)
+        elements.sum_columns(
+            elements.theta,
+            cython.address(self._phi[0]),
+            cython.address(self._places[0]),
+            cython.address(self._weights[0]),
+            self._corners,
+            cython.address(elements.rate[0]),
+        )
         for i in range(n):
-            self._rates[i * self._together] = rate[i]
+            self._rates[i * self._together] = elements.rate[i]
 
 
 @cython.cclass
@@ -1248,16 +1319,8 @@ class Runs:
     _places: cython.longlong[::1]  # blocks that held there, four of each run
     _weights: cython.double[::1]
     _modes: cython.double[::1]
-    _theta: cython.double[::1]  # horizon after horizon, block after block, column after column
-    _delta: cython.double[::1]
-    _v: cython.double[::1]
-    _one_theta: cython.double[::1]
-    _one_delta: cython.double[::1]
-    _one_v: cython.double[::1]
-    _rate: cython.double[::1]
-    _spread: cython.double[::1]
+    _elements = cython.declare(list)
     _phi: cython.double[::1]  # beyond the states and the mean controls 1
-    _psi: cython.double[::1]
     _blank = cython.declare(object)
     _ahead: cython.double[::1]  # of the run that is foreseen, as of the others
     _ahead_time: cython.double[::1]
@@ -1286,14 +1349,7 @@ class Runs:
             self._ahead, self._ahead_time = _doubles(np.zeros(n)), _doubles(np.zeros(1))
             self._ahead_control = _doubles(np.zeros(m or 1))
             self._modes = _doubles(np.zeros(2))
-            columns = [[np.swapaxes(a, -1, -2) for a in table[:2]] for table in tables]
-            self._theta = _doubles(np.stack([theta for theta, _ in columns]))
-            self._delta = _doubles(np.stack([delta for _, delta in columns]))
-            self._v = _doubles(np.stack([v for *_, v in tables]))
-            self._one_theta, self._one_delta = _doubles(np.zeros(n * judge.p)), _doubles(np.zeros(n * judge.p))
-            self._one_v = _doubles(np.zeros(n))
-            self._phi, self._psi = _doubles(np.ones(judge.p)), _doubles(np.ones(judge.p))
-            self._rate, self._spread = _doubles(np.zeros(n)), _doubles(np.zeros(n))
+            self._elements, self._phi = [_Elements(*table) for table in tables], _doubles(np.ones(judge.p))
             self._blank = array("d", np.full(self.count * n, np.nan).tobytes())
             self.residuals = array("d", self._blank)
             self._residual = self.residuals
@@ -1431,17 +1487,15 @@ class Runs:
         k: cython.Py_ssize_t
         h: cython.Py_ssize_t
         longest: cython.Py_ssize_t = self._longest
-        corners: cython.Py_ssize_t = 1
         s: cython.double
         time: cython.double
         value: cython.double
         size: cython.double
         x_next: cython.double
         inside: cython.bint
-        v: cython.p_double
+        elements: _Elements
         for i in range(judge._axes):
             if not judge._of_modes[i]:
-                corners *= 2
                 continue
             k = judge._positions[i]
             s = judge._phi[k] if k < judge.size else judge._z[k]
@@ -1457,17 +1511,13 @@ class Runs:
         self._time[k] = 0.0
         for j in range(m):
             self._control[j * longest + k] = 0.0
-        for i in range(corners):
-            self._places[4 * k + i] = judge._places[i]
-            self._weights[4 * k + i] = judge._weights[i]
+        self._keep_blocks(judge, k)
         if runner is not judge:
             for i in range(judge.size):
                 runner._phi[i] = judge._phi[i]
-            if judge._axes:
-                for i in range(corners):
-                    runner._places[i] = judge._places[i]
-                    runner._weights[i] = judge._weights[i]
-                runner._sum_blocks(corners)
+            for i in range(judge._corners):
+                runner._places[i] = judge._places[i]
+                runner._weights[i] = judge._weights[i]
         runner._advance(self._x, self._time, self._control, longest, 0, self._under_way, dt)
         blank = array("d", self._blank)
         values: cython.double[::1] = blank
@@ -1484,12 +1534,13 @@ class Runs:
                 self._phi[i] = self._start[i * longest + k]
             for j in range(m):
                 self._phi[n + j] = self._control[j * longest + k] / time
-            v = self._correct(h, k, corners)
+            elements = self._elements[h]
+            self._sum(elements, k)
             for i in range(n):
                 x_next = after[i]
                 x_next = normalised(x_next, judge._steady[i], judge._scale[i])
-                value = centre_of(self._x[i * longest + k], time, self._rate[i])
-                size = half_of(time, self._spread[i], v[i])
+                value = centre_of(self._x[i * longest + k], time, elements.rate[i])
+                size = half_of(time, elements.spread[i], elements.still[i])
                 inside = contained(lower_of(value, size, 1.0), x_next, upper_of(value, size, 1.0))
                 self._residual[h * n + i] = x_next - value
                 values[h * n + i] = settled(utilisation_of(x_next - value, size), inside)
@@ -1504,18 +1555,13 @@ class Runs:
         n: cython.Py_ssize_t = judge.n
         m: cython.Py_ssize_t = judge.size - n
         i: cython.Py_ssize_t
-        corners: cython.Py_ssize_t = 1
         time: cython.double
         value: cython.double
         size: cython.double
-        v: cython.p_double
+        elements: _Elements = self._elements[self.count - 1]
         if runner._read(before) < 0:
             return None
-        for i in range(judge._axes):
-            corners *= 1 if judge._of_modes[i] else 2
-        for i in range(corners):
-            self._places[4 * self._longest + i] = runner._places[i]
-            self._weights[4 * self._longest + i] = runner._weights[i]
+        self._keep_blocks(runner, self._longest)
         for i in range(n):
             self._ahead[i] = self._phi[i] = runner._phi[i]
         self._ahead_time[0] = 0.0
@@ -1526,12 +1572,12 @@ class Runs:
         time = self._ahead_time[0]
         for i in range(m):
             self._phi[n + i] = self._ahead_control[i] / time
-        v = self._correct(self.count - 1, self._longest, corners)
+        self._sum(elements, self._longest)
         found = array("d", bytes(16 * n))
         bounds: cython.double[::1] = found
         for i in range(n):
-            value = centre_of(self._ahead[i], time, self._rate[i])
-            size = half_of(time, self._spread[i], v[i])
+            value = centre_of(self._ahead[i], time, elements.rate[i])
+            size = half_of(time, elements.spread[i], elements.still[i])
             bounds[i] = recorded(lower_of(value, size, judge.margin), judge._steady[i], judge._scale[i])
             bounds[n + i] = recorded(upper_of(value, size, judge.margin), judge._steady[i], judge._scale[i])
         return found
@@ -1540,43 +1586,26 @@ class Runs:
     @cython.boundscheck(False)
     @cython.wraparound(False)
     @cython.exceptval(check=False)
-    def _correct(self, h: cython.Py_ssize_t, k: cython.Py_ssize_t, corners: cython.Py_ssize_t) -> cython.p_double:
-        """`_rate` and `_spread` of a horizon where run k began, from what is in `_phi`; gives its `v`."""
-        judge: Judge = self._judge
-        n: cython.Py_ssize_t = judge.n
-        i: cython.Py_ssize_t = h * judge.blocks
-        j: cython.Py_ssize_t
-        theta: cython.p_double
-        delta: cython.p_double
-        v: cython.p_double
-        if judge._axes:
-            self._blend(i, k, corners)
-            theta, delta = cython.address(self._one_theta[0]), cython.address(self._one_delta[0])
-            v = cython.address(self._one_v[0])
-        else:
-            theta, delta = cython.address(self._theta[i * n * judge.p]), cython.address(self._delta[i * n * judge.p])
-            v = cython.address(self._v[i * n])
-        for j in range(judge.p):
-            self._psi[j] = abs(self._phi[j])
-        _sum_columns(theta, cython.address(self._phi[0]), cython.address(self._rate[0]), n, judge.p)
-        _sum_columns(delta, cython.address(self._psi[0]), cython.address(self._spread[0]), n, judge.p)
-        return v
+    def _keep_blocks(self, judge: Judge, k: cython.Py_ssize_t) -> cython.void:
+        """Those that hold where run k begins."""
+        i: cython.Py_ssize_t
+        for i in range(judge._corners):
+            self._places[4 * k + i] = judge._places[i]
+            self._weights[4 * k + i] = judge._weights[i]
 
     @cython.cfunc
     @cython.boundscheck(False)
     @cython.wraparound(False)
     @cython.exceptval(check=False)
-    def _blend(self, first: cython.Py_ssize_t, k: cython.Py_ssize_t, corners: cython.Py_ssize_t) -> cython.void:
-        """Elements of a horizon, whose blocks begin at the first, where run k began."""
+    def _sum(self, elements: _Elements, k: cython.Py_ssize_t) -> cython.void:
+        """The sums of a horizon for `_phi`, with the blocks that held where run k began."""
         judge: Judge = self._judge
-        size: cython.Py_ssize_t = judge.n * judge.p
-        i: cython.Py_ssize_t
-        r: cython.Py_ssize_t
-        for i in range(corners):
-            r = first + self._places[4 * k + i]
-            judge._add(self._one_theta, self._theta, size, i, r * size, self._weights[4 * k + i])
-            judge._add(self._one_delta, self._delta, size, i, r * size, self._weights[4 * k + i])
-            judge._add(self._one_v, self._v, judge.n, i, r * judge.n, self._weights[4 * k + i])
+        elements.sum(
+            cython.address(self._phi[0]),
+            cython.address(self._places[4 * k]),
+            cython.address(self._weights[4 * k]),
+            judge._corners,
+        )
 
 
 def _doubles(values: Any) -> Any:
