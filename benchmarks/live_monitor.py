@@ -103,7 +103,7 @@ def arms(rng: np.random.Generator, matrices: tuple[Any, ...], dt: float) -> dict
         return [np.stack([a * factor for factor in rng.uniform(0.5, 1.0, blocks)]) for a in arrays]
 
     v = np.full((blocks, n), 0.1)
-    residuals = Residuals(np.zeros(n), np.eye(n) * 2 * 0.05**2 / 3)
+    residuals = Residuals(np.zeros(n), np.eye(n) * 2 * 0.05**2 / 3 / 0.1**2)  # of what is published, over v
     horizons = [
         Horizon(
             h, *scheduled(*(np.zeros_like(a) for a in matrices[:2]), *matrices[2:]), v=v * rng.uniform(1.0, 1.2, n),

@@ -24,7 +24,7 @@ from uncertain_lti.model.alarm_rule import JOINT, KINDS, PER_STATE, AlarmRule, S
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.monitor import statistics
-from uncertain_lti.monitor.statistics import LIMIT, Statistic
+from uncertain_lti.monitor.statistics import LIMIT, Statistic, Statistics
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.reports.model_text import model_text
@@ -101,10 +101,32 @@ def test_one_at_a_time_and_all_at_once_are_the_same_bits(kind: str) -> None:
     together = statistic(kind, 0.1)
     alarm, values = together.push_all(dt, rows)
     one = statistic(kind, 0.1)
+    every = Statistics([one], [1])
     for k in range(500):
-        assert one.push(dt[k], array("d", [7.0, *rows[k]]), 1) == alarm[k]
-        assert np.array(one.values()).tobytes() == values[k].tobytes()
+        assert every.push(dt[k], array("d", [7.0, *rows[k]])) == alarm[k]
+        assert np.array(one.values()).tobytes() == np.array(every.values()).tobytes() == values[k].tobytes()
     assert np.isfinite(values[1:]).all()
+
+
+def test_several_take_their_parts_of_one_table_and_refuse_one_that_is_too_short() -> None:
+    every = Statistics([statistic("mean", 1.0, 2.0), statistic("chi2", 1.0)], [3, 0])
+    assert np.isnan(every.values()).all() and len(every.values()) == 4
+    assert every.push(1.0, array("d", [0.0, 0.0, 0.0, 1.0, -3.0, 0.5]))
+    assert every.values()[:3].tolist() == [0.5, -1.5, 0.25]
+    with pytest.raises(ValueError, match="do not fit"):
+        every.push(1.0, array("d", [0.0] * 5))
+
+
+@pytest.mark.parametrize("source", [statistics, compiled.uncompiled("monitor.statistics")], ids=["used", "uncompiled"])
+def test_one_number_beyond_a_limit_is_enough_and_none_at_all_is_no_verdict(source: Any) -> None:
+    places, nan, beyond = array("q", [1, 3]), float("nan"), source.some_beyond
+    assert beyond(array("d", [9.0, -1.0, 9.0, 1.0]), places, 1.0) == 0
+    assert (
+        beyond(array("d", [0.0, 0.0, 0.0, -1.5]), places, 1.0) == beyond(array("d", [0, nan, 0, 0]), places, 1.0) == 1
+    )
+    assert beyond(array("d", [0.0, nan, 0.0, nan]), places, 1.0) == -1
+    with pytest.raises(ValueError, match="do not fit"):
+        beyond(array("d", [0.0, 0.0, 0.0]), places, 1.0)
 
 
 @given(st.sampled_from(KINDS), st.integers(1, 4), st.integers(0, 10_000), st.sampled_from([1e-4, 0.03, 0.5, 1e6]))

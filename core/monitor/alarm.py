@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, StatisticRule, labels
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.statistics import Statistic
+from uncertain_lti.monitor.statistics import Statistic, Statistics, some_beyond
 
 EVERY_STATE = "joint"
 """What stands for the state in the name of a statistic of all of them."""
@@ -94,37 +94,17 @@ class AlarmStatistic(Protocol):
     def reset(self) -> None:
         """Forget every verdict and the alarm."""
 
-    def push(self, dt: float, violated: bool, table: Any) -> bool:
-        """Take one verdict.
-
-        Parameters
-        ----------
-        dt : float
-            Step that it ends, s.
-        violated : bool
-            Whether the one-step bounds are violated by a state that counts.
-        table : buffer of doubles
-            Rows of n: the utilisation for one step and for each horizon, then the residual of each likewise
-            (`residual_row`).
-
-        Returns
-        -------
-        bool
-            The alarm after it.
-        """
-        ...
-
     def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
-        """Take many verdicts; after each what `push` gives.
+        """Take many verdicts; after each what `Alarm.push` gives.
 
         Parameters
         ----------
         dt : array (K,)
             Steps, s.
         violated : array of bool (K,)
-            As for `push`.
+            As for `Alarm.push`.
         table : array (K, rows, n)
-            As for `push`.
+            As for `Alarm.push`.
 
         Returns
         -------
@@ -168,7 +148,7 @@ class AlarmWindow:
 
     def __init__(self, rule: AlarmRule, places: Sequence[int] = ()) -> None:
         self.rule: Rule = rule
-        self._needed, self._margin, self._places = rule.violations, rule.margin, list(places)
+        self._needed, self._margin, self._places = rule.violations, rule.margin, array("q", places)
         self._recent: deque[bool] = deque(maxlen=rule.window)
         self.reset()
 
@@ -193,7 +173,7 @@ class AlarmWindow:
         violated : bool
             Whether it is a violation that counts.
         table : buffer of doubles
-            As of `AlarmStatistic`; looked at for a horizon of several steps. If all of it is NaN there is no verdict.
+            As of `Alarm.push`; looked at for a horizon of several steps. If all of it is NaN there is no verdict.
 
         Returns
         -------
@@ -201,10 +181,10 @@ class AlarmWindow:
             The alarm after it.
         """
         if self._places:
-            sizes = [abs(table[place]) for place in self._places]
-            if all(size != size for size in sizes):
+            beyond = some_beyond(table, self._places, self._margin)
+            if beyond < 0:
                 return self.alarm
-            violated = any(not size <= self._margin for size in sizes)
+            violated = beyond > 0
         recent = self._recent
         if len(recent) == recent.maxlen:
             self._violations -= recent[0]
@@ -223,7 +203,7 @@ class AlarmWindow:
         violated : array of bool (K,)
             As for `push`.
         table : array (K, rows, n)
-            As of `AlarmStatistic`.
+            As of `Alarm.push`.
 
         Returns
         -------
@@ -268,14 +248,18 @@ class AlarmOverThreshold:
     ----------
     rule : StatisticRule
         As given.
+    statistic : Statistic
+        Its arithmetic.
+    begin : int
+        Where its numbers begin in the table of `Alarm.push`.
     """
 
     def __init__(self, rule: StatisticRule, model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
         self.rule: Rule = rule
         self._row = row_of(rule, model)
-        self._begin = self._row * model.n
+        self.begin = self._row * model.n
         residuals = model.residuals_at(rule.horizon) if rule.kind in JOINT else None
-        self._statistic = Statistic(
+        self.statistic = Statistic(
             KINDS.index(rule.kind),
             model.n,
             rule.window_s,
@@ -289,30 +273,11 @@ class AlarmOverThreshold:
     @property
     def alarm(self) -> bool:
         """Whether it is over its threshold for some state that counts."""
-        return bool(self._statistic.alarm)
+        return bool(self.statistic.alarm)
 
     def reset(self) -> None:
         """Forget every verdict and the alarm."""
-        self._statistic.reset()
-
-    def push(self, dt: float, violated: bool, table: Any) -> bool:
-        """As `AlarmStatistic`.
-
-        Parameters
-        ----------
-        dt : float
-            Step that the verdict ends, s.
-        violated : bool
-            Not looked at.
-        table : buffer of doubles
-            As of `AlarmStatistic`.
-
-        Returns
-        -------
-        bool
-            The alarm after it.
-        """
-        return bool(self._statistic.push(dt, table, self._begin))
+        self.statistic.reset()
 
     def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
         """As `AlarmStatistic`.
@@ -324,7 +289,7 @@ class AlarmOverThreshold:
         violated : array of bool (K,)
             Not looked at.
         table : array (K, rows, n)
-            As of `AlarmStatistic`.
+            As of `Alarm.push`.
 
         Returns
         -------
@@ -333,7 +298,7 @@ class AlarmOverThreshold:
         array (K, n), or (K, 1) of a joint statistic
             `values` after each.
         """
-        after, values = self._statistic.push_all(dt, table[:, self._row])
+        after, values = self.statistic.push_all(dt, table[:, self._row])
         return after, values
 
     def values(self) -> Any:
@@ -344,7 +309,7 @@ class AlarmOverThreshold:
         array of doubles (n,), or (1,) of a joint statistic
             NaN before the first verdict.
         """
-        return self._statistic.values()
+        return self.statistic.values()
 
 
 def row_of(rule: Rule, model: UncertainLTI) -> int:
@@ -430,7 +395,10 @@ class Alarm:
         self.parts, self.names = tuple(parts), tuple(names)
         self.needs_table = any(rule.horizon > 1 or rule.kind != "containment" for rule in self.rules)
         self.needs_residual = any(row_of(rule, model) >= residual_row(model) for rule in self.rules)
-        self._only = self.parts[0] if len(self.parts) == 1 else None
+        self._windows = [part for part in parts if isinstance(part, AlarmWindow)]
+        over = [part for part in parts if isinstance(part, AlarmOverThreshold)]
+        self._statistics = Statistics([part.statistic for part in over], [part.begin for part in over])
+        self._only = self._windows[0] if len(parts) == len(self._windows) == 1 else None
 
     def reset(self) -> None:
         """Forget every verdict and the alarm."""
@@ -439,7 +407,7 @@ class Alarm:
         self.alarm = False
 
     def push(self, dt: float, violated: bool, table: Any = None) -> bool:
-        """Take one verdict; as `AlarmStatistic.push`.
+        """Take one verdict.
 
         Parameters
         ----------
@@ -448,7 +416,8 @@ class Alarm:
         violated : bool
             Whether the one-step bounds are violated by a state that counts.
         table : buffer of doubles, optional
-            As of `AlarmStatistic`; if `needs_table`.
+            If `needs_table`: rows of n, the utilisation for one step and for each horizon, and if `needs_residual` the
+            residuals likewise (`residual_row`).
 
         Returns
         -------
@@ -458,9 +427,9 @@ class Alarm:
         if self._only is not None:
             self.alarm = self._only.push(dt, violated, table)
             return self.alarm
-        alarm = False
-        for part in self.parts:
-            alarm = part.push(dt, violated, table) or alarm
+        alarm = bool(self.names) and bool(self._statistics.push(dt, table))
+        for window in self._windows:
+            alarm = window.push(dt, violated, table) or alarm
         self.alarm = alarm
         return alarm
 
@@ -472,10 +441,7 @@ class Alarm:
         array of doubles
             A copy; NaN before the first verdict.
         """
-        found = array("d")
-        for part in self.parts:
-            found.extend(part.values())
-        return found
+        return self._statistics.values()
 
     def nearest(self, values: Sequence[float]) -> dict[str, Nearest]:
         """Of each rule with a statistic the one that is nearest to its threshold.

@@ -19,6 +19,7 @@ operations in the same order give the same bits.
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 from typing import Any
 
 try:
@@ -153,34 +154,6 @@ class Statistic:
             return array("d", [float("nan")] * self._size)
         return array("d", self._values)
 
-    def push(self, dt: cython.double, table: Any, begin: cython.Py_ssize_t) -> bool:
-        """Take one verdict.
-
-        Parameters
-        ----------
-        dt : float
-            Step that it ends, s.
-        table : buffer of doubles
-            The utilisation of each state, or the residual, among others.
-        begin : int
-            Where they begin. If all are NaN there is no verdict, and nothing changes.
-
-        Returns
-        -------
-        bool
-            The alarm after it.
-
-        Raises
-        ------
-        ValueError
-            There are too few numbers.
-        """
-        row: cython.double[::1] = table
-        if begin < 0 or begin + self._n > len(row):
-            raise ValueError("the numbers of the verdict do not fit the states")
-        self._push(dt, row, begin)
-        return self.alarm
-
     def push_all(self, dt: Any, rows: Any) -> tuple[Any, Any]:
         """Take many verdicts.
 
@@ -189,7 +162,8 @@ class Statistic:
         dt : array (K,)
             Steps, s.
         rows : array (K, n)
-            As for `push`, a row for each verdict.
+            The utilisation of each state, or the residual, a row for each verdict. If all are NaN there is no verdict,
+            and nothing changes.
 
         Returns
         -------
@@ -368,9 +342,121 @@ class Statistic:
         self._begin, self._end = 0, count
 
 
+@cython.cclass
+class Statistics:
+    """Several statistics, each of its own part of the numbers of one verdict after another.
+
+    Parameters
+    ----------
+    parts : sequence of Statistic
+        The statistics.
+    begins : sequence of int
+        Where the numbers of each begin.
+    """
+
+    _parts = cython.declare(list)
+    _begins: cython.longlong[::1]
+    _total: cython.Py_ssize_t
+
+    def __init__(self, parts: Sequence[Statistic], begins: Sequence[int]) -> None:
+        self._parts, self._begins = list(parts), array("q", begins or [0])
+        self._total = sum([len(part.values()) for part in parts])
+
+    def push(self, dt: cython.double, table: Any) -> bool:
+        """Take one verdict.
+
+        Parameters
+        ----------
+        dt : float
+            Step that it ends, s.
+        table : buffer of doubles
+            The utilisation of each state, or the residual, for each statistic. If all of its own are NaN there is no
+            verdict for it, and nothing changes.
+
+        Returns
+        -------
+        bool
+            Whether some statistic raises the alarm after it.
+
+        Raises
+        ------
+        ValueError
+            There are too few numbers.
+        """
+        part: Statistic
+        k: cython.Py_ssize_t = 0
+        begin: cython.Py_ssize_t
+        raised: cython.bint = False
+        row: cython.double[::1] = table
+        for part in self._parts:
+            begin = self._begins[k]
+            if begin < 0 or begin + part._n > len(row):
+                raise ValueError("the numbers of the verdict do not fit the states")
+            part._push(dt, row, begin)
+            raised = raised or part.alarm
+            k += 1
+        return raised
+
+    def values(self) -> Any:
+        """`Statistic.values` of each, one after the other.
+
+        Returns
+        -------
+        array of doubles
+            A copy.
+        """
+        part: Statistic
+        i: cython.Py_ssize_t
+        at: cython.Py_ssize_t = 0
+        found = array("d", bytes(8 * self._total))
+        values: cython.double[::1] = found
+        for part in self._parts:
+            for i in range(part._size):
+                values[at + i] = part._values[i] if part._pushed else float("nan")
+            at += part._size
+        return found
+
+
+def some_beyond(table: Any, places: Any, limit: cython.double) -> int:
+    """Whether the size of one of some numbers is over a limit, or one of them is NaN.
+
+    Parameters
+    ----------
+    table : buffer of doubles
+        The numbers, among others.
+    places : buffer of 8-byte integers
+        Where they are.
+    limit : float
+        The limit.
+
+    Returns
+    -------
+    int
+        0 or 1; -1 if all are NaN.
+
+    Raises
+    ------
+    ValueError
+        There are too few numbers.
+    """
+    row: cython.double[::1] = table
+    at: cython.longlong[::1] = places
+    i: cython.Py_ssize_t
+    value: cython.double
+    nothing: cython.bint = True
+    beyond: cython.bint = False
+    for i in range(len(at)):
+        if not 0 <= at[i] < len(row):
+            raise ValueError("the numbers of the verdict do not fit the states")
+        value = row[at[i]]
+        nothing = nothing and value != value
+        beyond = beyond or not -limit <= value <= limit
+    return -1 if nothing else int(beyond)
+
+
 def _doubles(values: Any) -> Any:
     return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
 
 
 if not cython.compiled:
-    use_twin(globals(), ("Statistic",))
+    use_twin(globals(), ("Statistic", "Statistics", "some_beyond"))

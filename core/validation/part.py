@@ -148,7 +148,7 @@ class Part:
 
     @property
     def table(self) -> Array:
-        """(K, rows, n): utilisation for one step and for each horizon, then the residuals, for `AlarmStatistic`."""
+        """(K, rows, n), for `Alarm.over`: utilisation for one step and for each horizon, then the residuals."""
         rows = [self.utilisation[:, None], self.longer, self.residual[:, None], self.longer_residual]
         return np.concatenate([row for row in rows if row.size or not self.judged], axis=1)
 
