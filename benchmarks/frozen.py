@@ -23,57 +23,35 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from measure import table
+from real_machines import CASES, Case
+from shared_recordings import DATA, read_shared, signals_of
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.validation.blocks import cut
 
-ROOT = Path(__file__).resolve().parents[1]
 INSTANTS, WITHIN, SECONDS = 200, 1.0, 2.0
-FILES: tuple[tuple[str, str, Sequence[str], Sequence[str]], ...] = (
-    ("Neato, 5 Hz", "neato", ["neato/person_follower.mcap"], ["neato/draw_square.mcap"]),
-    ("Neato, 5 Hz, the other way round", "neato", ["neato/draw_square.mcap"], ["neato/person_follower.mcap"]),
-    (
-        "Hunter SE (simulated), 27 Hz", "hunter_se", ["hunter_se/straight_odd_t_0_5_run_01.mcap"],
-        ["hunter_se/straight_odd_t_0_5_run_02.mcap", "hunter_se/straight_even_t_0_2_run_01.mcap"],
-    ),
-    (
-        "Crazyflie, Vicon, 100 Hz", "crazyflie_vicon", ["crazyflie/rollbag_0.mcap"],
-        ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"],
-    ),
-    (
-        "Crazyflie, estimate, 10 Hz", "crazyflie_estimate", ["crazyflie/rollbag_0.mcap"],
-        ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"],
-    ),
-    (
-        "micro gas turbine, 1 Hz", "micro_gas_turbine", ["micro_gas_turbine/ex_1.mcap", "micro_gas_turbine/ex_20.mcap"],
-        ["micro_gas_turbine/ex_24.mcap"],
-    ),
-)  # fmt: skip
+OTHER_WAY = Case(
+    "Neato, 5 Hz, the other way round", "neato", ["neato/draw_square.mcap"], ["neato/person_follower.mcap"]
+)
 
 
-def of_files(
-    data: Path, signals: str, fitted: Sequence[str], checked: Sequence[str]
-) -> tuple[list[Transient], list[Transient]]:
+def of_case(data: Path, case: Case) -> tuple[list[Transient], list[Transient]]:
     """Recordings that are fitted, and others."""
-    first = read_transients([data / name for name in fitted], ROOT / "config" / "signals" / f"{signals}.yaml")
+    first = read_shared(case.signals, *case.fitted, data=data)
     assert first[0].signals is not None
-    return first, [read_as_fitted(data / name, first[0].signals) for name in checked]
+    return first, [read_as_fitted(data / name, first[0].signals) for name in case.checked]
 
 
 def of_joint(data: Path, joint: int) -> tuple[list[Transient], list[Transient], list[Transient]]:
     """One joint of the quadruped: every other second is fitted; any instant of the run is held."""
-    text = (ROOT / "config" / "signals" / "go2_joint.yaml").read_text().replace("[j0]", f"[j{joint}]")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "signals.yaml"
-        path.write_text(text)
-        (whole,) = read_transients(data / "go2" / "test_3.mcap", path)
+    text = signals_of("go2_joint").replace("[j0]", f"[j{joint}]")
+    (whole,) = read_shared("go2_joint", "go2/test_3.mcap", data=data, text=text)
     seconds = [cut(whole, start, start + 500) for start in range(0, 6500, 500)]
     return seconds[::2], seconds[1::2], [cut(whole, 0, 6500)]
 
@@ -143,7 +121,7 @@ def measure(
 def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings")
     data = parser.parse_args().data
     if not data.is_dir():
         print(f"{data}: the recordings are not there; name their folder with --data", file=sys.stderr)
@@ -151,8 +129,8 @@ def main() -> int:
     rows = []
     for joint in range(12):
         rows += measure(f"Go2, 500 Hz, joint {joint}", *of_joint(data, joint))
-    for title, signals, fitted, checked in FILES:
-        rows += measure(title, *of_files(data, signals, fitted, checked))
+    for case in (*CASES, OTHER_WAY):
+        rows += measure(case.machine, *of_case(data, case))
     header = ("machine: state", "longest repeat, s", "held", "within 1 s", "median, s", "90 %, s", "false, healthy")
     table("Held states", header, rows)
     return 0

@@ -21,10 +21,8 @@ exit status is 2.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,13 +31,11 @@ from typing import Any
 
 import numpy as np
 from measure import table
-from regimes import CRAZYPAD
+from shared_recordings import DATA, airborne, crazypad_labels, read_shared
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients, tune
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, tune
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.validation.blocks import cut
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
@@ -96,9 +92,9 @@ def rows_of(
     return rows
 
 
-def go2(data: Path, signals: Path) -> list[list[str]]:
+def go2(data: Path) -> list[list[str]]:
     """Joint 0 fitted on every other second, checked on the others taken together."""
-    (whole,) = read_transients(data / "go2" / "test_3.mcap", signals / "go2_joint.yaml")
+    (whole,) = read_shared("go2_joint", "go2/test_3.mcap", data=data)
     seconds = [cut(whole, start, start + 500) for start in range(0, 6500, 500)]
     model = fit(seconds[::2])
     verdicts = [EnvelopeMonitor(model, 1, 1, 1.0).check(part) for part in seconds[1::2]]
@@ -143,31 +139,15 @@ TUNINGS = (
 )  # fmt: skip
 
 
-def airborne(data: Path) -> tuple[list[Transient], list[str]]:
-    """The healthy flights of CrazyPAD while they are in the air, and the flight of each piece."""
-    folder = data / "crazypad"
-    labels = json.loads((folder / "labels.json").read_text())
-    pieces, flights = [], []
-    with tempfile.TemporaryDirectory() as name:
-        signals = Path(name) / "signals.yaml"
-        signals.write_text(CRAZYPAD)
-        healthy = [file for file in labels if not labels[file]["faulty"]]
-        for file, flight in zip(healthy, read_transients([folder / f for f in healthy], signals), strict=True):
-            for low, high in labels[file]["airborne_s"]:
-                inside = np.flatnonzero((flight.t >= low) & (flight.t <= high))
-                pieces.append(cut(flight, int(inside[0]), int(inside[-1]) + 1))
-                flights.append(file)
-    return pieces, flights
-
-
-def tuned_row(case: Tuning, data: Path, signals: Path, cache: Path | None) -> list[str]:
+def tuned_row(case: Tuning, data: Path, cache: Path | None) -> list[str]:
     """What tune came to: rate, choice, size, biases seen beside those of the plain fit, processor time."""
     groups: list[str] | None = None
     if case.signals == "crazypad":
-        transients, groups = airborne(data)
+        flights = airborne([file for file, label in crazypad_labels(data).items() if not label["faulty"]], data)
+        transients = [piece for pieces in flights.values() for piece in pieces]
+        groups = [file for file, pieces in flights.items() for _ in pieces]
     else:
-        files = [ROOT / f if f.startswith("bags/") else data / f for f in case.recordings]
-        transients = read_transients(files, signals / f"{case.signals}.yaml")
+        transients = read_shared(case.signals, *case.recordings, data=data)
     began = time.process_time()
     tuned = tune(transients, case.rate, within=case.within, groups=groups, cache=cache)
     taken = time.process_time() - began
@@ -189,19 +169,19 @@ def tuned_row(case: Tuning, data: Path, signals: Path, cache: Path | None) -> li
     ]  # fmt: skip
 
 
-def tunings(data: Path, signals: Path, only: str, cache: Path | None) -> None:
+def tunings(data: Path, only: str, cache: Path | None) -> None:
     """Print the table of what tune chose."""
     header = (
         "machine, left out", "false alarms per hour", "chosen", "size",
         "biases seen: plain fit → chosen", "ways", "processor time",
     )  # fmt: skip
     cases = [case for case in TUNINGS if case.machine.lower().startswith(only.lower())]
-    table("What tune chooses", header, [tuned_row(case, data, signals, cache) for case in cases])
+    table("What tune chooses", header, [tuned_row(case, data, cache) for case in cases])
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings")
     parser.add_argument("--tune", metavar="MACHINE", nargs="?", const="", help="what tune chooses, on all or one")
     parser.add_argument("--cache", type=Path, help="folder that keeps what tune tried")
     options = parser.parse_args()
@@ -209,13 +189,12 @@ def main() -> int:
     if not data.is_dir():
         print(f"{data}: the recordings are not there; name their folder with --data", file=sys.stderr)
         return 2
-    signals = ROOT / "config" / "signals"
     if options.tune is not None:
-        tunings(data, signals, options.tune, options.cache)
+        tunings(data, options.tune, options.cache)
         return 0
-    rows = go2(data, signals)
+    rows = go2(data)
     for case in CASES:
-        fitted = read_transients([data / name for name in case.fitted], signals / f"{case.signals}.yaml")
+        fitted = read_shared(case.signals, *case.fitted, data=data)
         model = fit(fitted)
         rows += rows_of(
             case.machine, model, fitted, [read_as_fitted(data / name, model.signals) for name in case.checked]

@@ -46,6 +46,7 @@ from typing import Any
 
 import numpy as np
 from measure import table
+from shared_recordings import crazypad_labels, read_shared
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
@@ -521,18 +522,9 @@ def left_out(title: str, transients: Sequence[Transient], signal: str, additive:
     print("\n".join(notes))
 
 
-def shared() -> Path:
-    """The folder of real recordings."""
-    data = ROOT.parent / "shared" / "data"
-    if not data.is_dir():
-        raise UncertainLTIError(f"{data}: the real recordings are not there, so this part is left out")
-    return data
-
-
 def gas_turbine(keep: Path | None) -> None:
     """The real micro gas turbine."""
-    files = [shared() / "micro_gas_turbine" / f"{name}.mcap" for name in ("ex_1", "ex_20", "ex_24")]
-    transients = read_transients(files, ROOT / "config/signals/micro_gas_turbine.yaml")
+    transients = read_shared("micro_gas_turbine", *(f"micro_gas_turbine/ex_{k}.mcap" for k in (1, 20, 24)))
     left_out(
         "Micro gas turbine: ex_1, ex_20, ex_24, each left out in turn", transients, "power", "both", (1, 3, 6, "auto")
     )
@@ -561,27 +553,8 @@ def minute(keep: Path | None) -> None:
         model = scheduled([levels], criterion, "fan_speed", "auto", "both")
         print(f"{name}, one minute of the turbofan along levels: auto took {knots_text(model)}")
         print(why(model))
-    flights = sorted((shared() / "crazypad").glob("normal_flight__*.mcap"))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "signals.yaml"
-        path.write_text(CRAZYPAD)
-        transients = read_transients(flights, path)
+    transients = read_shared("crazypad", *(file for file, label in crazypad_labels().items() if not label["faulty"]))
     left_out("CrazyPAD: four healthy flights", transients, "thrust", "both", (1, 3, "auto"))
-
-
-CRAZYPAD = """\
-clock: /crazyflie/imu
-additive: both
-states:
-  - {name: roll_rate, topic: /crazyflie/imu, field: angular_velocity.x, unit: rad/s}
-  - {name: pitch_rate, topic: /crazyflie/imu, field: angular_velocity.y, unit: rad/s}
-  - {name: yaw_rate, topic: /crazyflie/imu, field: angular_velocity.z, unit: rad/s}
-controls:
-  - {name: thrust, topic: /crazyflie/command, field: wrench.force.z, steady: auto, scale: 10000}
-  - {name: roll, topic: /crazyflie/command, field: wrench.torque.x, scale: 10000}
-  - {name: pitch, topic: /crazyflie/command, field: wrench.torque.y, scale: 10000}
-  - {name: yaw, topic: /crazyflie/command, field: wrench.torque.z, scale: 10000}
-"""
 
 
 def million(keep: Path | None, count: int) -> None:

@@ -39,6 +39,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from measure import table
+from shared_recordings import DATA
 
 from uncertain_lti import SignalMap, Transient, fit, read_transients, validate
 from uncertain_lti.base.arrays import Array
@@ -190,7 +191,7 @@ def found_cases(folder: Path, scratch: Path) -> list[Case]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings")
     parser.add_argument("--found", type=Path, metavar="FOLDER", help="folder of further recordings, see above")
     parser.add_argument("machines", nargs="*", metavar="MACHINE", help="words of the machines to compare; default all")
     options = parser.parse_args()

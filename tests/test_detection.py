@@ -14,7 +14,8 @@ import pytest
 
 pytest.importorskip("scipy", reason="scipy, which the benchmark needs, is not installed")
 
-from detection import Case, Faulty, Kind, Recorded, evaluate, from_whole_degrees, our_rules, profile, threshold_of
+from detection_cases import Case, Faulty, Recorded, from_whole_degrees, profile
+from detection_procedure import Kind, evaluate, our_rules, threshold_of
 from detectors import Kalman, LeastSquares, Runs, Statistic, cusum, of_window, residual_detectors
 from tanks import Tanks
 from temporal_logic import arrivals, formula_of, gathered, verdicts
