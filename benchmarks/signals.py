@@ -25,6 +25,8 @@ recording, with guard intervals).
                        Uncertainty-quantification-in-neural-state-space-models-applications
     before1.bag, after1.bag, col2.bag
                        a wheeled robot, ROS 1 (MIT); github.com/zaki0929/bagfiles, 2018/may9/editted and 2018/feb13
+    my_bag.db3         a filter of odometry as a node, beside a simulated TurtleBot3, rosbag2 (MIT);
+                       github.com/fadil-nurmaulid/robot_kf, my_bag
 """
 
 from __future__ import annotations
@@ -175,6 +177,11 @@ def found_cases(folder: Path, scratch: Path) -> list[Case]:
             {"name": "angular_command", "topic": "/cmd_vel", "field": "angular.z", "max_hold": 1.0},
         ],
     }
+    odometry = {
+        "additive": "noise",
+        "states": [{"name": a, "topic": "/odom_kf", "field": f"pose.pose.position.{a}"} for a in "xy"],
+        "controls": [{"name": f"{a}_in", "topic": "/odom_noisy", "field": f"pose.pose.position.{a}"} for a in "xy"],
+    }
     cases = []
     if (folder / "SNLS80mV.csv").is_file():
         path = runs("SNLS80mV.csv", 2**14 / 1e7, [("V1", "V2")], slice(40_650, 50_650))  # the first multisine
@@ -186,6 +193,8 @@ def found_cases(folder: Path, scratch: Path) -> list[Case]:
     if all(bag.is_file() for bag in bags):
         memories = ["lag(linear_command, 1)", "lag(angular_command, 1)"]
         cases.append(case("Wheeled robot", [str(bag) for bag in bags], base, *memories))
+    if (filtered := folder / "my_bag.db3").is_file():
+        cases.append(case("Filter node", [str(filtered)], odometry, "rate(x)", "rate(y)"))
     return cases
 
 
