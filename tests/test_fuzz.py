@@ -195,7 +195,7 @@ def test_whatever_goes_wrong_is_noticed(tmp_path: Path) -> None:
     program = tmp_path / "wrong.py"
     program.write_text("""
 import os, time, fuzz
-fuzz.LIMIT_CPU_S, fuzz.LIMIT_S = 0.5, 5.0
+fuzz.LIMIT_CPU_S, fuzz.LIMIT_S = 0.5, 20.0
 def wrong(rng, folder):
     kind = next(kinds)
     if kind == "raise":

@@ -23,8 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import ModelError, SignalError, refuse_other
-from uncertain_lti.base.html_table import MOST, html_table, name_with_unit, number_text
+from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.model.alarm_rule import (
     JOINT,
     AlarmRule,
@@ -56,10 +55,8 @@ from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature, checked_signatures
 from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
 from uncertain_lti.sampling.transient import Transient, Transitions
-from uncertain_lti.signals.signal_map import Recalled, Signal, SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
-LONGEST_RECURSION = 400
-"""Rows of the matrix of the recursion up to which it remembers earlier samples; longer memories are left out of it."""
 _BLOCK = 65536  # products per block of the vectorised path: they stay in the cache
 
 
@@ -416,52 +413,10 @@ class UncertainLTI:
         return text + ")"
 
     def _repr_html_(self) -> str:
-        """Nominal elements with their half-widths, or the blocks of a schedule, and the widths that the fit reached."""
-        header, rows = self._elements_table() if self.schedule is None else self._blocks_table(self.schedule)
-        facts, below = self.fit_summary, []
-        if facts.get("mean_width_recorded") is not None:
-            widths = [
-                f"{name_with_unit(s.name, s.unit)} {number_text(float(w))}"
-                for s, w in zip(self.signals.states[:MOST], np.ravel(facts["mean_width_recorded"]), strict=False)
-            ]
-            below.append(f"mean one-step width: {', '.join(widths)}" + ", …" * (self.n > MOST))
-        for rule in self.alarm:
-            margin = f", margin {number_text(rule.margin)}" if isinstance(rule, AlarmRule) else ""
-            below.append(f"alarm: {rule.words}{margin}")
-        below += [f"note: {message}" for message in facts.get("messages", [])]
-        return html_table(repr(self), header, rows, below)
+        """What a notebook shows."""
+        from uncertain_lti.model.overview import overview
 
-    def _elements_table(self) -> tuple[list[str], list[list[str]]]:
-        """Of one block: a row per state, a column per signal and additive term."""
-        names = [*self.state_names, *self.control_names]
-        nominal, half = np.hstack([self.A, self.B]), np.hstack([self.dA, self.dB])
-        shown = range(min(len(names), MOST))
-        extra = [(t.nominal or t.half, a, b) for t, a, b in self.additive() if a.any() or b.any()]
-        header = ["A, B [1/s]", *(names[j] for j in shown)]
-        header += ["…"] * (len(names) > MOST) + [name for name, _, _ in extra]
-        rows = []
-        for i in range(min(self.n, MOST)):
-            row = [self.state_names[i], *(f"{nominal[i, j]:.4g} ± {half[i, j]:.3g}" for j in shown)]
-            row += ["…"] * (len(names) > MOST) + [f"{a[i]:.4g} ± {b[i]:.3g}" for _, a, b in extra]
-            rows.append(row)
-        if self.n > MOST:
-            rows.append(["…"] * len(header))
-        return header, rows
-
-    def _blocks_table(self, schedule: Schedule) -> tuple[list[str], list[list[str]]]:
-        """A row per block: its data, and the element of A on the diagonal of each state."""
-        shown = range(min(self.n, MOST))
-        header = ["regime", "transitions", "elements of", *(f"{self.state_names[i]}: A [1/s]" for i in shown)]
-        header += ["…"] * (self.n > MOST)
-        rows = []
-        for r, data in enumerate(self.block_data[:MOST]):
-            row = [self.block_name(r), "–" if data.transitions is None else str(data.transitions)]
-            row.append("its own" if data.tied_to is None else self.block_name(data.tied_to))
-            row += [f"{self.A[r, i, i]:.4g} ± {self.dA[r, i, i]:.3g}" for i in shown] + ["…"] * (self.n > MOST)
-            rows.append(row)
-        if schedule.blocks > MOST:
-            rows.append(["…"] * len(header))
-        return header, rows
+        return overview(self)
 
     # --- one-step bounds ---
 
@@ -850,36 +805,9 @@ class UncertainLTI:
         array (N+1, n)
             Normalised states; infinite or NaN where an unstable model runs away.
         """
-        u = np.asarray(u, dtype=np.float64)
-        dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(u),))
-        s = np.zeros((len(u), 0)) if s is None else np.asarray(s, dtype=np.float64)
-        x = np.empty((len(u) + 1, self.n))
-        x[0] = x0
-        A, B, c = self.A, self.B, self.c
-        n, m = self.n, self.m
-        z = np.hstack((x[:-1], u, s))
-        recalled = [r for r in self.signals.recalled if r.of < n]
-        with np.errstate(over="ignore", invalid="ignore"):  # an unstable model runs away, and may
-            for k in range(len(u)):
-                z[k, :n] = x[k]
-                for of_state in recalled:
-                    self._recall(of_state, z, k, dt)
-                if self.schedule is not None:
-                    corners = self.schedule.corners(z[k, self._positions, None])
-                    A, B, c = (blended(blocks, *corners)[..., 0] for blocks in (self.A, self.B, self.c))
-                x[k + 1] = x[k] + dt[k] * (A @ x[k] + B @ z[k, n : n + m] + c)
-        return x
+        from uncertain_lti.model.free_run import simulated
 
-    def _recall(self, recalled: Recalled, z: Array, k: int, dt: Array) -> None:
-        """Fill in what sample k takes from earlier ones, if the run z (N, n + m + q) has them."""
-        memory, before = recalled.memory, k - recalled.memory.samples
-        if before < 0:
-            return
-        steady, scale = self.operating_point.steady, self.operating_point.scale
-        now, past = z[[k, before], recalled.of] * scale[recalled.of] + steady[recalled.of]
-        value = past if memory.kind == "lag" else now - past
-        value = value / dt[before] if memory.kind == "rate" else value
-        z[k, recalled.position] = (value - steady[recalled.position]) / scale[recalled.position]
+        return simulated(self, x0, u, dt, s)
 
     def free_run(self, transient: Transient) -> Transient:
         """Free run of the nominal model over a recording: its controls, and nothing of its states but the first.
@@ -902,28 +830,10 @@ class UncertainLTI:
         ModelError
             The transient has other numbers of signals than the model.
         """
-        point = self.operating_point
-        x = point.recorded_x(self._free_run(transient))
-        return transient.replace(x=x, name=f"{transient.name}, free run of the model")
+        from uncertain_lti.model.free_run import free_run
 
-    def _free_run(self, transient: Transient) -> Array:
-        """Normalised states (N+1, n) of the run over each usable stretch; NaN elsewhere."""
-        refuse_other(transient, Transient, "the recording", "give a Transient", ModelError)
-        given = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
-        if given != (self.n, self.m, self.q):
-            raise ModelError(
-                f"{transient.name}: it has {given[0]} states, {given[1]} controls and {given[2]} further scheduling "
-                f"signals, and the model has {self.n}, {self.m} and {self.q}; read it with the signals of the model"
-            )
-        x = self.operating_point.normalise_x(transient.x)
-        u = self.operating_point.normalise_u(transient.u)
-        s = self.operating_point.normalise_s(transient.s)
-        usable, dt = transient.usable, transient.dt
-        run = np.full(x.shape, np.nan)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
-        for start, stop in edges.reshape(-1, 2):
-            run[start : stop + 1] = self.simulate(x[start], u[start:stop], dt[start:stop], s[start:stop])
-        return run
+        x = self.operating_point.recorded_x(free_run(self, transient))
+        return transient.replace(x=x, name=f"{transient.name}, free run of the model")
 
     def discrepancy(self, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
         """Discrepancies (4) and (5) between the free-running nominal model and a recorded transient.
@@ -950,24 +860,9 @@ class UncertainLTI:
         ModelError
             W has another shape.
         """
-        error = (self._free_run(transient) - self.operating_point.normalise_x(transient.x))[1:]
-        usable = transient.usable
-        weights = np.ones(self.n) if W is None else np.asarray(W, dtype=np.float64)
-        if weights.shape not in ((self.n,), (len(usable), self.n), (len(usable), self.n, self.n)):
-            raise ModelError(
-                f"W has shape {weights.shape}; it must be ({self.n},), ({len(usable)}, {self.n}) "
-                f"or ({len(usable)}, {self.n}, {self.n})"
-            )
-        diagonal = np.broadcast_to(
-            np.diagonal(weights, axis1=1, axis2=2) if weights.ndim == 3 else weights, error.shape
-        )[usable]
-        error = error[usable]
-        if weights.ndim == 3:
-            total = float(np.einsum("ki,kij,kj->", error, weights[usable], error))
-        else:
-            total = float(np.sum(diagonal * error**2))
-        largest = np.max(np.sqrt(diagonal) * np.abs(error), axis=0, initial=0.0)
-        return total, largest
+        from uncertain_lti.model.free_run import discrepancy
+
+        return discrepancy(self, transient, W)
 
     def eigenvalues(self) -> NDArray[np.complex128]:
         """Eigenvalues of A.
@@ -1000,32 +895,12 @@ class UncertainLTI:
         ModelError
             dt is left out and the model has no median step.
         """
+        from uncertain_lti.model.free_run import recursion
+
         dt = self.sampling.dt_median if dt is None else dt
         if dt is None:
             raise ModelError("spectral radius: the model has no dt_median; give dt")
-        return float(np.abs(np.linalg.eigvals(self._recursion(dt))).max())
-
-    def _recursion(self, dt: float) -> Array:
-        """Matrix that takes [x_k; x_{k-1}; ...] to the next, as far back as the model remembers its states."""
-        n, scale = self.n, self.operating_point.scale
-        step = np.eye(n) + dt * self.A
-        recalled = [r for r in self.signals.recalled if r.of < n and r.position < n + self.m]
-        longest = max((r.memory.samples for r in recalled), default=0)
-        if not longest or longest > LONGEST_RECURSION // n:
-            return step
-        whole = np.zeros((*step.shape[:-2], n * (longest + 1), n * (longest + 1)))
-        whole[..., :n, :n] = step
-        whole[..., n:, :-n] = np.eye(n * longest)
-        for r in recalled:
-            column = dt * self.B[..., r.position - n] * (scale[r.of] / scale[r.position])
-            column = column / dt if r.memory.kind == "rate" else column
-            past = n * r.memory.samples + r.of
-            if r.memory.kind == "lag":
-                whole[..., :n, past] += column
-            else:
-                whole[..., :n, r.of] += column
-                whole[..., :n, past] -= column
-        return whole
+        return float(np.abs(np.linalg.eigvals(recursion(self, dt))).max())
 
     def replace(self, **changes: Any) -> UncertainLTI:
         """The same model with some constructor arguments replaced.

@@ -1,0 +1,192 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""The nominal model on its own: the free run, its discrepancies from a recording, and its recursion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.errors import ModelError, refuse_other
+from uncertain_lti.model.bounds import blended
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.signal_map import Recalled
+
+LONGEST_RECURSION = 400
+"""Rows of the matrix of the recursion up to which it remembers earlier samples; longer memories are left out of it."""
+
+
+def simulated(model: Any, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLike | None = None) -> Array:
+    """`UncertainLTI.simulate`.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    x0, u, dt, s : array
+        As there.
+
+    Returns
+    -------
+    array (N+1, n)
+        Normalised states.
+    """
+    u = np.asarray(u, dtype=np.float64)
+    dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(u),))
+    s = np.zeros((len(u), 0)) if s is None else np.asarray(s, dtype=np.float64)
+    x = np.empty((len(u) + 1, model.n))
+    x[0] = x0
+    A, B, c = model.A, model.B, model.c
+    n, m = model.n, model.m
+    z = np.hstack((x[:-1], u, s))
+    recalled = [r for r in model.signals.recalled if r.of < n]
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable model runs away, and may
+        for k in range(len(u)):
+            z[k, :n] = x[k]
+            for of_state in recalled:
+                _recall(model, of_state, z, k, dt)
+            if model.schedule is not None:
+                corners = model.schedule.corners(z[k, model.scheduling_positions, None])
+                A, B, c = (blended(blocks, *corners)[..., 0] for blocks in (model.A, model.B, model.c))
+            x[k + 1] = x[k] + dt[k] * (A @ x[k] + B @ z[k, n : n + m] + c)
+    return x
+
+
+def _recall(model: Any, recalled: Recalled, z: Array, k: int, dt: Array) -> None:
+    """Fill in what sample k takes from earlier ones, if the run z (N, n + m + q) has them."""
+    memory, before = recalled.memory, k - recalled.memory.samples
+    if before < 0:
+        return
+    steady, scale = model.operating_point.steady, model.operating_point.scale
+    now, past = z[[k, before], recalled.of] * scale[recalled.of] + steady[recalled.of]
+    value = past if memory.kind == "lag" else now - past
+    value = value / dt[before] if memory.kind == "rate" else value
+    z[k, recalled.position] = (value - steady[recalled.position]) / scale[recalled.position]
+
+
+def free_run(model: Any, transient: Transient) -> Array:
+    """States of the run over each usable stretch of a recording.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    transient : Transient
+        In recorded units.
+
+    Returns
+    -------
+    array (N+1, n)
+        Normalised; NaN where there is no run.
+
+    Raises
+    ------
+    ModelError
+        The transient has other numbers of signals than the model.
+    """
+    refuse_other(transient, Transient, "the recording", "give a Transient", ModelError)
+    given = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
+    if given != (model.n, model.m, model.q):
+        raise ModelError(
+            f"{transient.name}: it has {given[0]} states, {given[1]} controls and {given[2]} further scheduling "
+            f"signals, and the model has {model.n}, {model.m} and {model.q}; read it with the signals of the model"
+        )
+    x = model.operating_point.normalise_x(transient.x)
+    u = model.operating_point.normalise_u(transient.u)
+    s = model.operating_point.normalise_s(transient.s)
+    usable, dt = transient.usable, transient.dt
+    run = np.full(x.shape, np.nan)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
+    for start, stop in edges.reshape(-1, 2):
+        run[start : stop + 1] = simulated(model, x[start], u[start:stop], dt[start:stop], s[start:stop])
+    return run
+
+
+def discrepancy(model: Any, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
+    """`UncertainLTI.discrepancy`: (4) and (5).
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    transient : Transient
+        In recorded units.
+    W : array, optional
+        As there.
+
+    Returns
+    -------
+    float
+        Eq. (4).
+    array (n,)
+        Eq. (5).
+
+    Raises
+    ------
+    ModelError
+        W has another shape.
+    """
+    error = (free_run(model, transient) - model.operating_point.normalise_x(transient.x))[1:]
+    usable = transient.usable
+    weights = np.ones(model.n) if W is None else np.asarray(W, dtype=np.float64)
+    if weights.shape not in ((model.n,), (len(usable), model.n), (len(usable), model.n, model.n)):
+        raise ModelError(
+            f"W has shape {weights.shape}; it must be ({model.n},), ({len(usable)}, {model.n}) "
+            f"or ({len(usable)}, {model.n}, {model.n})"
+        )
+    diagonal = np.broadcast_to(np.diagonal(weights, axis1=1, axis2=2) if weights.ndim == 3 else weights, error.shape)[
+        usable
+    ]
+    error = error[usable]
+    if weights.ndim == 3:
+        total = float(np.einsum("ki,kij,kj->", error, weights[usable], error))
+    else:
+        total = float(np.sum(diagonal * error**2))
+    largest = np.max(np.sqrt(diagonal) * np.abs(error), axis=0, initial=0.0)
+    return total, largest
+
+
+def recursion(model: Any, dt: float) -> Array:
+    """Matrix that takes [x_k; x_{k-1}; ...] to the next, as far back as the model remembers its states.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    dt : float
+        Δt, s.
+
+    Returns
+    -------
+    array (N, N), or (R, N, N) with a schedule
+        I + Δt A without a memory.
+    """
+    n, scale = model.n, model.operating_point.scale
+    step: Array = np.eye(n) + dt * model.A
+    recalled = [r for r in model.signals.recalled if r.of < n and r.position < n + model.m]
+    longest = max((r.memory.samples for r in recalled), default=0)
+    if not longest or longest > LONGEST_RECURSION // n:
+        return step
+    whole = np.zeros((*step.shape[:-2], n * (longest + 1), n * (longest + 1)))
+    whole[..., :n, :n] = step
+    whole[..., n:, :-n] = np.eye(n * longest)
+    for r in recalled:
+        column = dt * model.B[..., r.position - n] * (scale[r.of] / scale[r.position])
+        column = column / dt if r.memory.kind == "rate" else column
+        past = n * r.memory.samples + r.of
+        if r.memory.kind == "lag":
+            whole[..., :n, past] += column
+        else:
+            whole[..., :n, r.of] += column
+            whole[..., :n, past] -= column
+    return whole
