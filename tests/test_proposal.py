@@ -690,6 +690,25 @@ def trials(path, column, ids, restart=True, rows=60):
     return path
 
 
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_column_that_is_set_now_and_then_is_a_command_if_it_shows(tmp_path, moves):
+    rng = np.random.default_rng(4)
+    valve, level, lines = 0.0, 0.0, ["time,valve,level"]
+    for k in range(600):
+        valve = float(rng.choice([0.0, 0.4, 1.0])) if k % 25 == 0 else valve
+        lines.append(f"{0.1 * k:.1f},{valve},{level:.6f}")
+        level += 0.1 * ((valve if moves else 0.0) - 0.5 * level) + 1e-3 * rng.standard_normal()
+    path = tmp_path / "tank.csv"
+    path.write_text("\n".join(lines) + "\n")
+    proposal = propose([path])
+    commands = [c.path for c in proposal.controls]
+    assert commands == (["valve"] if moves else []), proposal.text
+    assert ("by correlation alone: nothing is called a command here" in proposal.text) == moves
+    if moves:
+        assert [c.path for c in proposal.states] == ["level"]
+        assert fitted([path], proposal).fit_summary["violations"] == 0
+
+
 @pytest.mark.parametrize(
     ("column", "ids", "restart"),
     [("trial", [1, 2, 3], True), ("Run No", [7, 4, 9], False), ("label", ["a", "b", "c"], True)],

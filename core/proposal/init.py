@@ -109,6 +109,7 @@ def propose(
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     commands, measured = assign_roles(sources)
+    sources += [s for s in commands if not any(s is other for other in sources)]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         reasons = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])

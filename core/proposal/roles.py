@@ -13,12 +13,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
+
+import numpy as np
 
 from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.proposal.candidates import Source
 from uncertain_lti.proposal.effects import SHOWS, explained
+from uncertain_lti.recordings.table import TYPE
 
 # Words in the name of a topic or of its type; the last word of a name counts most.
 _COMMAND = re.compile(r"(cmd|command|contr|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory)")
@@ -40,6 +44,10 @@ _ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|me
 
 
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
+
+
+FEWEST_SET, MOST_SET = 3, 0.2
+"""A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
 
 
 _PHYSICAL = re.compile(
@@ -209,6 +217,23 @@ def _topics(sources: Sequence[Source]) -> str:
     return shortlist([s.topic for s in sources], 20)
 
 
+def _held_columns(table: Source) -> Source | None:
+    """Columns of a table that are held, and set now and then, if they show in the next step of the others.
+
+    They leave the table for a topic of their own, whose role is a guess.
+    """
+    if table.type != TYPE:
+        return None
+    changed = {id(c): np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
+    held = [c for c in table.free if FEWEST_SET <= changed[id(c)].sum() <= MOST_SET * len(changed[id(c)])]
+    rest = replace(table, candidates=[c for c in table.candidates if not any(c is other for other in held)])
+    found = replace(table, candidates=held, role="guess")
+    if not held or not rest.free or explained(rest, [found]) <= SHOWS:
+        return None
+    table.candidates = rest.candidates
+    return found
+
+
 def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
     """Which topics are controls, and which may be the state.
 
@@ -248,6 +273,8 @@ def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]
             by_effect.role = "guess"
             controls, states = [by_effect], [s for s in states if s is not by_effect]
             unknown = [s for s in unknown if s is not by_effect]
+    if not controls:
+        controls = [held for source in states if (held := _held_columns(source)) is not None]
     for source in unknown:
         source.reason = "neither state nor control by its name or type"
     return controls, states
