@@ -37,7 +37,8 @@ from detectors import (
 from scipy.stats import chi2
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI
-from uncertain_lti.model.alarm_rule import KINDS, AlarmRule, Rule, StatisticRule, labels
+from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule, labels
+from uncertain_lti.proposal.tune import STATISTICS
 from uncertain_lti.validation.armed import families, quiet
 from uncertain_lti.validation.detectable import COMPARED, detectable, log_sizes
 from uncertain_lti.validation.part import judge
@@ -203,8 +204,6 @@ def armed_together(scores: Sequence[Score], case: Case) -> Score:
 
 # --- what the product chooses ---
 
-SETS = (*((kind,) for kind in KINDS if kind != "ewma"), KINDS)
-"""Statistics that are tried beside containment: one at a time as `tune` does, and all together as `calibrate` does."""
 CASES = 15
 """Onsets of each fault, about."""
 WORTH = 0.02
@@ -238,7 +237,7 @@ def as_tuned(models: Mapping[str, UncertainLTI], case: Case) -> AsTuned:
     for name, model in models.items():
         parts = [judge(model, model, t, t.name) for runs in case.learn for t in runs.transients]
         some = parts[:: max(1, len(parts) // CASES)]
-        for family in families(parts, median_step(case.fitted), SETS):
+        for family in families(parts, median_step(case.fitted), STATISTICS):
             if family.window > 1 and not family.kinds:
                 continue
             rules, _ = quiet(family, model, parts, case.allowed)

@@ -11,6 +11,7 @@
 
     ./run python benchmarks/frozen.py                    # the table of docs/real_machines.md (Markdown)
     ./run python benchmarks/frozen.py --data FOLDER
+    ./run python benchmarks/frozen.py --horizons         # would a repeat be told sooner by bounds over several steps?
 
 Each machine is fitted to some recordings, or every other second of one, and 200 instants of the others, drawn at
 random, hold one state from there on. Instants count at which the machine moves: within one second the true value
@@ -118,14 +119,40 @@ def measure(
     return rows
 
 
+STEPS = {"hunter_se": (5, 10, 25)}
+"""Horizons in steps that are looked at; of the others 2, 5 and 10."""
+
+
+def horizon_widths(case: Case, data: Path) -> list[str]:
+    """One row: the half-width of one step over the range of each state, and those of horizons over that of one step."""
+    fitted, (checked, *_) = of_case(data, case)
+    steps = STEPS.get(case.signals, (2, 5, 10))
+    model, transitions = fit(fitted, horizons=list(steps)), checked.transitions()
+    z, shape = model.normalised_columns(transitions), (model.n, len(transitions.dt))
+    centre, half = np.empty(shape), np.empty(shape)
+    model.columns_centre_and_half(z, transitions.dt, centre, half)
+    one = np.median(half, axis=1)
+    longer = {w.steps: np.median(h, axis=1) / one for w, _, h in model.envelopes(transitions.k, z, transitions.dt)}
+    reach = one * model.operating_point.X / np.ptp(np.vstack([t.x for t in fitted]), axis=0)
+    rows = [reach, *(longer.get(h, np.full(model.n, np.nan)) for h in steps)]
+    return [case.machine, *(", ".join(f"{v:.2f}" for v in row) for row in rows), "/".join(map(str, steps))]
+
+
 def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings")
-    data = parser.parse_args().data
+    parser.add_argument("--horizons", action="store_true", help="compare half-widths over several steps with one step")
+    options = parser.parse_args()
+    data = options.data
     if not data.is_dir():
         print(f"{data}: the recordings are not there; name their folder with --data", file=sys.stderr)
         return 2
+    if options.horizons:
+        slow = [c for c in (*CASES, OTHER_WAY) if not c.signals.startswith("crazyflie")]
+        header = ("machine", "one step over range", "first horizon over one step", "second", "third", "steps")
+        table("Half-widths over several steps, states in turn", header, [horizon_widths(c, data) for c in slow])
+        return 0
     rows = []
     for joint in range(12):
         rows += measure(f"Go2, 500 Hz, joint {joint}", *of_joint(data, joint))
