@@ -639,7 +639,11 @@ def soak(seconds: float, rate: float, n: int, domain: int, armed: bool) -> dict[
             digests, stamps = Path(folder) / "digests.npz", Path(folder) / "stamps.npy"
             hearer = run.part("digest", str(digests)) if armed else run.part("hear", *TOPICS)
             hearer.line()
-            status(run.domain)
+            deadline = time.monotonic() + 60.0  # a topic that is matched late is heard from its middle on
+            heard = [output.name for output in OUTPUTS if output.position or output.name == "violation"]
+            while not all(status(run.domain)["listeners"][name] for name in heard):
+                assert time.monotonic() < deadline, "the monitor does not know who listens"
+                time.sleep(0.2)
             keeps = str(stamps) if armed else ""
             publisher = run.part("publish", str(n), str(rate), str(seconds), str(left), keeps, "hearer")
             publisher.line()

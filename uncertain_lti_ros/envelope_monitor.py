@@ -649,6 +649,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "use_sim_time": self.settings.value("use_sim_time"),
                 "received": {s.topic: s.received for s in self.inputs.values()},
                 "lost": {s.topic: s.lost for s in self.inputs.values()},
+                "listeners": {name: output.listeners for name, output in self.outputs.publishers.items()},
                 "verdicts": session.verdicts if session else 0,
                 "violations": dict(zip(session.model.state_names, session.violations, strict=True)) if session else {},
                 "alarm": session.alarm if session else False,
