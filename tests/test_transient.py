@@ -177,6 +177,8 @@ def test_an_empty_run_and_a_single_sample_have_no_transition() -> None:
         assert len(transient.transitions().k) == len(transient.usable) == len(transient.dt) == 0
         assert transient.statuses() == [Status.FIRST] * count
         assert "0 usable transitions" in repr(transient)
+    one = Transient(np.arange(2.0), np.zeros((2, 1)), np.zeros((2, 1)))
+    assert repr(one).endswith("1 usable transition in 1 segment)")
 
 
 @pytest.mark.parametrize(

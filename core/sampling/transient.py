@@ -295,7 +295,7 @@ class Transient:
         return (
             f"Transient({self.name!r}: {plural(len(self), 'sample')} over {span:g} s, {plural(n, 'state')}, "
             f"{plural(m, 'control')}, "
-            f"{usable} usable transitions in {self.segments} segments)"
+            f"{plural(usable, 'usable transition')} in {plural(self.segments, 'segment')})"
         )
 
     def _repr_html_(self) -> str:
