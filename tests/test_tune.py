@@ -17,7 +17,7 @@ import pytest
 from engine_bag import SIGNALS, engine_bag
 from tanks import Tanks
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, tune
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients, tune
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.proposal import tune as module
@@ -103,12 +103,38 @@ def test_an_interrupted_search_goes_on_and_comes_to_the_same(tuned, runs, faulty
     assert json.dumps(again.model.to_dict()) == json.dumps(tuned.model.to_dict())
 
 
+def test_the_cache_does_not_ask_where_the_signals_file_lies(tmp_path, monkeypatch):
+    """But whether the program is the same."""
+    kept = []
+    for folder in ("here", "there"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "signals.yaml").write_text(SIGNALS)
+        if not kept:
+            engine_bag(tmp_path / "run.mcap", seed=1)
+        runs = read_transients([tmp_path / "run.mcap"], tmp_path / folder / "signals.yaml")
+        kept.append(module._fingerprint(runs, {}, None))
+    assert kept[0] == kept[1] != module._fingerprint(runs, {}, "folder")
+    monkeypatch.setattr(module, "_PACKAGE", tmp_path)
+    (tmp_path / "other.py").write_text("changed = True\n")
+    assert module._fingerprint(runs, {}, None) != kept[0]
+
+
+def test_a_plain_fit_that_is_chosen_is_set_beside_the_best_of_the_others(tuned):
+    search = object.__new__(module._Search)
+    search.trials, search.faulty = [tuned.trials[0], tuned.trials[2], tuned.trials[1]], {}
+    search.plain = search.trials[0]
+    best = min(search.trials[1:], key=search.score)
+    reason = search._reason(search.plain, search.plain)
+    assert f"the best of 2 others, {best.words}, needs {math.exp(search.score(best)):.3g} times" in reason
+
+
 def test_the_budget_ends_it_and_what_was_not_tried_is_named(runs):
     tuned = tune(runs, RATE, budget=1e-6)
     assert len(tuned.trials) == 1 and tuned.chosen is tuned.trials[0]
     assert "(11), noise; alarm 1 of 1" in tuned.not_tried and "no other way could be judged" in tuned.reason
     text = tune_text(tuned.to_dict())
     assert "the budget left no time for" in text and "record next" in text
+    assert f"; and {len(tuned.not_tried) - 3} more" in text and tuned.not_tried[-1] not in text
 
 
 def test_labelled_recordings_count(tuned):

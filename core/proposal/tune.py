@@ -57,6 +57,7 @@ STATISTICS = tuple((kind,) for kind in KINDS if kind != "ewma")
 """Statistics that are tried beside containment, one at a time; a moving average sees what the mean does."""
 UNITS = 6
 """Recordings, groups or blocks below which a choice rests on little."""
+_PACKAGE = Path(__file__).resolve().parents[1]
 MARGIN = 0.02
 """A way must detect faults smaller by this share, on average, to be taken for better than the plain one."""
 
@@ -368,9 +369,11 @@ class _Search:
             others = [t for t in self.trials if not t.refused and t is not self.plain]
             if not others:
                 return "no other way could be judged on left-out data"
+            best = min(others, key=self.score)
+            what = f"the best of {len(others)} others" if len(others) > 1 else "the only other"
             return (
-                "no other way detects smaller faults on left-out data at as many false alarms: the best of "
-                f"{len(others)} others, {best.words}, needs {math.exp(self.score(best)):.3g} times their size"
+                "no other way detects clearly smaller faults on left-out data at as many false alarms: "
+                f"{what}, {best.words}, needs {math.exp(self.score(best)):.3g} times their size"
             )
         text = (
             f"at {plural(chosen.alarms, 'false alarm')} in {chosen.hours:.3g} h left out it detects faults of "
@@ -465,10 +468,13 @@ def _folder(path: str | os.PathLike[str]) -> Path:
 def _fingerprint(
     transients: Sequence[Transient], faulty: Mapping[str, Sequence[Transient]], groups: Sequence[Any] | str | None
 ) -> str:
-    """Of everything that a trial depends on."""
+    """Of everything that a trial depends on: this program, the recordings, and what the signals file says."""
     found = hashlib.sha256(repr(groups).encode())
+    for source in sorted(_PACKAGE.rglob("*.py")):
+        found.update(source.read_bytes())
     for run in [*transients, *(run for label in sorted(faulty) for run in faulty[label])]:
-        found.update(repr((run.name, run.state_names, run.control_names, run.max_gap, run.signals)).encode())
+        signals = None if run.signals is None else replace(run.signals, source="")  # wherever the file lies
+        found.update(repr((run.name, run.state_names, run.control_names, run.max_gap, signals)).encode())
         for array in (run.t_ns, run.x, run.u, run.s):
             found.update(np.ascontiguousarray(array).tobytes())
     return found.hexdigest()

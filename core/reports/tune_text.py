@@ -17,6 +17,8 @@ from typing import Any
 from uncertain_lti.base.english import plural
 from uncertain_lti.reports.tables import number, table
 
+_NAMED = 3  # ways that the budget left out; the model file has all
+
 
 def tune_text(data: Mapping[str, Any]) -> str:
     """Summary of `Tuned.to_dict()` for a person.
@@ -54,9 +56,9 @@ def tune_text(data: Mapping[str, Any]) -> str:
     refused = [t for t in trials if "refused" in t]
     lines += [f"not judged: {t['fit']}: {t['refused']}" for t in refused]
     if data["not_tried"]:
-        lines.append(
-            f"the budget left no time for {plural(len(data['not_tried']), 'way')}: {'; '.join(data['not_tried'])}"
-        )
+        ways = data["not_tried"]
+        more = f"; and {len(ways) - _NAMED} more" if len(ways) > _NAMED else ""
+        lines.append(f"the budget left no time for {plural(len(ways), 'way')}: {'; '.join(ways[:_NAMED])}{more}")
     lines.append(f"chosen: {chosen['fit']}; alarm {chosen['alarm']}")
     lines.append(f"because {data['reason']}")
     lines += [f"record next: {text}" for text in data["record"]]
