@@ -18,14 +18,17 @@ With phi = [x; u; 1], psi = |phi| and the terms of the model side by side (`term
 and a sample is contained if lower <= x_next <= upper. Where the model is scheduled, Theta, Delta and v are first
 blended from its blocks with the weights of the scheduling vector, element by element (`schedule`). Every sum
 goes from the first column to the last, whether one sample is judged or a million, compiled or not, so all of them give
-the same bits.
+the same bits (`sums` of many samples at once, `_Elements` of one in compiled code).
+
+The equations come first. `centre_and_half` is them for many samples, `Judge` for one transition after another, with
+what it says in a `Judgement`, and `Runs` for the states several steps on. They stay in one file, as they are compiled
+together: the equations are inlined into the loops.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Sequence
 from typing import Any
 
 try:
@@ -36,6 +39,7 @@ except ImportError:  # Cython is not needed to run
 import numpy as np
 
 from uncertain_lti.base.compiled import use_twin
+from uncertain_lti.model.sums import blended, ordered_sum
 
 # The functions below are the equations. Uncompiled they take arrays and numbers alike, compiled they take doubles.
 
@@ -397,80 +401,6 @@ def visited(z: Any, least: Any, greatest: Any, occupied: Any) -> Any:
     place = cell_of(z, least, cells_per_unit(least, greatest, cells), cells - 1)
     first, second = pairs_of(z.shape[-1])
     return occupied[np.arange(len(first)), place[..., first], place[..., second]].all(axis=-1)
-
-
-def ordered_sum(weights: Any, values: Any) -> Any:
-    """Sum of weights * values over the first axis, from the first element to the last.
-
-    No BLAS, whose order depends on shapes. Compiled code has the same sum in `_Elements.sum`.
-
-    Parameters
-    ----------
-    weights, values : array (p, ...)
-        That can be multiplied with each other.
-
-    Returns
-    -------
-    array (...)
-        The sum.
-    """
-    products = np.multiply(weights, values, order="C")  # the layout decides the order of the sum
-    return _sum_of_rows(products.shape)(products)
-
-
-@cache
-def _sum_of_rows(shape: tuple[int, ...]) -> Callable[[Any], Any]:
-    """Sum over the first axis, row after row.
-
-    `add.reduce` does it in this order and is several times faster than `add.accumulate`, which is defined to; as its
-    order is nowhere stated, it is tried on this shape first.
-    """
-    rng = np.random.default_rng(0)
-    for _ in range(20):  # where the sums are few, another order may give the same bits by chance
-        rows = rng.normal(size=shape)
-        in_order = rows[0].copy()
-        for row in rows[1:]:
-            in_order += row
-        if np.add.reduce(rows, axis=0).tobytes() != in_order.tobytes():
-            return _accumulated
-    return _reduced
-
-
-def _reduced(rows: Any) -> Any:
-    return np.add.reduce(rows, axis=0)
-
-
-def _accumulated(rows: Any) -> Any:
-    return np.add.accumulate(rows, axis=0)[-1]
-
-
-def blended(blocks: Any, places: Any, weights: Any) -> Any:
-    """Elements of a scheduled model at K samples: Σ_r w_r θ_r over the blocks that hold, in their order.
-
-    Compiled code has the same sum in `_Elements.blend`.
-
-    Parameters
-    ----------
-    blocks : array (R, ...)
-        Elements of each block.
-    places : array of int (C, K)
-        Blocks that hold at each sample (`Schedule.corners`).
-    weights : array (C, K)
-        Their weights.
-
-    Returns
-    -------
-    array (..., K)
-        Elements at each sample.
-    """
-    last = np.ascontiguousarray(np.moveaxis(blocks, 0, -1))
-    total = np.take(last, places[0], axis=-1)
-    total *= weights[0]
-    for place, weight in zip(places[1:], weights[1:], strict=True):
-        part = np.take(last, place, axis=-1)
-        part *= weight
-        total += part
-    return total
 
 
 def centre_and_half(

@@ -36,7 +36,6 @@ from uncertain_lti.model.alarm_rule import (
 from uncertain_lti.model.bounds import (
     Judge,
     Runs,
-    blended,
     centre_and_half,
     contained,
     lower_of,
@@ -53,6 +52,7 @@ from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature, checked_signatures
+from uncertain_lti.model.sums import blended
 from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.signals.signal_map import Signal, SignalMap
