@@ -46,6 +46,8 @@ from uncertain_lti.validation.part import judge
 CONFIDENCE = 0.9
 OURS = "ours"
 """Names of this project's rules begin with it."""
+SEVERAL = ("armed together", "as tuned")
+"""How the names of several rules at once end."""
 
 # --- thresholds, delays ---
 
@@ -220,13 +222,18 @@ class AsTuned:
         The largest of what each of its rules compares with its threshold, over that.
     text : str
         What was chosen, and of what.
+    rules : tuple of Rule
+        What was chosen, with thresholds.
     """
 
     score: Score
     text: str
+    rules: tuple[Rule, ...]
 
 
-def as_tuned(models: Mapping[str, UncertainLTI], case: Case) -> AsTuned:
+def as_tuned(
+    models: Mapping[str, UncertainLTI], case: Case, statistics: Sequence[tuple[str, ...]] = STATISTICS
+) -> AsTuned:
     """The model and the family of rules with the smallest detectable faults, as `tune` looks for them.
 
     Thresholds are the smallest at which `case.learn` raises as many alarms as may be; faults are injected into
@@ -237,7 +244,7 @@ def as_tuned(models: Mapping[str, UncertainLTI], case: Case) -> AsTuned:
     for name, model in models.items():
         parts = [judge(model, model, t, t.name) for runs in case.learn for t in runs.transients]
         some = parts[:: max(1, len(parts) // CASES)]
-        for family in families(parts, median_step(case.fitted), STATISTICS):
+        for family in families(parts, median_step(case.fitted), statistics):
             if family.window > 1 and not family.kinds:
                 continue
             rules, _ = quiet(family, model, parts, case.allowed)
@@ -274,7 +281,7 @@ def as_tuned(models: Mapping[str, UncertainLTI], case: Case) -> AsTuned:
         f"As tuned: of {len(found)} ways, {words}, which sees {', '.join(COMPARED)} of {size:.3g} of the largest tried "
         f"within {case.within:g} s on the recordings that thresholds are learnt from.\n"
     )
-    return AsTuned(once, text)
+    return AsTuned(once, text, rules)
 
 
 # --- other detectors ---

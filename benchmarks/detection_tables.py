@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from detection_cases import HORIZONS, Case
-from detection_procedure import CONFIDENCE, OURS, Kind, Outcome, evaluate
+from detection_procedure import CONFIDENCE, OURS, SEVERAL, Kind, Outcome, evaluate
 from detectors import Array, Score
 from scipy.stats import beta
 
@@ -145,6 +145,11 @@ def judged(case: Case, detectors: Mapping[str, Score]) -> Report:
     for name, score in detectors.items():
         outcomes[name] = evaluate(case, score)
         print(f"{case.title}: {name}: {outcomes[name].share():.3f}", file=sys.stderr, flush=True)
+    return reported(case, outcomes)
+
+
+def reported(case: Case, outcomes: dict[str, Outcome]) -> Report:
+    """The tables of what every detector came to."""
     learnt = sum(len(runs.x) for runs in case.learn)
     exposure = f"{case.exposure:.3g} h" if case.unit == "per hour" else f"{100 * case.exposure:.0f} recordings"
     unit = "s" if case.second == 1.0 else "µs"
@@ -175,23 +180,23 @@ def numbers_of(o: Outcome) -> dict[str, Any]:
 def beside_the_best(case: Case, outcomes: Mapping[str, Outcome]) -> str:
     """Delay of our best rule over that of the best other detector, for every fault, over the same recordings."""
     rng, rows = np.random.default_rng(0), []
-    together = next((name for name in outcomes if name.endswith("armed together")), "")
+    further = [name for name in outcomes if name.endswith(SEVERAL)]
     for label in case.faulty:
 
         def order(name: str, label: str = label) -> tuple[float, float]:
             delays = outcomes[name].delays[label]
             return -float(np.isfinite(delays).mean()), float(np.median(delays))
 
-        mine = min((n for n in outcomes if n.startswith(OURS + ",")), key=order)
+        mine = min((n for n in outcomes if n.startswith(OURS + ",") and n not in further), key=order)
         cells = [label, mine, delay_text(outcomes[mine].delays[label], case.second)]
         for begins in ("least squares", ""):
             peer = min((n for n in outcomes if n.startswith(begins) and not n.startswith("our")), key=order)
             cells += [peer, delay_text(outcomes[peer].delays[label], case.second)]
-            for name in filter(None, (mine, together)):
+            for name in (mine, *further):
                 ratio, low, high = later(outcomes[name].delays[label], outcomes[peer].delays[label], rng)
                 cells.append(f"{ratio:.2f} ({low:.2f} to {high:.2f})")
         rows.append(cells)
-    ratios = ["ratio", "ratio, armed together"] if together else ["ratio"]
+    ratios = ["ratio", *(f"ratio, {name.split(', ')[-1]}" for name in further)]
     header = [
         "fault", "our best rule", "delay", "best on least squares", "delay", *ratios,
         "best of all others", "delay", *ratios,

@@ -9,13 +9,15 @@
 
 """The benchmark of detection: scores are those of the monitor's alarm, thresholds let through what they are to."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("scipy", reason="scipy, which the benchmark needs, is not installed")
 
 from detection_cases import Case, Faulty, Recorded, from_whole_degrees, profile
-from detection_procedure import Kind, evaluate, our_rules, threshold_of
+from detection_procedure import Kind, as_tuned, evaluate, our_rules, threshold_of
 from detectors import Kalman, LeastSquares, Runs, Statistic, cusum, of_window, residual_detectors
 from tanks import Tanks
 from temporal_logic import arrivals, formula_of, gathered, verdicts
@@ -87,6 +89,20 @@ def test_a_threshold_lets_as_many_recordings_through_as_it_may(case):
             assert delay == (
                 pytest.approx(t.t[faulty.first + after[0]] - t.t[faulty.first - 1]) if len(after) else np.inf
             )
+
+
+def test_what_is_tuned_keeps_to_the_alarms_allowed_and_is_the_monitors_alarm(case):
+    transients = [t for runs in case.fitted for t in runs.transients]
+    model = fit(transients, additive="both", horizons=[5], widths="growing", operating_point=POINT)
+    tuned = as_tuned({"ours, 1 knot": model}, replace(case, within=1.0), [("energy",)])
+    monitor = EnvelopeMonitor(model, rules=tuned.rules)
+    alarmed = [monitor.check(t).alarm for runs in case.learn for t in runs.transients]
+    assert sum(a.any() for a in alarmed) <= case.allowed
+    (faulty,) = case.faulty.values()
+    for t, row in zip(faulty.runs.transients, tuned.score(faulty.runs), strict=True):
+        raised = monitor.check(t).alarm
+        assert raised.any() and np.array_equal(raised, row > 1.0)
+    assert "1 knot" in tuned.text
 
 
 def test_the_peers_are_what_their_names_say():
