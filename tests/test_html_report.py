@@ -94,6 +94,7 @@ def test_the_page_answers_first(engine, tmp_path, capsys):
     first = text.index("May I rely on it?"), text.index("What happened?")
     assert max(first) < text.index("Violated shares") and "has not been validated" in text
     assert "bad.mcap" in text and "2.5" in text and "fan (" in text
+    assert text.index("states (violations,") < text.index("last [s]"), "a phone shows the first columns"
     assert out.stat().st_size < 3_000_000
     assert list(tmp_path.iterdir()) == [out]
 

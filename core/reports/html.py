@@ -342,17 +342,17 @@ def _episodes(facts: Mapping[str, Any]) -> str:
         rows.append(
             [
                 f"{e['first']['t']:.4f}",
-                f"{e['last']['t']:.4f}",
+                _text(shortlist(listed, 4)),  # early, where a phone shows it without scrolling
                 str(e["verdicts_violated"]),
                 "yes" if e["alarm"] else "",
-                _text(shortlist(listed, 4)),
+                f"{e['last']['t']:.4f}",
             ]
         )
-    header = ("first [s]", "last [s]", "violated", "alarm", "states (violations, worst utilisation)")
+    header = ("first [s]", "states (violations, worst utilisation)", "violated", "alarm", "last [s]")
     text = f"<p>Episodes (violations with fewer than {APART} verdicts between them): {facts['episode_count']}.</p>"
     if facts["episode_count"] > _MOST_EPISODES:
         text += f'<p class="soft">The first {_MOST_EPISODES}; <code>--json</code> has more.</p>'
-    return text + _table(header, rows, left=(4,))
+    return text + _table(header, rows, left=(1,))
 
 
 def _utilisation(state: Mapping[str, Any]) -> str:
