@@ -10,6 +10,7 @@
 """What a schedule is worth, and where it must not be chosen: one knot and more, on the same recordings in one run.
 
     ./run python benchmarks/regimes.py turbofan       # envelopes and faults on manoeuvres that were not fitted
+    ./run python benchmarks/regimes.py profiles       # how many recordings three knots need, and what auto takes
     ./run python benchmarks/regimes.py paper          # the paper's check, from pulses at three power levels
     ./run python benchmarks/regimes.py coil           # a saturating coil, against PARC, jax-sysid and quantile regions
     ./run python benchmarks/regimes.py bags           # the three shipped noisy recordings: one knot is right
@@ -46,6 +47,7 @@ from typing import Any
 
 import numpy as np
 from measure import table
+from scipy.optimize import linprog
 from shared_recordings import crazypad_labels, read_shared
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
@@ -225,7 +227,7 @@ def turbofan(keep: Path | None) -> None:
                 [
                     *first,
                     str(left_outside(model, fitted)),
-                    " ".join(f"{1e4 * h:.1f}" for h in half),
+                    halves_text(half),
                     " ".join(f"{r:.2f}" for r in (half / single[criterion])[2:]),
                     *(f"{j.inside_all:.2%}" for j in seen),
                     f"{seconds:.1f} s",
@@ -273,9 +275,75 @@ def turbofan(keep: Path | None) -> None:
         ["criterion", "knots", "violated before", *(f.replace("_", " ") for f in FAULTS)],
         faults,
     )
-    alone = " ".join(f"{1e4 * h:.1f}" for h in noise_alone(fitted))
-    print(f"Noise alone, as many samples, asks for half-widths of {alone}")
+    print(f"Noise alone, as many samples, asks for half-widths of {halves_text(noise_alone(fitted))}")
     print("\n".join(notes))
+
+
+def profiles(keep: Path | None) -> None:
+    """How the envelopes and what is inside of them change with the number of fitted lever profiles."""
+    most = max(AMOUNTS)
+    fitted_runs = [*pulses(NOISE), *(moved(lever_moves(58.0, 1 + i), LONG, 300 + i) for i in range(most))]
+    tested_runs = [moved(m, SHORT_RUN, 400 + i) for i, m in enumerate(TESTED_MOVES.values())]
+    every = simulated([*fitted_runs, *tested_runs], keep)
+    tested, rows, notes = every[len(fitted_runs) :], [], []
+    for count in AMOUNTS:
+        fitted = every[: 2 + count]
+        size = f"{sum(len(t) - 1 for t in fitted)}"
+        around = around_least_squares(fitted, tested)
+        noise = noise_alone(fitted)
+        rows.append([str(count), size, "least squares", "1", "", halves_text(around), "", "", *[""] * len(tested)])
+        rows.append([str(count), size, "noise alone", "", "", halves_text(noise), "", "", *[""] * len(tested)])
+        for criterion, name in CRITERIA.items():
+            single = None
+            for knots in KNOTS if count == most else [k for k in KNOTS if k in (1, 2, 3)]:
+                model = scheduled(fitted, criterion, "fan_speed", knots, "both")
+                seen = [judge(model, t) for t in tested]
+                half = np.vstack([j.half[j.judged] for j in seen]).mean(axis=0)
+                single = half if single is None else single
+                ratios = (" ".join(f"{r:.2f}" for r in (half / base)[2:]) for base in (single, around))
+                inside = (f"{j.inside_all:.2%}" for j in seen)
+                rows.append(
+                    [str(count), size, name, str(knots), knots_text(model), halves_text(half), *ratios, *inside]
+                )
+                if knots == "auto":
+                    notes += [f"{name}, {count} profiles, auto took {knots_text(model)}", why(model)]
+    header = [
+        "profiles",
+        "transitions",
+        "centre",
+        "asked",
+        "knots",
+        "half-widths",
+        "over one knot's",
+        "over least squares'",
+    ]
+    table("Two pulse runs and so many lever profiles; judged on six other manoeuvres", [*header, *TESTED_MOVES], rows)
+    print("\n".join(notes))
+
+
+AMOUNTS = (6, 12, 24, 36)
+
+
+def halves_text(half: Array) -> str:
+    """Half-widths in 1e-4 of the scale."""
+    return " ".join(f"{1e4 * h:.1f}" for h in half)
+
+
+def around_least_squares(fitted: Sequence[Transient], tested: Sequence[Transient]) -> Array:
+    """Mean half-widths on tested runs: all of fitted inside, of least mean width, around least squares."""
+    point = fit(fitted, additive="both").operating_point
+
+    def regressors(transients: Sequence[Transient]) -> tuple[Array, Array, Array]:
+        steps = [t.transitions() for t in transients]
+        x, u, x_next = (np.concatenate([getattr(s, name) for s in steps]) for name in ("x", "u", "x_next"))
+        z, dt = np.hstack([point.normalise_x(x), point.normalise_u(u)]), np.concatenate([s.dt for s in steps])[:, None]
+        psi = np.column_stack([dt * np.abs(z), dt, np.ones(len(z))])
+        return dt * np.column_stack([z, np.ones(len(z))]), psi, (x_next - x) / point.X
+
+    phi, psi, step = regressors(fitted)
+    left = np.abs(step - phi @ np.linalg.lstsq(phi, step, rcond=None)[0])
+    mean, there = psi.mean(axis=0), regressors(tested)[1].mean(axis=0)
+    return np.array([there @ linprog(mean, -psi, -r, method="highs").x for r in left.T])
 
 
 def noise_alone(transients: Sequence[Transient]) -> Array:
@@ -631,8 +699,8 @@ def live(keep: Path | None) -> None:
 
 LIVE_KNOTS = (1, 2, 3, 5, 12)
 PARTS: dict[str, Callable[[Path | None], None]] = {
-    "turbofan": turbofan, "paper": paper, "bags": bags, "gas-turbine": gas_turbine, "linear": linear, "minute": minute,
-    "live": live,
+    "turbofan": turbofan, "profiles": profiles, "paper": paper, "bags": bags, "gas-turbine": gas_turbine,
+    "linear": linear, "minute": minute, "live": live,
 }  # fmt: skip
 
 

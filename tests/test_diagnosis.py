@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from uncertain_lti import OperatingPoint, SignalMap, Transient, fit
+from uncertain_lti.identification import discard
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.signals.signal_map import Signal
 
@@ -322,6 +323,14 @@ def spiked(at, size=0.5):
         return x, u
 
     return change
+
+
+@pytest.mark.parametrize(("knots", "sought"), [(2, True), (9, False)])
+def test_few_samples_are_not_sought_where_that_would_take_minutes(monkeypatch, knots, sought):
+    asked = []
+    monkeypatch.setattr(discard, "_greedy", lambda *of: asked.append(of) or iter(()))
+    fit(run(), additive="noise", schedule={"speed": knots}, seek_carriers=True)
+    assert bool(asked) == sought
 
 
 @pytest.mark.parametrize("at", [(400,), (400, 900), (400, 700, 701, 1100)])

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients, validate
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.html_table import MOST
+from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.reports import figures
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -358,7 +359,8 @@ def test_a_scheduled_model_is_one_system_per_block_and_one_at_a_point():
 
 @pytest.mark.parametrize(("axes", "further", "n", "m"), SCHEDULES)
 def test_a_scheduled_model_comes_back_from_matlab(axes, further, n, m, tmp_path):
-    model = scheduled_model(axes, further, n, m)
+    repeats = Repeats(*np.random.default_rng(5).random((4, n)))
+    model = scheduled_model(axes, further, n, m).replace(repeats=repeats)
     path = tmp_path / "m.mat"
     model.save_mat(path)
     assert UncertainLTI.load_mat(path).to_dict() == model.to_dict()

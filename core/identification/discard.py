@@ -31,8 +31,8 @@ FEW, FEW_SHARE = 12, 0.005
 """Largest number of transitions, and largest share of all, that count as few."""
 MUCH, ENOUGH = 2.0, 1.2
 """Mean width with the few over that without them, from which on they are worth a word; what is left of the latter."""
-LARGEST, MOST_ELEMENTS = 200_000, 300
-"""Transitions, and elements of A and B, up to which the few are sought: some seconds."""
+LARGEST, MOST_ELEMENTS, LONGEST_ROW = 200_000, 300, 32
+"""Transitions, elements of A and B of all blocks, and those of a row, up to which the few are sought: some seconds."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,9 @@ def carriers(problem: Problem, structure: Structure | None) -> Carriers | None:
         The carriers, or None.
     """
     budget = min(FEW, int(FEW_SHARE * problem.N))
-    if not budget or problem.N > LARGEST or problem.n * problem.p > MOST_ELEMENTS or problem.weights.ndim == 3:
+    row = problem.p * problem.columns.count
+    large = problem.N > LARGEST or problem.n * row > MOST_ELEMENTS or row > LONGEST_ROW
+    if not budget or large or problem.weights.ndim == 3:
         return None
     engine = WorkingSet(Fleet([problem]), structure)
     chosen: list[int] = []

@@ -344,7 +344,8 @@ def _scheduled(model_class: Any, data: dict[str, Any], whole: Any, path: str | o
         model = model_class.from_dict(whole, source=os.fspath(path))
         if [axis.signal for axis in model.schedule.axes] != names:
             raise ModelError("'schedule_signals' are not those of 'model_json'")
-        return model.replace(schedule=_changed(model, kinds, values))
+        changed = _changed(model, kinds, values)
+        return model if changed == model.schedule else model.replace(schedule=changed)
     signals = SignalMap(
         _signals(data, "state", "x", n, path),
         _signals(data, "control", "u", sizes["u"], path),
