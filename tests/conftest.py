@@ -27,7 +27,7 @@ settings.load_profile("here")
 
 # No test is heard beyond this machine, whoever started it. The number of the domain is for each test to take.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_DOMAIN_ID"] = "101"  # of what takes none; `own_domain` gives those below
+os.environ["ROS_DOMAIN_ID"] = "101"  # of what takes none; `own_domain` gives others
 for name in ("ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER"):
     os.environ.pop(name, None)
 

@@ -37,7 +37,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-PATIENCE = 60.0  # s; costs nothing where all is well
+PATIENCE = 300.0  # s; costs nothing where all is well
 MONITOR = "/envelope_monitor"
 _COMMANDS = """
 import argparse, sys
@@ -252,7 +252,7 @@ class World:
         number, goal = _TRANSITIONS[label]
         request = ChangeState.Request(transition=Transition(id=number))
         try:
-            return bool(self.call(ChangeState, f"{name}/change_state", request, patience=PATIENCE / 3).success)
+            return bool(self.call(ChangeState, f"{name}/change_state", request, patience=20.0).success)
         except AssertionError:
             if self.state(name) == goal:
                 return True

@@ -313,14 +313,14 @@ def test_a_record_that_lies_about_its_length_costs_one_chunk(compression: str, l
 
 @contextlib.contextmanager
 def bounded(seconds: float, memory: int) -> Iterator[None]:
-    begin = time.monotonic()
+    begin = time.process_time()
     tracemalloc.start()
     try:
         yield
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert time.monotonic() - begin < seconds
+    assert time.process_time() - begin < seconds
     assert peak < memory
 
 
@@ -443,7 +443,7 @@ def test_fuzzed_files_give_a_reading_or_one_sentence(layout: Layout, tmp_path: P
     readings = 0
     for _ in range(120):
         path.write_bytes(mutate(original, dice))
-        begin = time.monotonic()
+        begin = time.process_time()
         try:
             bag = Bag(path)
             times = [raw.log_time_ns for raw in bag.raw_messages()]
@@ -456,7 +456,7 @@ def test_fuzzed_files_give_a_reading_or_one_sentence(layout: Layout, tmp_path: P
         except BagError as error:
             sentences = [str(error)]
         assert all("\n" not in sentence and str(path) in sentence for sentence in sentences)
-        assert time.monotonic() - begin < 5
+        assert time.process_time() - begin < 5
     assert readings > 30
 
 
@@ -1068,12 +1068,12 @@ def test_mutated_real_recordings(name: str, tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     for _ in range(60):
         path.write_bytes(mutate(original, dice))
-        begin = time.monotonic()
+        begin = time.process_time()
         with contextlib.suppress(BagError):
             bag = Bag(path)
             bag.facts()
             list(bag.messages([topic for topic, info in bag.topics.items() if info.readable]))
-        assert time.monotonic() - begin < 20
+        assert time.process_time() - begin < 20
 
 
 def test_checksums_are_those_of_the_format() -> None:

@@ -62,6 +62,21 @@ def stopped(messages: list[Message], begin: float, chunk: int, first: str) -> li
     return perturbed.stopped(messages, begin, chunk, first, STOPPED)
 
 
+def in_parts(messages: list[Message]) -> list[Message]:
+    """A stop, then what came meanwhile in three parts 0.12 s apart: at the beginning of the third topics are level."""
+    end = 5.01 + STOPPED
+    late = [m for m in stopped(messages, 5.01, 1, STATE_TOPIC) if end <= m[0] < end + 0.02]  # a state, its control, ...
+    parts = [late[:120], late[120:160], late[160:162], late[162:]]
+    come = []
+    for part, at in zip(parts, (0.0, 0.12, 0.24, 0.2401), strict=True):
+        for k, (before, topic, log_time, data) in enumerate(sorted(part, key=lambda m: m[1] != STATE_TOPIC)):
+            now = end + at + 1e-5 * k
+            come.append((now, topic, log_time + round((now - before) * 1e9), data))
+    rest = [m for m in messages if not 5.01 <= m[0] < end + 0.02]
+    rest = [(at if at < end else max(at, come[-1][0]), *message) for at, *message in rest]
+    return sorted([*come, *rest], key=lambda m: m[0])
+
+
 DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
     "on time": lambda m: m,
     "controls come 0.6 s after the states": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 0.6),
@@ -71,6 +86,7 @@ DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
     "stopped, then topic by topic": lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC),
     "stopped, then in chunks": lambda m: stopped(m, 5.01, 16, STATE_TOPIC),
     "stopped, then in chunks, controls first": lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC),
+    "stopped, then in parts": in_parts,
     "stopped, and controls 3 s later": lambda m: held_up(stopped(m, 5.01, 16, STATE_TOPIC), CONTROL_TOPIC, 5.01, 12.0),
 }
 

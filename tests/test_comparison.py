@@ -80,7 +80,7 @@ def test_with_additive_terms_the_objective_is_never_above_that_of_simpler_models
 def test_the_benchmark_runs_and_says_what_it_leaves_out():
     command = [sys.executable, str(ROOT / "benchmarks" / "comparison.py"), "--quick", "--peers", "/nonexistent/python"]
     command += ["--only", "Three tanks, 20"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1500)
     assert done.returncode == 0, done.stderr
     assert "PyIPM is not compared: it is not installed" in done.stdout
     assert "### Three tanks, 20 transients, noise 1e-3" in done.stdout

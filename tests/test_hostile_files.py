@@ -83,7 +83,7 @@ resource.setrlimit(resource.RLIMIT_CPU, ({seconds}, {seconds}))
 sys.exit(main(sys.argv[1:]))
 """
     return subprocess.run(
-        [sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True, timeout=1200
     )
 
 

@@ -149,7 +149,7 @@ def test_under_every_disorder_the_verdicts_are_those_of_the_offline_check(world:
     assert {v.status for v in verdicts} >= {Status.OK, Status.MISSING, Status.GAP, Status.RESET}
     process = world.monitor(path)
     outputs = Outputs.of(world)
-    world.command("play", bag, "--rate", 2).succeed(60)
+    world.command("play", bag, "--rate", 2).succeed()
     outputs.hold_against(verdicts, ("a", "b"))
     status = world.status()
     assert status["counters"]["gaps"] == sum(v.status is Status.GAP for v in verdicts) > 0
@@ -168,7 +168,7 @@ def test_stamps_from_the_future_are_counted_and_told(world: World, tmp_path: Pat
     assert world.status()["future"] == {}
     plant.t_ns = time.time_ns() + 3600 * 10**9
     plant.send(3)
-    until(lambda: ever(diagnostics, WARN, "lie over 1 s in the future"), "a warning", 5)
+    until(lambda: ever(diagnostics, WARN, "lie over 1 s in the future"), "a warning")
     assert world.status()["future"] == {STATE: 3, CONTROL: 3}
     plant.t_ns = EPOCH_NS
     plant.send(3)
@@ -194,10 +194,10 @@ def test_mutated_messages_do_no_harm(world: World, tmp_path: Path) -> None:
         time.sleep(0.002)
     until(lambda: world.status()["received"].get(STATE) == 400, "all of them")
     assert sum(world.status()["unreadable"].values()) > 50
-    until(lambda: ever(diagnostics, STALE, f"{STATE}: a message cannot be decoded"), "a word on them", 10)
+    until(lambda: ever(diagnostics, STALE, f"{STATE}: a message cannot be decoded"), "a word on them")
     plant.state.publish(JointState(name=["a", "b"], position=[0.0] * 100_000))
     until(lambda: world.status()["received"].get(STATE) == 401, "the huge one")
-    until(lambda: ever(diagnostics, STALE, "more than parameter largest_message allows"), "a word on it", 10)
+    until(lambda: ever(diagnostics, STALE, "more than parameter largest_message allows"), "a word on it")
     plant.t_ns = EPOCH_NS + 10**12  # later than whatever stamp got through, or a step back: a new segment either way
     heard = len(flags.messages)
     plant.send(6)
@@ -244,7 +244,7 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
         message.vector.x, message.vector.y = float(u[0]), float(u[1])
         plant.control.publish(message)
         time.sleep(0.01)
-    status = diagnostics.reaches(STALE, saying=f"no message on {STATE} for", patience=20, since=before)
+    status = diagnostics.reaches(STALE, saying=f"no message on {STATE} for", since=before)
     values = Diagnostics.values(status)
     assert float(values[f"age {CONTROL}"]) < 0.4 <= float(values[f"age {STATE}"])
     assert len(flags.messages) == 10 and violation.messages[-1].data is False
@@ -260,8 +260,8 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
     got = np.isnan([m.position[0] for m in flags.count(95)[15:]])
     held = np.flatnonzero(got)[0]
     assert 49 <= held <= 52 and got[held:].all(), held
-    until(lambda: ever(diagnostics, ERROR, "a signal is missing, stale or not finite"), "a report of it", 20)
-    values = Diagnostics.values(diagnostics.reaches(STALE, patience=20))
+    until(lambda: ever(diagnostics, ERROR, "a signal is missing, stale or not finite"), "a report of it")
+    values = Diagnostics.values(diagnostics.reaches(STALE))
     assert float(values[f"age {CONTROL}"]) > 0.5 and int(values["stale p"]) > 20
 
 
@@ -273,7 +273,7 @@ def test_missed_deadlines_are_told(world: World, tmp_path: Path) -> None:
     world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
     diagnostics = world.diagnostics()
     plant.subscribed().send(5)
-    status = diagnostics.reaches(WARN, saying=f"{STATE}: ", patience=20)
+    status = diagnostics.reaches(WARN, saying=f"{STATE}: ")
     assert "deadlines missed by its publishers" in status.message
 
 
@@ -295,7 +295,7 @@ def test_a_publisher_that_is_killed_and_comes_back_causes_no_wrong_verdict(world
     time.sleep(0.3)
     heard = len(flags.messages)
     np.testing.assert_array_equal([m.position for m in flags.messages], [v.flags for v in once[:heard]])
-    world.command("play", bag).succeed(60)
+    world.command("play", bag).succeed()
     again = flags.count(heard + len(once))[heard:]
     np.testing.assert_array_equal([m.position for m in again], [v.flags for v in once])
 
@@ -369,7 +369,7 @@ sys.exit(envelope_monitor.main())
     got = [m.position[0] for m in flags.count(36)]
     assert np.isnan(got).sum() == 4  # the first, and the first after each that was lost; nothing was called contained
     assert not any(value == 1.0 for value in got)
-    status = diagnostics.reaches(STALE, saying="unexpected errors, the last", patience=20)
+    status = diagnostics.reaches(STALE, saying="unexpected errors, the last")
     until(lambda: world.status()["unexpected_errors"] > 10, "errors of the timer")
     assert int(Diagnostics.values(status)["unexpected errors"]) >= 4
     assert "ZeroDivisionError: every tenth" in process.output
@@ -384,7 +384,7 @@ def test_memory_stays_flat_and_every_sample_is_accounted_for() -> None:
     command = [sys.executable, str(ROOT / "benchmarks" / "live_monitor.py"), *soak]
     with own_domain() as domain:
         command += ["--domain", str(domain)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0 and "counters exact" in done.stdout, done.stdout + done.stderr
     assert "live is offline" in done.stdout and ", 0 alarms" not in done.stdout
 
@@ -405,7 +405,7 @@ def test_masks_grace_latch_and_reset(world: World, tmp_path: Path) -> None:
     plant.send(1)
     assert [list(m.position) for m in flags.count(5)[1:]] == [[0, 0], [0, 1], [0, 1], [0, 1]]
     assert not any(m.data for m in violation.messages)
-    status = diagnostics.reaches(OK, saying="masked: b", patience=20)
+    status = diagnostics.reaches(OK, saying="masked: b")
     assert diagnostics.latest("envelope_monitor: b").message.endswith("(masked)")
     plant.send(1, off=2.0)
     plant.send(5)
@@ -413,13 +413,13 @@ def test_masks_grace_latch_and_reset(world: World, tmp_path: Path) -> None:
     flags.count(11)
     time.sleep(0.3)
     assert [m.position[0] for m in flags.messages[-4:]] == [0, 0, 0, 0] and violation.messages[-1].data, "not latched"
-    status = diagnostics.reaches(ERROR, saying="latched until ~/reset", patience=20)
+    status = diagnostics.reaches(ERROR, saying="latched until ~/reset")
     assert Diagnostics.values(status)["latched"] == "1"
     success, message = trigger(world, "reset")
     assert success and message == "the alarm is reset"
     until(lambda: not violation.messages[-1].data, "the end of the alarm")
     plant.send(3)
-    diagnostics.reaches(OK, patience=20)
+    diagnostics.reaches(OK)
     assert trigger(world, "reset")[0]
 
     for wrong, why in (("c", "masked state 'c' is not in the model"), ("a, b", "every state of the model is masked")):
@@ -445,7 +445,7 @@ def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Pat
     plant = Plant(world, model).subscribed()
     plant.send(5, off=2.0)
     assert [m.position[0] for m in flags.count(5)[2:]] == [1, 1, 1]
-    diagnostics.reaches(WARN, saying="alarms are off: it is not known whether /machine/mode data == 3", patience=20)
+    diagnostics.reaches(WARN, saying="alarms are off: it is not known whether /machine/mode data == 3")
     assert world.status()["armed"] is None
     lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     mode = world.publisher(UInt8, "/machine/mode", lasting)  # its type is found in the graph
@@ -453,7 +453,7 @@ def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Pat
     until(lambda: world.status()["armed"] is False, "the mode")
     plant.send(5, off=2.0)
     flags.count(10)
-    diagnostics.reaches(WARN, name="envelope_monitor: a", saying="outside its bounds", patience=20)
+    diagnostics.reaches(WARN, name="envelope_monitor: a", saying="outside its bounds")
     assert not any(m.data for m in violation.messages)
     mode.publish(UInt8(data=3))
     until(lambda: world.status()["armed"], "the mode")
@@ -603,7 +603,7 @@ def test_an_alarm_takes_a_snapshot_when_asked_to(world: World, tmp_path: Path) -
     plant.send(1, off=2.0)
     plant.send(10)
     flags.count(21)
-    (found,) = until(lambda: list(folder.glob("*.mcap")), "the file", 5)
+    (found,) = until(lambda: list(folder.glob("*.mcap")), "the file")
     verdicts = offline(path, found)
     assert sum(bool((v.flags == 1.0).any()) for v in verdicts) == 1
     assert len(verdicts) > 13, "what came after the alarm is there as well"
@@ -633,13 +633,13 @@ def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(world
         plant.send(1, off=2.0)
         plant.send(3)
     flags.count(320 + 8 * 4)
-    (found,) = until(lambda: list(folder.glob("*.mcap")), "the file", 5)
+    (found,) = until(lambda: list(folder.glob("*.mcap")), "the file")
     verdicts = offline(path, found)
     assert len(verdicts) < 300 and sum(not v.judged for v in verdicts) == 1 and any(v.violated for v in verdicts)
     assert world.status()["snapshot"] == str(found), "one file as long as the alarm keeps coming back"
     time.sleep(1.2)
     plant.send(3, off=2.0)
-    until(lambda: len(list(folder.glob("*.mcap"))) == 2, "another after a while without", 5)
+    until(lambda: len(list(folder.glob("*.mcap"))) == 2, "another after a while without")
 
 
 def test_without_a_folder_there_are_no_snapshots(world: World, tmp_path: Path) -> None:
@@ -679,7 +679,7 @@ def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) 
     outside.write_bytes(b"of someone else")
     written = []
     for _ in range(8):
-        said = album.take(scene(30_000), patience=10.0)
+        said = album.take(scene(30_000), patience=300.0)
         written.append(Path(said.removeprefix("wrote ")))
         assert written[-1].parent == folder and written[-1].is_file()
         mine = [p for p in folder.iterdir() if not p.name.startswith("foreign")]
@@ -689,7 +689,7 @@ def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) 
     # a link that bears the name of a snapshot leads elsewhere, and is left alone
     (folder / written[0].name).symlink_to(outside)
     with pytest.raises(ModelError, match=r"more than snapshot.megabytes allows"):
-        album.take(scene(150_000), patience=10.0)
-    album.take(scene(30_000), patience=10.0)
+        album.take(scene(150_000), patience=300.0)
+    album.take(scene(30_000), patience=300.0)
     assert outside.read_bytes() == b"of someone else" and (folder / written[0].name).is_symlink()
     assert not list(tmp_path.rglob("*.part"))

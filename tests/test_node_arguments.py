@@ -39,7 +39,7 @@ def start(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
             [sys.executable, "-c", code, *arguments],
             env=os.environ
             | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(tmp_path / "log"), **environment},
-            cwd=tmp_path, capture_output=True, text=True, timeout=60,
+            cwd=tmp_path, capture_output=True, text=True, timeout=1200,
         )  # fmt: skip
 
     return call

@@ -392,7 +392,7 @@ def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
     player = world.command("play", bag)
     heard.count(3)
     player.signal(signal.SIGINT)
-    assert player.wait(5) == 130
+    assert player.wait() == 130
     assert re.fullmatch(r"\S+in.mcap: played \d+ messages of 1 topics in \S+ s, then interrupted\n", player.output)
 
 
@@ -400,15 +400,15 @@ def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
 @pytest.mark.parametrize("more", [[], ["--lockstep", "nobody"]], ids=["subscribers", "the node"])
 def test_a_signal_ends_waiting_at_once(world: World, tmp_path: Path, more: list[str], number: int, status: int) -> None:
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 10**8))).save(tmp_path / "in.mcap")
-    until = time.monotonic() + 20
-    player = world.command("play", bag, "--wait", "60", *more)
+    until = time.monotonic() + PATIENCE
+    player = world.command("play", bag, "--wait", "600", *more)
     while not any("player" in name for name in world.node.get_node_names()):
         assert time.monotonic() < until and player.running, player.output
         time.sleep(0.05)
     time.sleep(0.3)
     player.signal(number)
     began = time.monotonic()
-    assert player.wait(5) == status and time.monotonic() - began < 2
+    assert player.wait() == status and time.monotonic() - began < 300, "it would wait for 600 s"
     assert player.output == f"{bag}: interrupted before a message was played\n"
 
 
@@ -453,7 +453,7 @@ def test_lockstep_asks_again_where_an_answer_is_lost(world: World, tmp_path: Pat
     world.node.create_subscription(Float64, "/x", count, 100)
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 2 * 10**8))).save(tmp_path / "in.mcap")
     player = world.command("play", bag, "--lockstep", "listener")
-    assert "played 5 messages of 1 topics" in player.succeed(60)
+    assert "played 5 messages of 1 topics" in player.succeed()
     assert received[0] == 5 and answers[0] > 5 and not held
 
 
@@ -462,10 +462,10 @@ def test_quiet_says_nothing_but_errors(world: World, tmp_path: Path) -> None:
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 2 * 10**9, 10**8))).save(tmp_path / "in.mcap")
     process = world.command("record", "/x", "--output", output, "--duration", "1", "--quiet")
     player = world.command("play", bag, "--quiet")
-    assert player.succeed(20) == "" and process.succeed(20) == ""
+    assert player.succeed() == "" and process.succeed() == ""
     assert Bag(output).topics["/x"].count > 5
     again = world.command("record", "/x", "--output", output, "--quiet")
-    assert again.wait(20) != 0 and "is there already" in again.output
+    assert again.wait() != 0 and "is there already" in again.output
 
 
 def test_json_is_all_that_is_printed_where_it_is_asked_for(world: World, tmp_path: Path) -> None:
@@ -473,7 +473,7 @@ def test_json_is_all_that_is_printed_where_it_is_asked_for(world: World, tmp_pat
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 2 * 10**9, 10**8))).save(tmp_path / "in.mcap")
     process = world.command("record", "/x", "--output", output, "--duration", "1", "--quiet", "--json")
     player = world.command("play", bag, "--quiet", "--json")
-    played, recorded = json.loads(player.succeed(20)), json.loads(process.succeed(20))
+    played, recorded = json.loads(player.succeed()), json.loads(process.succeed())
     assert (played["bag"], played["messages"], played["topics"]) == (str(bag), 20, {"/x": 20})
     assert played["interrupted"] is False and played["unconfirmed"] == [] and played["seconds"] > 1.5
     number = Bag(output).topics["/x"].count
@@ -550,7 +550,7 @@ def test_two_demos_in_one_domain_say_so(world: World, tmp_path: Path) -> None:
     """Each would hear the other's recording, and none of the live verdicts would be those of the offline check."""
     other = world.node.create_publisher(JointState, "/envelope_monitor/flags", 10)
     demo = world.start("demo", "-m", "uncertain_lti.cli.main", "demo", "--output", str(tmp_path / "out"))
-    assert demo.wait(60) == 2
+    assert demo.wait() == 2
     assert "another envelope_monitor publishes /envelope_monitor/flags in ROS domain" in demo.output
     assert "export ROS_DOMAIN_ID=" in demo.output
     world.node.destroy_publisher(other)

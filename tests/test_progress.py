@@ -236,7 +236,7 @@ def test_ctrl_c_at_any_time(long_run, cache):
         )
         time.sleep(share * took)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=300)
         lines = [line for line in said.decode().splitlines() if not line.startswith("note: ")]
         left = {p.name for p in output.iterdir()} - {"cache"}
         assert left == {"m.model.json"}

@@ -287,11 +287,11 @@ def test_ctrl_c_while_installing_is_one_sentence_and_130(run, slow, tmp_path):
         text=True,
         start_new_session=True,
     )
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 300
     while not (tmp_path / "made").exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=20)
+    _, said = process.communicate(timeout=300)
     assert process.returncode == 130, said
     assert said.strip() == "./run: interrupted; .venv is not whole, and the next start makes it again."
     assert run("setup", programs={"python3": slow}).returncode == 0 and (tmp_path / "made").read_text() == "xx"

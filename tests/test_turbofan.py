@@ -417,7 +417,7 @@ def test_recording_anew_gives_identical_payloads(tmp_path):
         with open_world(folder) as world:
             bag = folder / "run.mcap"
             recorder = world.command("record", "/engine/state", "/engine/control", "--output", bag)
-            world.run_node("turbofan", parameters).succeed(60.0)
+            world.run_node("turbofan", parameters).succeed()
             recorder.signal(2)
             recorder.succeed()
         payloads.append({t: [m.data for m in Bag(bag).raw_messages([t])] for t in ("/engine/state", "/engine/control")})

@@ -190,8 +190,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _swap(self, session: Session) -> None:
         """Replace the model, between two messages."""
         if self.session is not None and self.active:
-            now = time.monotonic()
-            self._take_all(self.session, self.session.release(now, all_of_them=True), now)
+            self._take_waiting(self.session)
             session.go_on_from(self.session)
         self.session = session
         self.outputs.prepare(self.session)
@@ -417,6 +416,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         return f"{self._prefix}/{topic.removeprefix('/')}" if self._prefix else topic
 
     def _unsubscribe(self) -> None:
+        if self.active and self.session is not None:
+            self._take_waiting(self.session)
         self.active = False
         for subscription in self.inputs.values():
             subscription.destroy()
@@ -434,9 +435,14 @@ class EnvelopeMonitorNode(LifecycleNode):
         else:
             self._take_all(session, messages, now)
 
+    def _take_waiting(self, session: Session) -> None:
+        """Take what still waits, as nothing more is accepted."""
+        now = time.monotonic()
+        self._take_all(session, session.release(now, all_of_them=True), now)
+
     def _take_all(self, session: Session, messages: Sequence[Waiting], now: float) -> None:
         for number, message in enumerate(messages, 1):
-            if number % _AT_ONCE == 0:  # a burst of outputs would drive out what reliable readers have not had yet
+            if number % _AT_ONCE == 0:  # readers would have to ask again for much of a longer burst of outputs
                 time.sleep(_PAUSE)
             try:
                 self._take(session, message, now)

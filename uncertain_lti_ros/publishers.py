@@ -19,6 +19,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from uncertain_lti.monitor.catch_up import MOST
 from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION
 from uncertain_lti.monitor.session import Session
 from uncertain_lti.monitor.verdict import Verdict
@@ -27,7 +28,7 @@ from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.polled_events import PolledEvents
 
-_OUTPUT_DEPTH = 1000
+_OUTPUT_DEPTH = MOST  # what waits at a start or after a stall is sent at once; what readers have is kept no longer
 _WHEN = {
     "message": ("message",),
     "judged": ("message", "judged"),

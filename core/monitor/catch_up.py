@@ -26,6 +26,9 @@ MOST = 20_000
 
 _QUIET = STALL  # s that messages wait at least: a longer pause counts as another stall
 _BURST = 5  # stamps that advance this many times as fast as the steady time come in a burst
+_LAG = 0.1  # s that stamps may lag more than they did before a stall, and nothing is held back any more
+_PACE = 0.1  # stamps whose pace differs from that of the steady time by a larger share have no usual lag
+_LAGS = 50  # of so many looks the smallest lag is the usual one
 
 Waiting = tuple[str, int, bytes]
 """Topic, arrival in ns, and data of one message."""
@@ -64,15 +67,51 @@ class _Progress:
         return max((b - a for a, b in zip(stamps, stamps[1:], strict=False)), default=0)
 
 
+class Lags:
+    """By how much the stamps of the clock topic usually lag behind the steady time, for whatever reason."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, int]] = deque(maxlen=_LAGS)
+
+    def look(self, heard: float, stamp_ns: int) -> None:
+        """Note the last message; to be called now and then.
+
+        Parameters
+        ----------
+        heard : float
+            Steady time when it came, s.
+        stamp_ns : int
+            Its stamp, ns.
+        """
+        if not self._seen or heard > self._seen[-1][0]:
+            self._seen.append((heard, stamp_ns))
+
+    def usual(self) -> float | None:
+        """The smallest lag lately.
+
+        Returns
+        -------
+        float or None
+            Steady time less stamp, s; None where stamps go at another pace than time, as those of a recording may.
+        """
+        if len(self._seen) < 2:
+            return None
+        (first, stamp), (last, newest) = self._seen[0], self._seen[-1]
+        if abs((newest - stamp) * 1e-9 - (last - first)) > _PACE * (last - first):
+            return None
+        return min(heard - stamp * 1e-9 for heard, stamp in self._seen)
+
+
 class CatchUp:
     """Messages in order of arrival in, messages in an order in which no sample closes before its controls are here.
 
     When a monitor starts, or goes on after a stall, the middleware delivers what it held back in bursts, one topic
     after another. Messages wait here until each topic has been heard, has come as far as the clock topic, and stamps
-    advance no faster than the time; at most `longest` seconds. If topics came in bursts, messages are then released
-    by their stamps, each clock message after everything that belongs to it; otherwise as they came. The order within a
-    topic never changes. At a start there can be no verdict before every topic has been heard: until then each message
-    waits the full time, in case the missing topic arrives in a burst.
+    advance no faster than the time; after a stall, also until stamps lag no more than they did before. They wait at
+    most `longest` seconds. If topics came in bursts, messages are then released by their stamps, each clock message
+    after everything that belongs to it; otherwise as they came. The order within a topic never changes. At a start
+    there can be no verdict before every topic has been heard: until then each message waits the full time, in case the
+    missing topic arrives in a burst.
 
     Parameters
     ----------
@@ -90,6 +129,10 @@ class CatchUp:
         How long a message waits at most, s.
     start : bool
         Whether the monitor starts; otherwise it goes on after a stall.
+    lag : float, optional
+        That of the clock topic before the stall, s; None where it is not known.
+    since : float, optional
+        Steady time of the last message before the stall, s.
 
     Attributes
     ----------
@@ -112,9 +155,12 @@ class CatchUp:
         max_gap_ns: int,
         longest: float,
         start: bool,
+        lag: float | None = None,
+        since: float = 0.0,
     ) -> None:
         self._clock, self._never, self._step_ns = clock, {clock, *awaited}, to_ns(step)
         self._longest, self._max_gap_ns, self._start = longest, max_gap_ns, start
+        self._lag, self._since = lag, since
         self._progress = {topic: _Progress() for topic in (clock, *stamped)}
         self._waiting: deque[tuple[int, float, int, Waiting]] = deque()  # number, steady time, stamp, message
         self._recent: deque[tuple[float, int]] = deque()  # steady time and stamp of clock messages
@@ -209,6 +255,8 @@ class CatchUp:
             self._recent.popleft()
         if self._recent and (self._recent[-1][1] - self._recent[0][1]) * 1e-9 > _BURST * _QUIET:
             return False
+        if self._is_behind():
+            return False
         clock = self._progress[self._clock].newest
         for progress in self._progress.values():
             if not progress.newest:
@@ -218,6 +266,14 @@ class CatchUp:
             if behind > (progress.longest_step or self._step_ns) and not silent:
                 return False
         return True
+
+    def _is_behind(self) -> bool:
+        """Whether the clock topic still lags as only messages do that were sent during the stall, or since."""
+        clock = self._progress[self._clock]
+        if self._lag is None or not clock.newest:
+            return False
+        more = clock.at - clock.newest * 1e-9 - self._lag
+        return _LAG < more <= clock.at - self._since + _LAG  # else these stamps do not go on from those before
 
     def _release(self, until: float) -> list[Waiting]:
         """Those that came before a steady time, and what belongs before them."""

@@ -27,7 +27,7 @@ from uncertain_lti.model.jumps import jumps_in_words
 from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.arming import Arming, Condition
-from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Waiting
+from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Lags, Waiting
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.monitor.foreseen import Foreseen
 from uncertain_lti.monitor.likeness import Explainer
@@ -297,7 +297,8 @@ class Stream:
         self._heard: dict[str, float] = {}
         self._began, self._judged = now, -math.inf
         self._came = now
-        self._catches_up = self._catch_up(self._stamped, start=True) if math.isfinite(self._stall) else None
+        self._lags = Lags()
+        self._catches_up = self._catch_up(self._stamped) if math.isfinite(self._stall) else None
         self.reordered, self.caught_up = 0, ""
         self.period = Period(now)
 
@@ -455,9 +456,15 @@ class Stream:
         self.latched, self.sampler.counters = latched, counters
         self.failures += 1
 
-    def _catch_up(self, awaited: Sequence[str], start: bool) -> CatchUp:
-        step, max_gap = self.model.sampling.dt_median or 0.0, self.sampler.signals.max_gap
-        return CatchUp(self.sampler.clock, self._stamped, awaited, step, to_ns(max_gap), self._window, start)
+    def _catch_up(self, awaited: Sequence[str], since: float | None = None) -> CatchUp:
+        step, max_gap = self.model.sampling.dt_median or 0.0, to_ns(self.sampler.signals.max_gap)
+        clock, start, lag = self.sampler.clock, since is None, self._lags.usual()
+        return CatchUp(clock, self._stamped, awaited, step, max_gap, self._window, start, lag, since or 0.0)
+
+    def _look_at_lag(self) -> None:
+        latest, heard = self.sampler.latest(), self._heard.get(self.sampler.clock)
+        if latest is not None and heard is not None:
+            self._lags.look(heard, latest[0])
 
     def accept(self, topic: str, arrival_ns: int, data: bytes, now: float) -> Sequence[Waiting]:
         """Receive one serialised message, and tell which messages are to be taken now.
@@ -486,7 +493,7 @@ class Stream:
             if now - before <= self._stall:
                 return ((topic, arrival_ns, data),)
             lately = [t for t in self._stamped if self._heard.get(t, -math.inf) >= before - self._stall]
-            self._catches_up = self._catch_up(lately, start=False)
+            self._catches_up = self._catch_up(lately, before)
         stamp_ns = None
         if topic in self._readers and self.sampler.signals.time[topic] == "header":
             try:
@@ -514,6 +521,8 @@ class Stream:
         """
         waits = self._catches_up
         if waits is None:
+            if math.isfinite(self._stall):
+                self._look_at_lag()
             return ()
         before = waits.reordered
         released = waits.finish(now) if all_of_them else waits.ready(now)
