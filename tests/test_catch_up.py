@@ -160,6 +160,16 @@ def test_controls_that_are_sent_no_more_hold_up_nothing(engine: tuple[UncertainL
     assert len(messages) == 604 and max(waits) < 0.1 + STALL + 2 * STEP
 
 
+def test_a_recording_that_was_paused_goes_on_soon(engine: tuple[UncertainLTI, Bag]) -> None:
+    """Its stamps lag as those of messages that were held back; but they go on to."""
+    model, bag = engine
+    resumed = [(at + 3.0 if at > 5.01 else at, *message) for at, *message in sent(bag)]
+    session = session_of(model, bag)
+    run(session, [m for m in resumed if m[0] < 5.01], until=5.01)
+    waits = [at for at, *message in resumed if at > 5.01 and not session.accept(*message, at)]
+    assert len(waits) > 10 and max(waits) < 8.01 + STALL + 2 * STEP
+
+
 def test_what_cannot_be_read_is_counted_at_once(engine: tuple[UncertainLTI, Bag]) -> None:
     session = session_of(*engine)
     (message,) = session.accept(STATE_TOPIC, 1, b"no message", 0.0)

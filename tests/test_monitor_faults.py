@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -589,6 +590,20 @@ def test_snapshots_hold_what_came_and_what_was_said(world: World, tmp_path: Path
         until(lambda: trigger(world, "snapshot")[0], "another")
     until(lambda: len([p for p in folder.iterdir() if p != keep and p.suffix == ".mcap"]) == 2, "two files")
     assert keep.read_bytes() == b"mine" and not found.exists() and len(list(tmp_path.glob("*.mcap"))) == 0
+
+
+def test_what_still_waits_at_the_end_is_judged(world: World, tmp_path: Path) -> None:
+    """A topic that was never heard has messages wait: here for ten seconds, had the monitor not been told to end."""
+    process = world.monitor(saved(by_hand(), tmp_path), catch_up=10.0)
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, by_hand()).subscribed()
+    plant.control.publish = lambda _: None  # type: ignore[method-assign]
+    plant.send(20)
+    until(lambda: world.status()["received"][STATE] == 20, "20 samples")
+    assert not flags.messages
+    process.signal(signal.SIGINT)
+    process.succeed()
+    assert len(flags.count(20)) == 20
 
 
 def test_an_alarm_takes_a_snapshot_when_asked_to(world: World, tmp_path: Path) -> None:

@@ -167,6 +167,7 @@ class CatchUp:
         self._number, self._began, self._heard, self._until = 0, 0.0, 0.0, math.inf
         self._arrival_ns = -(2**63)  # of the last message released
         self._bursts = self._stepped_back = False
+        self._most_behind = -math.inf  # clock topic, s more than before the stall
         self.over, self.reordered, self.behind_ns, self.took = False, 0, 0, 0.0
 
     def put(self, topic: str, arrival_ns: int, data: bytes, stamp_ns: int | None, now: float) -> None:
@@ -200,6 +201,8 @@ class CatchUp:
         first = not progress.newest
         self._stepped_back |= progress.advance(stamp_ns, now) < -self._max_gap_ns
         if topic == self._clock:
+            if self._lag is not None:
+                self._most_behind = max(self._most_behind, now - stamp_ns * 1e-9 - self._lag)
             self._recent.append((now, stamp_ns))
             while self._recent[0][0] < now - _QUIET:
                 self._recent.popleft()
@@ -268,12 +271,15 @@ class CatchUp:
         return True
 
     def _is_behind(self) -> bool:
-        """Whether the clock topic still lags as only messages do that were sent during the stall, or since."""
+        """Whether the clock topic still lags as only messages do that were sent during the stall, or since.
+
+        The stamps of a recording that was paused lag as much, and go on to; those of what was held back come nearer.
+        """
         clock = self._progress[self._clock]
         if self._lag is None or not clock.newest:
             return False
         more = clock.at - clock.newest * 1e-9 - self._lag
-        return _LAG < more <= clock.at - self._since + _LAG  # else these stamps do not go on from those before
+        return _LAG < more <= clock.at - self._since + _LAG and more < self._most_behind - _LAG
 
     def _release(self, until: float) -> list[Waiting]:
         """Those that came before a steady time, and what belongs before them."""
