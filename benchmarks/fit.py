@@ -38,9 +38,10 @@ from measure import best, peak_memory, table
 from uncertain_lti import EnvelopeMonitor, fit
 from uncertain_lti.identification import formulation
 from uncertain_lti.identification.cache import CacheWriter
+from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import Columns, Problem
+from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient

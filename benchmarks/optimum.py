@@ -32,7 +32,8 @@ import numpy as np
 
 from uncertain_lti import OperatingPoint, Transient, fit
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification.problem import Problem, assemble
+from uncertain_lti.identification.assembly import assemble
+from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.structure import Structure
 
 AGREE = 1e-7

@@ -23,10 +23,12 @@ from engine_bag import SIGNALS, engine_bag
 from uncertain_lti import OperatingPoint, Transient, fit, read_transients
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.identification.archive import fit_archive
+from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.cache import CacheWriter
+from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import BLOCK, Columns, assemble
+from uncertain_lti.identification.problem import BLOCK
 
 ARRAYS = ("A", "B", "dA", "dB", "c", "dc", "v")
 

@@ -219,7 +219,7 @@ def test_stale_controls_are_named():
         clock="/s",
         max_gap=1.0,
     )
-    from uncertain_lti.identification.problem import assemble
+    from uncertain_lti.identification.assembly import assemble
     from uncertain_lti.identification.sensors import stale
 
     old = run(signals=signals, counters={"stale valve": 400})

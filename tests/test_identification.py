@@ -18,8 +18,10 @@ from hypothesis import strategies as st
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import formulation, passes, products, row, solvers
+from uncertain_lti.identification.assembly import assemble
+from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import Columns, Problem, Regimes, assemble
+from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import SUBSAMPLE
 from uncertain_lti.model.schedule import Axis, Schedule

@@ -197,7 +197,7 @@ def test_what_is_no_file_is_written_to_and_stays():
 
 
 def test_an_interrupted_cache_leaves_nothing(tmp_path):
-    from uncertain_lti.identification.problem import assemble
+    from uncertain_lti.identification.assembly import assemble
     from uncertain_lti.model.operating_point import OperatingPoint
     from uncertain_lti.sampling.transient import Transient
 

@@ -22,12 +22,14 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.progress import CountedStep
+from uncertain_lti.identification.assembly import assemble, is_constant
 from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.identification.cluster import DaskFleet
+from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.diagnosis import too_few
 from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import Columns, Problem, Regimes, assemble, is_constant
+from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.regimes import Knots, scheduled_by
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure

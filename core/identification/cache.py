@@ -23,7 +23,8 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.identification.problem import BLOCK, Block, Columns, Problem
+from uncertain_lti.identification.columns import Columns
+from uncertain_lti.identification.problem import BLOCK, Block, Problem
 
 _FORMAT = "uncertain-lti-cache/1"
 _DATA, _FACTS = "transitions.f64", "facts.json"

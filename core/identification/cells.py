@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
-from uncertain_lti.identification.problem import Block, Regimes
+from uncertain_lti.identification.columns import Regimes
+from uncertain_lti.identification.problem import Block
 from uncertain_lti.identification.products import gram_of, product
 
 

@@ -23,13 +23,15 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.identification.assembly import assemble, median_step
+from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizons import better_run, fit_horizons
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.problem import Columns, Problem, Regimes, assemble, median_step
+from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.regimes import Knots, block_data, scheduled_by
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure

@@ -21,8 +21,9 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification import passes
+from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
-from uncertain_lti.identification.problem import Columns, Partition, Problem
+from uncertain_lti.identification.problem import Partition, Problem
 from uncertain_lti.model.domain import Occupancy, cells_for
 from uncertain_lti.model.residuals import Residuals
 

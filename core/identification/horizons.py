@@ -27,9 +27,10 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.optimum import optimum
-from uncertain_lti.identification.problem import Columns, Problem, Regimes
+from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.horizon import Horizon, Run, Widths

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.identification.assembly import scaled_eigenvalues
 from uncertain_lti.identification.cells import Cells, Whole
-from uncertain_lti.identification.problem import Block, Columns, Partition, Regimes, scaled_eigenvalues
+from uncertain_lti.identification.columns import Columns, Regimes
+from uncertain_lti.identification.problem import Block, Partition
 from uncertain_lti.identification.products import gram_of, product
 from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of, utilisation_of
 

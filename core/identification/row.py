@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Moments, Samples
-from uncertain_lti.identification.problem import Columns
 from uncertain_lti.identification.solvers import FEASIBLE, Sense, Simplex, dual_bound, solve_qp
 
 TOLERANCE = 1e-11

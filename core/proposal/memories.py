@@ -21,7 +21,7 @@ import numpy as np
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
-from uncertain_lti.identification.problem import assemble
+from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.residuals import residuals
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI

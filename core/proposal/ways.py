@@ -19,7 +19,7 @@ import numpy as np
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification.problem import assemble
+from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.sensors import late_controls
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.proposal.memories import Remembered, memory_candidates, operating_point, remember

@@ -1,0 +1,340 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""From recordings to the identification problem: normalised columns, weights and what they refuse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.identification.columns import Columns, Regimes
+from uncertain_lti.identification.problem import BLOCK, Problem
+from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.sampling.transient import Transient, Transitions
+from uncertain_lti.signals.additive import Additive
+
+
+def is_constant(dt: Array) -> bool:
+    """Whether all steps are equal to a part in 1e6 (an integer clock jitters by a nanosecond).
+
+    Parameters
+    ----------
+    dt : array (N,)
+        Steps, s.
+
+    Returns
+    -------
+    bool
+        True without a step.
+    """
+    if not dt.size or (dt == dt[0]).all():
+        return True
+    return bool(np.ptp(dt) <= 1e-6 * np.median(dt))
+
+
+def median_step(dt: Array) -> float:
+    """Median of Δt; without a sort where all steps are the same.
+
+    Parameters
+    ----------
+    dt : array (N,)
+        Steps, s; at least one.
+
+    Returns
+    -------
+    float
+        In s.
+    """
+    first = float(dt[0])
+    return first if (dt == first).all() else float(np.median(dt))
+
+
+def assemble(
+    transients: Sequence[Transient],
+    point: OperatingPoint,
+    weights: ArrayLike | Sequence[ArrayLike] | None,
+    additive: Additive,
+    empty: bool = False,
+    transient_weights: Sequence[float] | None = None,
+    count: Literal["sample", "transient"] = "sample",
+    regimes: Regimes | None = None,
+) -> Problem:
+    """Put the usable transitions of all recordings into one problem.
+
+    Parameters
+    ----------
+    transients : sequence of Transient
+        The recordings.
+    point : OperatingPoint
+        The normalisation.
+    weights : array (n,), (N, n), (N, n, n), or one of the latter two per transient, or None
+        W(t_{k+1}); N counts the steps of a transient (samples less one), usable or not. None for ones.
+    additive : Additive
+        Terms besides A and B.
+    empty : bool
+        No transition at all is no error.
+    transient_weights : sequence of float, optional
+        One factor per transient on all its weights.
+    count : {"sample", "transient"}
+        Every transition weighs the same, or every transient does, however long it is.
+    regimes : Regimes, optional
+        Of a scheduled model.
+
+    Returns
+    -------
+    Problem
+        Normalised.
+
+    Raises
+    ------
+    FitError
+        No transitions; values whose squares overflow; a mode that the schedule does not list; weights of a wrong shape,
+        not positive, not symmetric or not positive definite.
+    """
+    n = len(point.x_s)
+    steps = [t.transitions() for t in transients]
+    k = _joined([s.k for s in steps])
+    source = np.zeros(len(k), dtype=np.intp)
+    for number, stop in enumerate(np.cumsum([len(s.k) for s in steps])[:-1], start=1):
+        source[stop:] = number
+    if not len(k) and not empty:
+        names = ", ".join(t.name for t in transients)
+        raise FitError(
+            f"{names}: no usable transition among {plural(sum(len(t) for t in transients), 'sample')}; "
+            f"{_without_values(transients)}"
+        )
+    dt = _joined([s.dt for s in steps])
+    p = n + len(point.u_s)
+    samples = np.empty((p, len(dt) + 1))
+    z = samples[:, :-1]
+    shared = len(steps) == 1 and steps[0].consecutive  # the next sample is the next column
+    x_next = samples[:n, 1:] if shared else np.empty((n, len(dt)))
+    start, square = 0, 0.0
+    for s in steps:
+        stop = start + len(s.dt)
+        part = slice(start, stop)
+        start = stop
+        square += _normalise(s.x, point.x_s, point.X, z[:n, part])
+        square += _normalise(s.u, point.u_s, point.U, z[n:, part])
+        if s.consecutive:  # computed once
+            if not shared:
+                x_next[:, part][:, :-1] = z[:n, part][:, 1:]
+            square += _normalise(s.x_next[-1:], point.x_s, point.X, x_next[:, stop - 1 : stop])
+        else:
+            square += _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
+    further, more = _scheduling(steps, point)
+    if not square + more <= LARGEST**2:
+        raise _too_large(transients)
+    columns = Columns.of(additive, is_constant(dt), regimes)
+    chosen = _weights(weights, transients, k, source, n)
+    factors = _factors(transient_weights, count, source, len(transients))
+    if factors is not None:
+        factors = factors[source]
+        chosen = factors[:, None] * chosen if chosen.ndim < 3 else factors[:, None, None] * chosen
+    problem = Problem(z, x_next, dt, source, k, chosen, columns, further)
+    if regimes is not None:
+        refuse_unlisted(problem, regimes, transients)
+    return problem
+
+
+def refuse_unlisted(problem: Problem, regimes: Regimes, transients: Sequence[Transient]) -> None:
+    """Refuse a mode that the schedule does not list.
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    regimes : Regimes
+        The schedule.
+    transients : sequence of Transient
+        The recordings, by their position in `problem.source`.
+
+    Raises
+    ------
+    FitError
+        There is one; names the mode, the recording and the remedy.
+    """
+    vectors = regimes.vectors(problem.z_columns, problem.s_columns)
+    for axis, values, row in zip(regimes.schedule.axes, vectors, regimes.positions, strict=True):
+        unlisted = np.flatnonzero(~np.isin(values, axis.modes))
+        if axis.modes and len(unlisted):
+            transient, k = transients[problem.source[unlisted[0]]], int(problem.k[unlisted[0]])
+            recorded = np.hstack([transient.x[k], transient.u[k], transient.s[k]])[row]
+            raise FitError(
+                f"{transient.name}: '{axis.signal}' is {recorded:g} at t = {transient.t[k]:.6g} s (and in "
+                f"{plural(len(unlisted), 'transition')} of all), a mode that the schedule does not list; list it, or "
+                f"leave that part of the recording out"
+            )
+
+
+def _scheduling(steps: Sequence[Transitions], point: OperatingPoint) -> tuple[Array | None, float]:
+    """Scheduling signals that are neither state nor control, normalised, (q, N), and the sum of their squares."""
+    if not len(point.s_s):
+        return None, 0.0
+    s = np.empty((len(point.s_s), sum(len(step.dt) for step in steps)))
+    start, square = 0, 0.0
+    for step in steps:
+        square += _normalise(step.s, point.s_s, point.S, s[:, start : start + len(step.dt)])
+        start += len(step.dt)
+    return s, square
+
+
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """One after the other; a single one as it is."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _too_large(transients: Sequence[Transient]) -> FitError:
+    """The error for values whose squares overflow, naming signal and recording."""
+    largest, name, recording = 0.0, "", ""
+    for t in transients:
+        names = (*t.state_names, *t.control_names, *t.scheduling_names)
+        for signal, values in zip(names, (*t.x.T, *t.u.T, *t.s.T), strict=True):
+            here = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+            if here > largest:
+                largest, name, recording = here, signal, t.name
+    return FitError(
+        f"{recording}: '{name}' reaches {largest:.3g}, over its scale more than the arithmetic can carry; leave out "
+        f"the recording, or mend the sensor or the scale"
+    )
+
+
+def _without_values(transients: Sequence[Transient]) -> str:
+    """Why there may be no usable transition, by signal."""
+    first, total = transients[0], sum(len(t) for t in transients)
+    known = sum(np.isfinite(np.concatenate([t.x, t.u, t.s], axis=1)).sum(axis=0) for t in transients)
+    names = (*first.state_names, *first.control_names, *first.scheduling_names)
+    counts = dict(zip(names, np.asarray(known).tolist(), strict=True))
+    never = [name for name, count in counts.items() if not count]
+    if never:
+        many = len(never) > 1
+        return (
+            f"{', '.join(never)} {'have' if many else 'has'} no value in any of them (missing, not finite or too old, "
+            f"see max_hold and max_skew), so check {'their fields' if many else 'its field'} in the signals file"
+        )
+    seldom = [f"{name} in {count}" for name, count in counts.items() if count < total]
+    if seldom:
+        return (
+            f"no two in a row have every signal; there is a value of {', '.join(seldom)} of them (otherwise missing, "
+            f"not finite or too old, see max_hold and max_skew), so check the signals file"
+        )
+    return "no two in a row are at most max_gap and at least min_step apart, so check these in the signals file"
+
+
+def _factors(
+    transient_weights: Sequence[float] | None, count: str, source: NDArray[np.intp], transients: int
+) -> Array | None:
+    """Factor on the weights of each transient; None where all are 1."""
+    if count not in ("sample", "transient"):
+        raise FitError(f"count is {count!r}; it must be sample or transient")
+    factors = np.ones(transients)
+    if transient_weights is not None:
+        factors = np.asarray(transient_weights, dtype=np.float64)
+        if factors.shape != (transients,) or not (np.isfinite(factors).all() and (factors > 0).all()):
+            raise FitError(f"transient_weights must be {transients} positive numbers, one per transient")
+    if count == "transient":
+        lengths = np.bincount(source, minlength=transients)
+        factors = factors * len(source) / (np.maximum(lengths, 1) * np.count_nonzero(lengths))
+    return None if (factors == 1.0).all() else factors
+
+
+def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> float:
+    """(recorded - steady) / scale as `OperatingPoint` does it, into columns; (K, n) to (n, K). The sum of squares."""
+    square = 0.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start in range(0, len(recorded), BLOCK):  # a piece of the rows stays in the cache while they become columns
+            part = slice(start, start + BLOCK)
+            for row, values, a, b in zip(out[:, part], recorded[part].T, steady, scale, strict=True):
+                np.subtract(values, a, out=row)
+                if b != 1.0:
+                    row /= b
+                square += float(row @ row)
+    return square
+
+
+def scaled_eigenvalues(weights: Array) -> Array:
+    """Eigenvalues of full weights whose diagonals are scaled to ones.
+
+    The scales of the states are taken apart, as their squares may differ by more than arithmetic holds.
+
+    Parameters
+    ----------
+    weights : array (K, n, n)
+        Symmetric.
+
+    Returns
+    -------
+    array (K, n)
+        In rising order.
+    """
+    unit = 1.0 / np.sqrt(np.maximum(np.einsum("kii->ki", weights), 1e-300))
+    return np.asarray(np.linalg.eigvalsh(weights * unit[:, :, None] * unit[:, None, :]))
+
+
+def _weights(
+    weights: ArrayLike | Sequence[ArrayLike] | None,
+    transients: Sequence[Transient],
+    k: NDArray[np.intp],
+    source: NDArray[np.intp],
+    n: int,
+) -> Array:
+    if weights is None:
+        return np.ones(n)
+    lengths = [max(len(t) - 1, 0) for t in transients]
+    try:
+        if isinstance(weights, (list, tuple)) and all(np.ndim(w) >= 2 for w in weights):
+            if len(weights) != len(transients):
+                raise FitError(
+                    f"weights: {len(weights)} arrays for {len(transients)} transients; give one per transient"
+                )
+            for w, length, t in zip(weights, lengths, transients, strict=True):
+                if np.shape(w) not in ((length, n), (length, n, n)):
+                    raise FitError(
+                        f"weights of {t.name} have shape {np.shape(w)}; they must be ({length}, {n}) or "
+                        f"({length}, {n}, {n}), one per step"
+                    )
+            if len({np.ndim(w) for w in weights}) > 1:
+                raise FitError("weights: some transients have diagonals and some full matrices; give one kind")
+            stacked = np.concatenate([np.asarray(w, dtype=np.float64) for w in weights])
+        else:
+            stacked = np.asarray(weights, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise FitError("weights are not arrays of numbers; give (n,), (N, n) or (N, n, n)") from None
+    total = sum(lengths)
+    if stacked.shape == (n,):
+        chosen = stacked
+    elif stacked.shape in ((total, n), (total, n, n)):
+        offset = np.concatenate([[0], np.cumsum(lengths)])[:-1]
+        chosen = stacked[offset[source] + k]
+    else:
+        raise FitError(
+            f"weights have shape {stacked.shape}; they must be ({n},), ({total}, {n}) or ({total}, {n}, {n}), "
+            f"one per step of the transients"
+        )
+    if not np.isfinite(chosen).all():
+        raise FitError("weights hold a number that is not finite")
+    if chosen.ndim == 3:
+        largest = np.abs(chosen).max(axis=(1, 2))
+        symmetric = np.abs(chosen - chosen.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-12 * largest
+        if not symmetric.all():
+            raise FitError(f"weights: the matrix of step {int(np.argmin(symmetric))} is not symmetric")
+        smallest = scaled_eigenvalues(chosen)[:, 0]
+        if smallest.min() <= 0:
+            raise FitError(f"weights: the matrix of step {int(np.argmin(smallest))} is not positive definite")
+    elif (chosen <= 0).any():
+        raise FitError("weights: every weight must be positive; leave samples out of the transient instead")
+    return chosen

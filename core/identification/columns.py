@@ -1,0 +1,296 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Regressors of a transition: which unknowns a row has, and what each of them is multiplied with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.errors import FitError, ModelError
+from uncertain_lti.model.schedule import Schedule
+from uncertain_lti.model.terms import ADDITIVE, Term
+from uncertain_lti.signals.additive import CHOICES, CHOICES_TEXT, Additive
+from uncertain_lti.signals.signal_map import SignalMap
+
+
+@dataclass(frozen=True)
+class Regimes:
+    """A schedule, and where its signals are among those of a transition.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        Knots and modes, normalised.
+    positions : tuple of int
+        Of each of its axes the row of [x; u; s].
+    """
+
+    schedule: Schedule
+    positions: tuple[int, ...]
+
+    @classmethod
+    def of(cls, schedule: Schedule, signals: SignalMap) -> Regimes:
+        """Where the signals of a schedule are.
+
+        Parameters
+        ----------
+        schedule : Schedule
+            The schedule.
+        signals : SignalMap
+            With its signals.
+
+        Returns
+        -------
+        Regimes
+            The schedule with positions.
+
+        Raises
+        ------
+        FitError
+            A signal is not there; names it.
+        """
+        try:
+            return cls(schedule, schedule.positions([s.name for s in signals.signals]))
+        except ModelError as error:
+            raise FitError(str(error)) from None
+
+    def vectors(self, z: Array, s: Array | None) -> Array:
+        """Scheduling vectors.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array (axes, K)
+            Normalised.
+        """
+        p = len(z)
+        rows = [z[j] if j < p or s is None else s[j - p] for j in self.positions]
+        return np.stack(rows)
+
+    def weights(self, z: Array, s: Array | None) -> Array:
+        """Weights of all blocks, w(s).
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array (R, K)
+            Weights, which sum to 1.
+        """
+        return self.schedule.weights(self.vectors(z, s))
+
+    def main_block(self, z: Array, s: Array | None) -> NDArray[np.intp]:
+        """The block of the largest weight.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array of int (K,)
+            Numbers of blocks.
+        """
+        return self.schedule.main_block(self.vectors(z, s))
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Which arrays of the additive terms are unknown besides A, B, ΔA, ΔB, and how many blocks of them all there are.
+
+    The unknowns of a row are those of the first block, then those of the second, and so on.
+
+    Parameters
+    ----------
+    names : frozenset of str
+        Of "c", "dc" and "v", those that are.
+    regimes : Regimes, optional
+        Of a scheduled model; None for one block.
+    """
+
+    names: frozenset[str] = frozenset()
+    regimes: Regimes | None = None
+
+    @property
+    def nominal(self) -> tuple[Term, ...]:
+        """Terms whose nominal elements are unknown, in the order of the rows after those of A and B."""
+        return tuple(term for term in ADDITIVE if term.nominal in self.names)
+
+    @property
+    def half(self) -> tuple[Term, ...]:
+        """Terms whose half-widths are unknown, in the order of the rows after those of ΔA and ΔB."""
+        return tuple(term for term in ADDITIVE if term.half in self.names)
+
+    @property
+    def drift(self) -> bool:
+        """Whether c is unknown."""
+        return "c" in self.names
+
+    @property
+    def disturbance(self) -> bool:
+        """Whether dc is unknown."""
+        return "dc" in self.names
+
+    @property
+    def noise(self) -> bool:
+        """Whether v is unknown."""
+        return "v" in self.names
+
+    @property
+    def count(self) -> int:
+        """Number of blocks, R."""
+        return 1 if self.regimes is None else self.regimes.schedule.blocks
+
+    def phi(self, z: Array, s: Array | None) -> Array:
+        """Regressors φ of the nominal row: z, and 1 for each additive term; of R blocks, each times its weight.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array (r, K)
+            φ / Δt.
+        """
+        return self._weighted(self.plain_phi(z), z, s)
+
+    def plain_phi(self, z: Array) -> Array:
+        """`phi` of one block, without its weight.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+
+        Returns
+        -------
+        array (r / R, K)
+            z, and 1 for each additive term.
+        """
+        return np.vstack([z, np.ones((len(self.nominal), z.shape[1]))]) if self.nominal else z
+
+    def psi(self, z: Array, dt: Array, s: Array | None) -> Array:
+        """Regressors ψ of the half-width: |z|, and for each additive term 1 or, if Δt does not multiply it, 1/Δt.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        dt : array (K,)
+            Δt, s.
+        s : array (q, K) or None
+            Further scheduling signals; None if there are none.
+
+        Returns
+        -------
+        array (q, K)
+            ψ / Δt; of R blocks, each times its weight.
+        """
+        return self._weighted(self.plain_psi(z, dt), z, s)
+
+    def plain_psi(self, z: Array, dt: Array) -> Array:
+        """`psi` of one block, without its weight.
+
+        Parameters
+        ----------
+        z : array (p, K)
+            [x; u].
+        dt : array (K,)
+            Δt, s.
+
+        Returns
+        -------
+        array (q / R, K)
+            |z|, and 1 or 1 / Δt for each additive term.
+        """
+        p = len(z)
+        psi = np.empty((p + len(self.half), z.shape[1]))
+        np.abs(z, out=psi[:p])
+        for row, term in zip(psi[p:], self.half, strict=True):
+            row[:] = 1.0 if term.times_dt else 1.0 / dt
+        return psi
+
+    def _weighted(self, base: Array, z: Array, s: Array | None) -> Array:
+        """w(s) ⊗ base."""
+        if self.regimes is None:
+            return base
+        weights = self.regimes.weights(z, s)
+        return (weights[:, None] * base).reshape(-1, z.shape[1])
+
+    def unknowns(self, p: int) -> int:
+        """Number of unknowns per row and block with p states and controls.
+
+        Parameters
+        ----------
+        p : int
+            Number of states and controls.
+
+        Returns
+        -------
+        int
+            Nominal elements and half-widths.
+        """
+        return 2 * p + len(self.names)
+
+    @classmethod
+    def of(cls, additive: Additive, constant_dt: bool, regimes: Regimes | None = None) -> Columns:
+        """For an `additive` option.
+
+        With a constant Δt, Δt·dc + v is one number: v takes it and dc is 0, because v is the one that still
+        holds when another recording has another Δt. With a schedule c is unknown together with every
+        additive term: it carries the steady state from knot to knot. Without such a term c is 0, as at rest its
+        rounding would have no half-width to lie in.
+
+        Parameters
+        ----------
+        additive : Additive
+            The option of `fit`.
+        constant_dt : bool
+            Whether all steps are equal.
+        regimes : Regimes, optional
+            Of a scheduled model.
+
+        Returns
+        -------
+        Columns
+            Terms that are unknown.
+
+        Raises
+        ------
+        FitError
+            There is no such option.
+        """
+        if additive not in CHOICES:
+            raise FitError(f"additive is {additive!r}; it must be {CHOICES_TEXT}")
+        names = {"none": "", "disturbance": "c dc", "noise": "v", "both": "c v" if constant_dt else "c dc v"}
+        drift = () if regimes is None or additive == "none" else ("c",)
+        return cls(frozenset((*names[additive].split(), *drift)), regimes)
