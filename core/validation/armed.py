@@ -9,10 +9,11 @@
 
 """Rules armed together, and the one search for their thresholds: on what was left out, each brought to a common scale.
 
-A rule is scaled by what its peaks on the other recordings or groups that were left out make likely (their mean
-logarithm and its deviation). So one factor raises all thresholds together, states that are noisier have higher ones, as
-has a statistic that differs more from recording to recording, and the search for the factor is one search however many
-rules are armed. As the scale at one recording or group comes from the others, the scaled levels are those of a new one.
+A rule is scaled by what its peaks on the recordings or groups that were left out make likely (their mean logarithm and
+its deviation). So one factor raises all thresholds together, states that are noisier have higher ones, as has a
+statistic that differs more from recording to recording, and the search for the factor is one search however many rules
+are armed. The scale is that of all of them, for their levels and for the thresholds alike: where they are few, a scale
+from the others alone would make the most restless of them stand out twice, and the thresholds far higher than it needs.
 """
 
 from __future__ import annotations
@@ -256,11 +257,10 @@ class Armed:
             peaks.append(np.ones_like(each) if alone else np.maximum(each, _TINY))
         self._scales = [_scale(each) for each in peaks]
         self.levels = []
-        for unit, of_part in zip(units.tolist(), values, strict=True):
+        for of_part in values:
             level = np.zeros(len(of_part[0]))
-            for rule, value, each in zip(self.rules, of_part, peaks, strict=True):
-                others = np.delete(each, unit, axis=0) if len(each) > 1 else each
-                scaled = value / _scale(others)
+            for rule, value, scale in zip(self.rules, of_part, self._scales, strict=True):
+                scaled = value / scale
                 if isinstance(rule, AlarmRule):  # its margin is never below 1
                     scaled = np.where(value > 1.0, scaled, 0.0)
                 level = np.maximum(level, scaled.max(axis=1))

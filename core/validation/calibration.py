@@ -198,7 +198,7 @@ def calibrate(
     could not show the target for so many even without an alarm, the longest m of n are not tried. A candidate is m of n
     violations, or statistics over one window (each of those named, and all together) beside containment of every
     verdict; all of it also over every horizon of the model. The alarms of all together are counted, while one factor
-    lowers all thresholds on the scale that the peaks on the other recordings give (`armed`). Chosen is the candidate
+    lowers all thresholds on the scale that the peaks on what was left out give (`armed`). Chosen is the candidate
     with the smallest detectable faults (`detectable`: biases, drifts and noise of every state, offsets of every
     control; geometric mean), and of those within WORTH of it the plainest.
 
