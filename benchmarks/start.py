@@ -153,26 +153,27 @@ def watch(model: str, executor: str) -> None:
     """The monitor; prints what it received and judged when it ends."""
     if executor == "default":
         sys.modules["rclpy.experimental"] = None  # type: ignore[assignment]
-    from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.monitor.session import Session
     from uncertain_lti_ros.envelope_monitor import EnvelopeMonitorNode, main
 
     received, judged = [], []
-    take, judge = EnvelopeMonitorNode._on_message, EnvelopeMonitor.judge
+    take, judge = EnvelopeMonitorNode._on_message, Session.take
 
     def noting(node: Any, topic: str, data: bytes) -> None:
         seconds, nanoseconds = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8))
         received.append((time.monotonic(), topic, seconds * 10**9 + nanoseconds))
         take(node, topic, data)
 
-    def judging(monitor: Any, step: Any, armed: bool = True) -> Any:
-        verdict = judge(monitor, step, armed)
-        if verdict.judged:
-            if not judged:
-                print("judges", file=sys.stderr, flush=True)
-            judged.append((time.monotonic(), verdict.t_ns))
-        return verdict
+    def judging(session: Any, *message: Any) -> Any:
+        verdicts, opened = judge(session, *message)
+        for verdict in verdicts:
+            if verdict.judged:
+                if not judged:
+                    print("judges", file=sys.stderr, flush=True)
+                judged.append((time.monotonic(), verdict.t_ns))
+        return verdicts, opened
 
-    EnvelopeMonitorNode._on_message, EnvelopeMonitor.judge = noting, judging  # type: ignore[method-assign]
+    EnvelopeMonitorNode._on_message, Session.take = noting, judging  # type: ignore[method-assign]
     status = main(["--ros-args", "-p", f"model:={model}", "--log-level", "error"])
     print(json.dumps({"received": received, "judged": judged}), flush=True)
     raise SystemExit(status)

@@ -248,6 +248,7 @@ class Stream:
     _came: cython.double
     _quiet: cython.Py_ssize_t  # verdicts without an alarm since the last one with
     _catches_up: Any
+    _lags: Any
     _reads_condition: Any
 
     def __init__(
