@@ -22,7 +22,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from ros_processes import World, open_world
+from ros_processes import World, open_world, own_domain
 
 from uncertain_lti_ros import parameters, plant, turbofan
 
@@ -35,12 +35,13 @@ def start(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
 
     def call(*arguments: str, node: str = "envelope_monitor", **environment: str) -> subprocess.CompletedProcess:
         code = f"import sys; from uncertain_lti_ros.{node} import main; sys.exit(main())"
-        return subprocess.run(
-            [sys.executable, "-c", code, *arguments],
-            env=os.environ
-            | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(tmp_path / "log"), **environment},
-            cwd=tmp_path, capture_output=True, text=True, timeout=1200,
-        )  # fmt: skip
+        own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(tmp_path / "log")}
+        with own_domain() as domain:
+            return subprocess.run(
+                [sys.executable, "-c", code, *arguments],
+                env=os.environ | own | {"ROS_DOMAIN_ID": str(domain)} | environment,
+                cwd=tmp_path, capture_output=True, text=True, timeout=300,
+            )  # fmt: skip
 
     return call
 

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -29,6 +30,7 @@ from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.polled_events import PolledEvents
 
 _OUTPUT_DEPTH = MOST  # what waits at a start or after a stall is sent at once; what readers have is kept no longer
+_LAST_WORDS = 1.0  # s that the end waits until readers have the last messages
 _WHEN = {
     "message": ("message",),
     "judged": ("message", "judged"),
@@ -93,8 +95,16 @@ class OutputPublisher:
     def _matched(self, event: Any) -> None:
         self.listeners = event.current_count
 
-    def destroy(self) -> None:
-        """Stop publishing."""
+    def destroy(self, patience: float) -> None:
+        """Stop publishing, once every reliable reader has everything.
+
+        Parameters
+        ----------
+        patience : float
+            How long that is waited for at most, s.
+        """
+        if self._listeners:
+            self._publisher.wait_for_all_acked(Duration(seconds=patience))
         self._events.destroy()
         self._node.destroy_lifecycle_publisher(self._publisher)
 
@@ -244,7 +254,8 @@ class Outputs:
             self._reason.send(text_message(text))
 
     def close(self) -> None:
-        """Stop publishing."""
+        """Stop publishing, once readers have what was published last."""
+        end = time.monotonic() + _LAST_WORDS
         for publisher in self.publishers.values():
-            publisher.destroy()
+            publisher.destroy(max(0.0, end - time.monotonic()))
         self.publishers.clear()
