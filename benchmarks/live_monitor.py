@@ -559,7 +559,8 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, 
                     runs[name].append(Run(n, rate, seconds, left).measure(*subject))
                 bare = Run(n, rate, seconds, left).measure("take", "events", [], delays=True)
                 for name, found in zip(late, (bare, runs["monitor, all outputs heard"][-1]), strict=True):
-                    late[name].append(float(np.percentile(found["delays"][100:], 99)) / 1e6)
+                    settled = found["delays"][round(WARM_UP * rate) :]  # the first wait until both topics are heard
+                    late[name].append(float(np.percentile(settled, 99)) / 1e6)
             cpu = {name: np.array([found["cpu"] for found in some]) for name, some in runs.items()}
             beside = {(name, peer): cpu[name] / cpu[peer] for name in cpu for peer in BARE}  # turn by turn
             for name, some in runs.items():
