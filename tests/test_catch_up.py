@@ -77,12 +77,20 @@ def in_parts(messages: list[Message]) -> list[Message]:
     return sorted([*come, *rest], key=lambda m: m[0])
 
 
+def two_at_once(messages: list[Message]) -> list[Message]:
+    """The first two states come together, then their controls: less than where a topic is far behind."""
+    came = messages[3][0]
+    early = sorted(messages[:4], key=lambda m: m[1] != STATE_TOPIC)
+    return [(came + 1e-5 * k, *message) for k, (_, *message) in enumerate(early)] + messages[4:]
+
+
 DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
     "on time": lambda m: m,
     "controls come 0.6 s after the states": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 0.6),
     "controls come 3 s after the states": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 3.0),
     "both come in bursts": lambda m: held_up(held_up(m, STATE_TOPIC, 0.0, 2.0), CONTROL_TOPIC, 0.0, 2.1),
     "states come 0.6 s after the controls": lambda m: held_up(m, STATE_TOPIC, 0.0, 0.6),
+    "two samples come at once": two_at_once,
     "stopped, then topic by topic": lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC),
     "stopped, then in chunks": lambda m: stopped(m, 5.01, 16, STATE_TOPIC),
     "stopped, then in chunks, controls first": lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC),

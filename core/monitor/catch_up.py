@@ -207,9 +207,10 @@ class CatchUp:
             while self._recent[0][0] < now - _QUIET:
                 self._recent.popleft()
         else:
-            clock = self._progress[self._clock].newest
-            behind = clock - stamp_ns
-            if (progress.in_burst(2) and behind > 0) or (first and clock and behind > self._step_ns):
+            clock = self._progress[self._clock]
+            behind = clock.newest - stamp_ns
+            burst = progress.in_burst(2) or clock.in_burst(2)
+            if (burst and behind > 0) or (first and clock.newest and behind > self._step_ns):
                 self._bursts = True
                 self.behind_ns = max(self.behind_ns, behind)
 
