@@ -81,6 +81,20 @@ def test_output_that_cannot_be_written(folder, what):
     assert "Exception ignored" not in done.stderr
 
 
+@pytest.mark.parametrize("package", ["lz4", "mcap", "rosbags", "tqdm", "zstandard"])
+def test_a_robot_that_only_monitors_is_told_what_recordings_need(folder, package):
+    """There apt installs numpy and PyYAML alone. MCAP files need the first two; not every file needs the others."""
+    without = f"import sys; sys.modules[{package!r}] = None; from uncertain_lti.cli.main import main; sys.exit(main())"
+    words = [sys.executable, "-c", without, *commands(folder)["check"]]
+    done = subprocess.run(words, text=True, capture_output=True, timeout=1200)
+    assert "Traceback" not in done.stderr
+    if done.returncode:
+        assert done.returncode == 2, done.stderr
+        assert f"the Python package {package}" in done.stderr and "pip install uncertain-lti-ros" in done.stderr
+    else:
+        assert package not in ("lz4", "mcap")
+
+
 @pytest.mark.parametrize("module", ["uncertain_lti.base.english", "uncertain_lti.cli.check", "argparse"])
 def test_a_damaged_installation_is_no_alarm(module):
     start = "from uncertain_lti.cli.program import main"
