@@ -166,5 +166,11 @@ def test_the_files_for_operation_name_what_there_is() -> None:
     file = yaml.safe_load((ROOT / "config/diagnostic_aggregator.yaml").read_text())
     analyzers = file["/**"]["ros__parameters"]["analyzers"]["envelope"]["analyzers"]
     assert analyzers["monitor"]["expected"] == [f"{NAME}: monitor"]
-    assert analyzers["states"]["startswith"] == [f"{NAME}: "]
     assert analyzers["monitor"]["timeout"] > DEFAULTS["diagnostics_period"]
+    branches = {"monitor": "monitor", "a": "states", "monitor_speed": "states"}
+    for name, branch in branches.items():  # `expected` alone matches nothing in Jazzy; a regex has to match as a whole
+        matches = [
+            key for key, an in analyzers.items() for regex in an["regex"] if re.fullmatch(regex, f"{NAME}: {name}")
+        ]
+        assert matches == [branch]
+        assert [f"{NAME}: {name}".removeprefix(prefix) for prefix in analyzers[branch]["remove_prefix"]] == [name]
