@@ -258,6 +258,17 @@ class World:
                 return True
         return bool(self.call(ChangeState, f"{name}/change_state", request).success)
 
+    def manage(self, *labels: str, name: str = MONITOR) -> bool:
+        """Ask for transitions as `nav2_lifecycle_manager` of Jazzy does, by its source, where `bond_timeout` is 0.0.
+
+        It believes the state, not the answer, and gives up at the first that failed.
+        """
+        for label in labels:
+            self.change(label, name)
+            if self.state(name) != _TRANSITIONS[label][1]:
+                return False
+        return True
+
     def state(self, name: str = MONITOR) -> str:
         return str(self.call(GetState, f"{name}/get_state", GetState.Request(), again=1.0).current_state.label)
 
@@ -271,6 +282,7 @@ _TRANSITIONS = {  # and where they lead
     "deactivate": (Transition.TRANSITION_DEACTIVATE, "inactive"),
     "cleanup": (Transition.TRANSITION_CLEANUP, "unconfigured"),
     "shutdown": (Transition.TRANSITION_ACTIVE_SHUTDOWN, "finalized"),
+    "shutdown when unconfigured": (Transition.TRANSITION_UNCONFIGURED_SHUTDOWN, "finalized"),
 }
 
 

@@ -7,12 +7,12 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Everything armed in the node: live is offline through a swapped model, a killed process and another QoS."""
+"""Everything armed in the node: live is offline in disorder, through a swapped model, a killed process, another QoS."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,20 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_processes import Diagnostics, World, open_world, until
 from sensor_msgs.msg import JointState
-from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, by_hand, saved, stamp_of
-from test_monitor_faults import NODE, stamped
+from test_live import (
+    CONTROL,
+    EPOCH_NS,
+    STATE,
+    STEP_NS,
+    Outputs,
+    bits,
+    by_hand,
+    header_bag,
+    offline,
+    saved,
+    stamp_of,
+)
+from test_monitor_faults import NODE, faulty_bag, stamped
 
 
 @pytest.fixture
@@ -43,13 +55,13 @@ def world(tmp_path: Path) -> Iterator[World]:
         yield world
 
 
-def everything_armed(seed: int) -> UncertainLTI:
+def everything_armed(seed: int, v: float = 0.15) -> UncertainLTI:
     """The model by hand with a schedule, horizons, every kind of statistic at one of them, and repeats."""
     plain, rng, n = by_hand(), np.random.default_rng(seed), 2
 
     def scheduled(scale: float = 1.0) -> dict[str, Any]:
         share = rng.uniform(0.5, 1.0, 3)
-        arrays = {name: getattr(plain, name) for name in ARRAYS} | {"v": np.full(n, 0.15)}
+        arrays = {name: getattr(plain, name) for name in ARRAYS} | {"v": np.full(n, v)}
         return {name: np.stack([scale * s * value for s in share]) for name, value in arrays.items()}
 
     residuals = Residuals(np.zeros(n), np.eye(n))
@@ -69,6 +81,28 @@ def everything_armed(seed: int) -> UncertainLTI:
         residuals=residuals,
         repeats=Repeats(np.full(n, 0.1)),
     )
+
+
+@pytest.mark.parametrize("disorderly", [header_bag, faulty_bag])
+def test_everything_armed_stays_offline_in_disorder(
+    world: World, tmp_path: Path, disorderly: Callable[[UncertainLTI, Path, int], Path]
+) -> None:
+    """Late, repeated, swapped, damaged and absent messages; stamps that jump, go back or are missing."""
+    model = everything_armed(4, v=0.005)
+    path = saved(model, tmp_path)
+    bag = disorderly(by_hand(), tmp_path / "run.mcap", 300)
+    verdicts = offline(path, bag)
+    judged = [v for v in verdicts if v.judged]
+    assert len({v.status for v in verdicts}) > 3 and {v.alarm for v in judged} == {True, False}
+    world.monitor(path)
+    names = ("horizon_utilisation", "statistics")
+    outputs = Outputs.of(world, *names)
+    world.command("play", bag, "--rate", 2).succeed()
+    outputs.hold_against(verdicts, ("a", "b"))
+    for name in names:
+        told = outputs.topics[name].count(len(judged))
+        assert [bits(m.position) for m in told] == [bits(np.ravel(getattr(v, name))) for v in judged]
+        assert sum(not np.isnan(m.position).any() for m in told) > 50
 
 
 def test_everything_armed_stays_offline_through_a_swap_a_kill_and_a_change_of_qos(world: World, tmp_path: Path) -> None:

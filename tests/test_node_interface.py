@@ -185,6 +185,30 @@ sys.exit(envelope_monitor.main())
     diagnostics.reaches(0)
 
 
+def test_a_lifecycle_manager_of_nav2_brings_it_up_and_down(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    (tmp_path / "wrong.model.json").write_text("{}")
+    process = world.run_node("envelope_monitor", {"model": str(tmp_path / "wrong.model.json"), "autostart": False})
+    startup, pause, reset = ("configure", "activate"), ("deactivate",), ("deactivate", "cleanup")
+    assert not world.manage(*startup) and world.state() == "unconfigured"
+    process.says("not configured")
+    assert world.set(model=str(saved(model, tmp_path))) == (True, "") and world.state() == "unconfigured"
+    assert world.manage(*startup)
+    flags, plant = world.listen(JointState, f"{NODE}/flags").connected(), Plant(world, model)
+    plant.subscribed().send(3)
+    assert flags.count(3)[2].position[0] == 0.0
+    assert world.manage(*pause) and world.manage("activate"), "pause and resume"
+    plant.subscribed().send(2)
+    assert [np.isnan(m.position[0]) for m in flags.count(5)[3:]] == [True, False]
+    assert world.manage(*reset) and world.manage(*startup) and world.manage(*reset, "shutdown when unconfigured")
+    assert not world.manage("configure") and world.state() == "finalized"
+
+
+def test_a_manager_gives_up_on_a_node_that_started_itself(world: World, tmp_path: Path) -> None:
+    world.monitor(saved(by_hand(), tmp_path))
+    assert not world.manage("configure") and world.state() == "active"
+
+
 # --- executors ----------------------------------------------------------------------------------------------
 
 

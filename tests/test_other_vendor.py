@@ -23,8 +23,10 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 pytest.importorskip("cyclonedds", reason="the cyclonedds wheel, which subscribes here, is not installed")
 
 from ros_processes import World, open_world
+from test_armed_node import everything_armed
 from test_live import by_hand, header_bag, offline, saved
 
+from uncertain_lti import UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.sampling.status import Status
 
@@ -94,10 +96,12 @@ def world(tmp_path: Path) -> Iterator[World]:
         yield world
 
 
-def test_another_vendor_hears_every_flag(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm_rule=AlarmRule(2, 5))
+@pytest.mark.parametrize(
+    "model", [by_hand(alarm_rule=AlarmRule(2, 5)), everything_armed(5, v=0.005)], ids=["one step", "all"]
+)
+def test_another_vendor_hears_every_flag(world: World, tmp_path: Path, model: UncertainLTI) -> None:
     path = saved(model, tmp_path)
-    bag = header_bag(model, tmp_path / "run.mcap", 300)
+    bag = header_bag(by_hand(), tmp_path / "run.mcap", 300)
     verdicts = offline(path, bag)
     world.monitor(path)
     world.env["CYCLONEDDS_URI"] = _CONFIGURATION
