@@ -705,6 +705,36 @@ def soak(seconds: float, rate: float, n: int, domain: int, armed: bool) -> dict[
             child.end()
 
 
+def stalled(seconds: float, rate: float, n: int, domain: int) -> None:
+    """What the monitor receives, judges and publishes while its only reader of all outputs stands still; prints it."""
+    before, after = 5.0, 10.0
+    run = Run(n, rate, before + seconds + after, domain=domain)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            subject = run.monitor(folder)
+            hearer = run.part("hear", *TOPICS)
+            hearer.line()
+            publisher = run.part("publish", str(n), str(rate), str(run.seconds), "0", "", "hearer")
+            publisher.line()
+            time.sleep(before)
+            memory = subject.memory
+            hearer.process.send_signal(signal.SIGSTOP)
+            time.sleep(seconds)
+            hearer.process.send_signal(signal.SIGCONT)
+            publisher.patient = True
+            sent = int(publisher.line())
+            time.sleep(1.0)
+            said = status(run.domain)
+            print(
+                f"{sent} samples sent, {said['received'][STATE]} received, {said['verdicts']} judged, "
+                f"{said.get('held_back', 0)} held back, {len(hearer.ask()['delays'])} flags heard; memory "
+                f"{subject.memory - memory:+.1f} MiB; counters {said['counters']}"
+            )
+    finally:
+        for child in run.children:
+            child.end()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=6.0, help="length of one run")
@@ -717,6 +747,9 @@ def main() -> None:
         "--armed", action="store_true", help="with --soak: schedule, horizons, statistics; live = offline"
     )
     parser.add_argument("--domain", type=int, default=0, metavar="N", help="ROS domain of --soak; 0: any")
+    parser.add_argument(
+        "--stalled", type=float, metavar="S", help="instead, stop the reader of all outputs for S seconds"
+    )
     parser.add_argument("--soak-rate", type=float, default=1000.0, metavar="HZ")
     parser.add_argument("--before", metavar="FOLDER", help="instead, beside the monitor of another checkout")
     parser.add_argument("--part", nargs="+", help=argparse.SUPPRESS)
@@ -737,6 +770,8 @@ def main() -> None:
         found = soak(args.soak, args.soak_rate, args.sizes[0], args.domain, args.armed)
         if not (found["exact"] and found["growth"] < 1.0):
             raise SystemExit(1)
+    elif args.stalled:
+        stalled(args.stalled, args.rates[-1], args.sizes[0], args.domain)
     elif args.before:
         compare_versions(args.before, args.rates, args.sizes, args.seconds, args.repeats)
     else:

@@ -18,8 +18,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,10 +32,12 @@ from conftest import ROOT
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.monitor.verdict import Verdict
+from uncertain_lti.monitor.verdict_messages import TRUE
 from uncertain_lti.sampling.status import Status
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+import test_compiled as compiled_cases
 from geometry_msgs.msg import Vector3Stamped
 from processes import own_domain
 from rclpy.duration import Duration
@@ -44,6 +48,7 @@ from ros_processes import Diagnostics, World, open_world, until
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt8
 from std_srvs.srv import Trigger
+from test_compiled import ros as ros
 from test_live import (
     CONTROL,
     EPOCH_NS,
@@ -66,6 +71,8 @@ from test_live import (
     stamp_of,
     vector,
 )  # fmt: skip
+
+from uncertain_lti_ros import publishers
 
 NODE = "/envelope_monitor"
 
@@ -473,6 +480,50 @@ def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Pat
     plant.send(3, off=2.0)
     until(lambda: violation.messages[-1].data, "the alarm")
     assert world.set(enable="") == (True, "") and world.status()["armed"] is True
+
+
+def test_a_subscriber_that_stands_still_costs_outputs_and_no_verdict(
+    ros: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each message takes 1 ms to send, as Fast DDS does to a stopped process; later it takes 5 µs again."""
+    clock = SimpleNamespace(now=100.0, sending=1e-3)
+    monkeypatch.setattr(publishers, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    model = compiled_cases.saved(tmp_path / "m.json", 2, np.random.default_rng(5))
+    node = compiled_cases.Node(tmp_path / "m.json")
+    sent: Counter[str] = Counter()
+    alarms: list[bool] = []
+
+    def sends(name: str) -> Any:
+        def send(data: bytes) -> None:
+            clock.now += clock.sending
+            sent[name] += 1
+            if name == "violation":
+                alarms.append(data == TRUE)
+
+        return send
+
+    for name, output in node.outputs.publishers.items():
+        output.send = sends(name)
+    stream = compiled_cases.stream(model, np.random.default_rng(6), 4000, 0.1)
+    heard = [False]
+    began, verdicts, samples = clock.now, 0, 0
+    for received, (arrival, topic, data) in enumerate(stream, 1):
+        clock.now += 5e-4
+        node.arrive(arrival, topic, data)
+        verdicts, samples = node.session.verdicts, node.session.sampler.counters["samples"]
+        if node.session.alarm != heard[-1]:
+            heard.append(node.session.alarm)
+            assert alarms[-1] == heard[-1], "each change of the alarm is published at once"
+        if samples == 2000 and clock.sending > 1e-4:
+            assert sent["flags"] < 400, "most verdicts are held back"
+            assert sent["flags"] + node.outputs.held_back >= verdicts > 1000, "nothing else is"
+            assert clock.now - began < 1.4 * 5e-4 * received + 0.6, "what is left of the time is for the inputs"
+            assert node.outputs.problems and "stands still" in node.outputs.problems[0]
+            clock.sending, before = 5e-6, (verdicts, sent["flags"], node.outputs.held_back)
+    assert len(heard) > 2 and not node.outputs.problems
+    judged, published, held = verdicts - before[0], sent["flags"] - before[1], node.outputs.held_back - before[2]
+    assert published >= judged - held > 0.9 * judged, "all of them again"
+    compiled_cases.end([node])
 
 
 def test_reload_reads_the_file_again_or_says_why_not(world: World, tmp_path: Path) -> None:

@@ -573,6 +573,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _lasting_problems(self) -> list[str]:
         """Problems that last and concern no topic of the model."""
         problems = [self._enable_problem] if self._enable_problem else []
+        problems += self.outputs.problems
         if self.clock.ros_time_is_active and not self.clock.now().nanoseconds:
             problems.append("use_sim_time is true, and no time has come on /clock")
         return problems
@@ -588,7 +589,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is not None and self.active:
             reports = self.session.report(now, self.settings.real("state_timeout"), self._problems())
             extra = input_values(self.inputs)
-            extra |= {"unexpected errors": str(self.failures.count), **self.snapshots.values}
+            extra |= {"unexpected errors": str(self.failures.count), "held back": str(self.outputs.held_back)}
+            extra |= self.snapshots.values
             reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
         else:
             state = self.state_name
@@ -661,6 +663,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "alarm": session.alarm if session else False,
                 "latched": session.latched if session else False,
                 "armed": session.arming.on if session else None,
+                "held_back": self.outputs.held_back,
                 "counters": dict(session.sampler.counters) if session else {},
                 "unreadable": dict(session.unreadable) if session else {},
                 "future": dict(session.future) if session else {},

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -29,7 +30,10 @@ from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.polled_events import PolledEvents
 
-_OUTPUT_DEPTH = MOST  # what waits at a start or after a stall is sent at once; what readers have is kept no longer
+_OUTPUT_DEPTH = MOST // 5  # samples that a start or a stall may send at once; what readers have is kept no longer
+_SLOW = 0.0001  # s to send one message; it takes 3 to 10 µs, unless Fast DDS makes the way to a reader anew each time
+_PATIENCE = 60  # samples that are sent so slowly, less those that are not; a busy machine delays one of many
+_REST = 4.0  # times what the last try took pass until the next
 _LAST_WORDS = 1.0  # s that the end waits until readers have the last messages
 _WHEN = {
     "message": ("message",),
@@ -129,6 +133,8 @@ class Outputs:
         By name of the output; empty while the node is not configured.
     alarm_sent : float
         When ~/violation was last published, steady time in s.
+    held_back : int
+        Verdicts that were not published, as sending took so long that inputs would have been lost.
     """
 
     def __init__(self, node: LifecycleNode, now: float) -> None:
@@ -139,6 +145,7 @@ class Outputs:
         # By what they are published for, None where nobody listens; empty when it must be made again.
         self._heard: dict[str, _Heard | None] = {}
         self._alarm_heard = self._reason_heard = False
+        self.held_back, self._slow, self._until = 0, 0, -math.inf
 
     def open(self, heartbeat: float) -> None:
         """Make the publishers.
@@ -191,6 +198,9 @@ class Outputs:
         First all messages are laid out, then all are sent together: threads of the middleware that are woken by
         one message then find the others too, and need not be woken again.
 
+        A subscriber that stands still can make sending a hundred times slower, so that inputs would be lost. Then
+        verdicts are held back, but for a try now and then; the alarm is published when it changes.
+
         Parameters
         ----------
         session : Session
@@ -208,6 +218,9 @@ class Outputs:
             self._listen()
         heard = self._heard
         messages: list[tuple[OutputPublisher, bytes]] = []
+        if self._slow >= _PATIENCE and time.monotonic() < self._until:
+            self.held_back += len(verdicts)
+            verdicts, opened = (), False
         for verdict in verdicts:
             judged = verdict.judged
             if made := heard.get("judged" if judged else "message"):
@@ -223,10 +236,29 @@ class Outputs:
         if turned:
             self.alarm_sent = now
             messages.append((self._violation, TRUE if session.alarm else FALSE))
-        for publisher, message in messages:
-            publisher.send(message)
+        if messages:
+            self._send(messages)
         if self._reason_heard:
             self.send_reason(session.reasons.text)
+
+    def _send(self, messages: Sequence[tuple[OutputPublisher, bytes]]) -> None:
+        began = time.monotonic()
+        for publisher, message in messages:
+            publisher.send(message)
+        took = (ended := time.monotonic()) - began
+        slow = self._slow + (1 if took > _SLOW * len(messages) else -1)
+        self._slow = max(0, min(slow, 2 * _PATIENCE))
+        self._until = ended + _REST * took
+
+    @property
+    def problems(self) -> list[str]:
+        """Why verdicts are held back, one sentence; empty if they are not."""
+        if self._slow < _PATIENCE:
+            return []
+        return [
+            "a subscriber of the outputs stands still: sending to it takes so long that most verdicts are not "
+            "published, the alarm is"
+        ]
 
     def send_alarm(self, alarm: bool, now: float) -> None:
         """Publish ~/violation.
