@@ -77,11 +77,11 @@ def in_parts(messages: list[Message]) -> list[Message]:
     return sorted([*come, *rest], key=lambda m: m[0])
 
 
-def two_at_once(messages: list[Message]) -> list[Message]:
-    """The first two states come together, then their controls: less than where a topic is far behind."""
+def two_at_once(messages: list[Message], apart: float = 0.0) -> list[Message]:
+    """The first two states come so many s apart, then their controls at once: none is far behind the clock topic."""
     came = messages[3][0]
     early = sorted(messages[:4], key=lambda m: m[1] != STATE_TOPIC)
-    return [(came + 1e-5 * k, *message) for k, (_, *message) in enumerate(early)] + messages[4:]
+    return [(came + 1e-5 * k + apart * (k > 0), *message) for k, (_, *message) in enumerate(early)] + messages[4:]
 
 
 DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
@@ -91,6 +91,7 @@ DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
     "both come in bursts": lambda m: held_up(held_up(m, STATE_TOPIC, 0.0, 2.0), CONTROL_TOPIC, 0.0, 2.1),
     "states come 0.6 s after the controls": lambda m: held_up(m, STATE_TOPIC, 0.0, 0.6),
     "two samples come at once": two_at_once,
+    "two samples come at once, their states less so": lambda m: two_at_once(m, 0.4 * STEP),
     "stopped, then topic by topic": lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC),
     "stopped, then in chunks": lambda m: stopped(m, 5.01, 16, STATE_TOPIC),
     "stopped, then in chunks, controls first": lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC),

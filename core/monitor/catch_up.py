@@ -40,6 +40,7 @@ class _Progress:
     def __init__(self) -> None:
         self._last: deque[tuple[float, int]] = deque(maxlen=10)  # steady time and stamp of the last messages
         self.newest = 0  # stamp, ns
+        self.behind = 0  # ns, the last message behind the clock topic
 
     def advance(self, stamp: int, now: float) -> int:
         """Take a stamp; the step from the one before."""
@@ -208,11 +209,12 @@ class CatchUp:
                 self._recent.popleft()
         else:
             clock = self._progress[self._clock]
-            behind = clock.newest - stamp_ns
-            burst = progress.in_burst(2) or clock.in_burst(2)
-            if (burst and behind > 0) or (first and clock.newest and behind > self._step_ns):
+            before, behind = progress.behind, clock.newest - stamp_ns
+            progress.behind = behind
+            together = progress.in_burst(2) and max(before, behind) > 0  # two messages of which one is late
+            if together or (first and clock.newest and behind > self._step_ns):
                 self._bursts = True
-                self.behind_ns = max(self.behind_ns, behind)
+                self.behind_ns = max(self.behind_ns, before, behind)
 
     def ready(self, now: float) -> list[Waiting]:
         """Messages that need not wait any longer, in the order in which they are to be taken.
