@@ -62,10 +62,19 @@ def start(context):
         prefix=given["prefix"] or None,
         respawn=respawn,
         respawn_delay=float(given["respawn_delay"]),
-        on_exit=Shutdown(reason="envelope_monitor is required, and has ended") if required else None,
+        on_exit=ended if required else None,
         output="screen",
     )
     return [node]
+
+
+def ended(event, context):
+    """End the launch that the node is required for, with status 1 unless the node ended in order."""
+    if context.is_shutdown:
+        return None
+    if event.returncode:
+        raise RuntimeError(f"{event.process_name} is required, and ended with status {event.returncode}")
+    return Shutdown(reason=f"{event.process_name} is required, and has ended")
 
 
 def truth(name, text):

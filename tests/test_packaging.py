@@ -20,6 +20,8 @@ from collections.abc import Iterable
 from distutils.core import run_setup  # setuptools brings it where Python no longer does
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 from xml.etree import ElementTree
 
 import pytest
@@ -297,3 +299,19 @@ def test_the_changelog_of_a_release_is_what_catkin_reads(package):
     tree = core.publish_doctree(released, settings_overrides={"report_level": 2, "halt_level": 2})
     (section,) = [*tree.findall(lambda node: node.tagname == "bullet_list" and node.parent.tagname != "list_item")]
     assert len(section.children) == len(re.findall(r"^- ", text, re.MULTILINE))
+
+
+def test_a_launch_ends_with_the_node_that_it_requires(monkeypatch):
+    """With status 1 after a fault, in order otherwise. `launch` itself comes with ROS 2 alone."""
+    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    ended = runpy.run_path(str(ROOT / "launch/envelope_monitor.launch.py"))["ended"]
+
+    def end(status, shutting_down=False):
+        event = SimpleNamespace(process_name="envelope_monitor-1", returncode=status)
+        return ended(event, SimpleNamespace(is_shutdown=shutting_down))
+
+    with pytest.raises(RuntimeError, match="envelope_monitor-1 is required, and ended with status 2"):
+        end(2)
+    assert end(0) is sys.modules["launch.actions"].Shutdown.return_value
+    assert end(0, shutting_down=True) is end(-2, shutting_down=True) is None, "Ctrl-C ends it already"
