@@ -12,6 +12,7 @@
 import json
 import math
 
+import matplotlib
 import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
@@ -22,6 +23,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.proposal import tune as module
 from uncertain_lti.proposal import ways
+from uncertain_lti.reports.tune_figure import tune_figure
 from uncertain_lti.reports.tune_text import tune_text
 from uncertain_lti.validation import armed
 
@@ -166,12 +168,26 @@ def test_a_control_that_acts_late_is_taken_earlier():
     assert dict(tuned.chosen.setting.delays) == {"u1": 3} and "u1 3 samples earlier" in tuned.chosen.words
 
 
+def test_the_figure_has_its_hours_where_nothing_raised_an_alarm(tuned, tmp_path):
+    quiet = [t if "refused" in t else {**t, "alarms": 0, "per_hour": 0.0} for t in tuned.to_dict()["trials"]]
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        tune_figure({**tuned.to_dict(), "trials": quiet, "curve": []}, tmp_path / "tune.svg")
+    assert f"what was left out, {tuned.chosen.hours:.3g} h" in (tmp_path / "tune.svg").read_text()
+
+
 def test_what_to_record_is_named(runs):
-    still = [Transient(r.t_ns, r.x, np.column_stack([r.u, np.ones(len(r))])) for r in runs[:3]]
+    still = [
+        Transient(r.t_ns, np.column_stack([r.x, np.zeros(len(r))]), np.column_stack([r.u, np.ones(len(r))]))
+        for r in runs[:3]
+    ]
     tuned = tune(still, 0.01, budget=1e-6)
     text = "\n".join(tuned.record)
     assert "3 recordings can hardly carry a choice: record 3 more recordings" in text
-    assert "u2 does not move" in text and "h without an alarm would" in text
+    assert (
+        "u2 does not move" in text
+        and "x4 does not move, so nothing says" in text
+        and "h without an alarm would" in text
+    )
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.reports.validation_text import validation_text
 from uncertain_lti.validation import calibration
-from uncertain_lti.validation.armed import Armed, Family, families, kinds_of, quiet, values_of
+from uncertain_lti.validation.armed import Armed, Family, families, kinds_of, quiet, steady, values_of
 from uncertain_lti.validation.blocks import cut, remaining_spans
 from uncertain_lti.validation.calibration import calibrate
 from uncertain_lti.validation.detectable import COMPARED, detectable
@@ -332,6 +332,8 @@ def test_the_condition_stands_beside_every_interval(days):
             assert "90% interval" not in line or beside in line
         assert text.count("90% interval") == 3 and "holds if they are independent of one another" in text
         assert beside in left_out_text(data) and beside in data["calibration"]["words"]
+        missed = f"{1 - 0.1 ** (1 / validation.units):.0%}"  # of such runs, one in ten samples of so many has none
+        assert f"in less than {missed} of the {what} may be in none of them" in text and "show all that happens" in text
 
 
 def test_a_single_group_or_wrong_groups_are_refused(days):
@@ -503,6 +505,26 @@ def test_quiet_rules_raise_as_many_alarms_as_are_allowed(validation):
                 if rules[0].margin > 1.0:
                     assert sum(p.alarms(AlarmRule(1, 1, rules[0].margin / 1.021)) for p in parts) > allowed
     assert factors[1] <= factors[0] and factors[3] <= factors[2]
+
+
+def test_thresholds_are_those_that_halves_need_too(validation, runs):
+    """Never below those of `quiet`, the median of the halves where that is higher; and alarms are counted with them."""
+    options = {"criterion": "qp", "additive": "noise", "full": validation.model}
+    halves = [validate(runs, groups=[k // 3**j % 2 for k in range(12)], **options).parts for j in range(3)]
+    for family in (Family((), 1, 1, DT), Family(("energy",), 10, 1, DT)):
+        alone, counts = quiet(family, validation.model, validation.parts, 0)
+        same, again = steady(family, validation.model, validation.parts, [], 0)
+        assert same == alone and again.tolist() == counts.tolist()
+        rules, counts = steady(family, validation.model, validation.parts, halves, 3)
+        each = [quiet(family, validation.model, half, 3)[0] for half in halves]
+        own, _ = quiet(family, validation.model, validation.parts, 3)
+        assert rules[0].margin == max(own[0].margin, float(np.median([found[0].margin for found in each])))
+        raised = [p.alarms(rules[0]) for p in validation.parts]
+        if not family.kinds:
+            assert raised == counts.tolist() and rules[0].margin > own[0].margin  # half of them bound them worse
+        else:
+            limits = np.median([found[1].threshold for found in each], axis=0)
+            assert rules[1].threshold == tuple(np.maximum(own[1].threshold, limits).tolist())
 
 
 def test_statistics_see_small_faults_that_containment_misses(monkeypatch):

@@ -38,7 +38,7 @@ from uncertain_lti.proposal.suggestion import suggest_schedule
 from uncertain_lti.proposal.trial import Trial, row_of, trial_data, trial_from_data
 from uncertain_lti.proposal.ways import Setting
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.validation.armed import Family, families, quiet
+from uncertain_lti.validation.armed import Family, families, steady
 from uncertain_lti.validation.detectable import (
     COMPARED,
     COMPARED_CASES,
@@ -48,15 +48,18 @@ from uncertain_lti.validation.detectable import (
     typical_within,
 )
 from uncertain_lti.validation.false_alarms import allowed_alarms
+from uncertain_lti.validation.groups import resolve_groups
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
-from uncertain_lti.validation.part import by_unit
+from uncertain_lti.validation.part import Part, by_unit
 from uncertain_lti.validation.result import Validation
 
 STATISTICS = tuple((kind,) for kind in KINDS if kind != "ewma")
 """Statistics that are tried beside containment, one at a time; a moving average sees what the mean does."""
 UNITS = 6
 """Recordings, groups or blocks below which a choice rests on little."""
+HALVED = 4
+"""Recordings or groups from which on thresholds are also asked of fits to half of them."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 MARGIN = 0.02
 """A way must detect faults smaller by this share, on average, to be taken for better than the plain one."""
@@ -104,6 +107,7 @@ class Tuned:
         return {
             "trials": [row_of(t, plain) for t in self.trials],
             "chosen": self.trials.index(self.chosen),
+            "hours": self.chosen.hours,
             "reason": self.reason,
             "record": list(self.record),
             "not_tried": list(self.not_tried),
@@ -127,8 +131,9 @@ def tune(
 
     Additive terms, criteria, constant and growing half-widths, then schedules, then lags and rates of the states, then
     alarm rules are tried, each beside the best of the step before. Every way is fitted without each recording, group or
-    block, its alarm is set to raise at most `false_alarms` per hour there, and the smallest faults are sought that it
-    detects (`validation.detectable`). Ways are compared by the mean logarithm of these sizes; the simplest within one
+    block, its alarm is set to raise at most `false_alarms` per hour there (of HALVED or more recordings or groups also
+    where half of them are left out, `validation.armed.steady`), and the smallest faults are sought that it detects
+    (`validation.detectable`). Ways are compared by the mean logarithm of these sizes; the simplest within one
     standard error of the best (jackknife over what was left out) is chosen, and never one that detects less than the
     plain fit at as many false alarms. Labelled recordings with a fault come first: a way that misses more of them than
     the best by over a standard error is not taken.
@@ -218,6 +223,7 @@ class _Search:
         self.trials: list[Trial] = []
         self.not_tried: list[str] = []
         self._left: tuple[Setting | None, Validation | None, str] = (None, None, "")
+        self._half: tuple[Setting | None, list[tuple[Part, ...]]] = (None, [])
         plain = ways.plain(transients)
         left = self._validated(plain)
         self.within = typical_within(left.parts) if within is None and left is not None else within
@@ -294,13 +300,35 @@ class _Search:
         self._left = setting, left, why
         return left
 
+    def _halves(self, setting: Setting) -> list[tuple[Part, ...]]:
+        """What a setting that was just validated leaves out with half of the recordings or groups; the last is kept."""
+        if self._half[0] == setting:
+            return self._half[1]
+        left, found = self._validated(setting), list[tuple[Part, ...]]()
+        if left is not None and left.kind == "transients" and left.units >= HALVED:
+            runs = setting.prepared(self.transients)
+            options = setting.arguments(runs)
+            options.pop("schedule", None)
+            names, _ = resolve_groups(self.transients, self.groups)
+            names = names or [str(k) for k in range(len(runs))]
+            numbers = {name: k for k, name in enumerate(dict.fromkeys(names))}
+            k = np.arange(len(numbers))
+            for half in (k % 2, k // ((len(k) + 1) // 2), (k + 1) // 2 % 2):
+                groups = [int(half[numbers[name]]) for name in names]
+                try:
+                    found.append(validate(runs, full=left.model, groups=groups, **options).parts)
+                except UncertainLTIError:
+                    continue  # too little is left to fit to
+        self._half = setting, found
+        return found
+
     def _try(self, setting: Setting, family: Family) -> Trial:
         left = self._validated(setting)
         if left is None:
             return Trial(setting, family, refused=self._left[2])
         parts, hours = left.parts, sum(p.hours for p in left.parts)
         try:
-            rules, counts = quiet(family, left.model, parts, allowed_alarms(self.rate, hours))
+            rules, counts = steady(family, left.model, parts, self._halves(setting), allowed_alarms(self.rate, hours))
             model = left.model.replace(alarm=rules)
             found = detectable(model, parts, self.within, kinds=COMPARED, cases=COMPARED_CASES)
         except (FitError, ModelError) as error:
@@ -402,6 +430,9 @@ class _Search:
                 f"confidence, not {self.rate:g}; {needed:.3g} h without an alarm would show that"
             )
         model, domain = left.model, left.model.domain
+        for i, name in enumerate(model.state_names):
+            if not float(domain.x_max[i]) > float(domain.x_min[i]):
+                yield f"{name} does not move, so nothing says which faults of it are seen: record runs in which it does"
         for j, name in enumerate(model.control_names[: self.transients[0].u.shape[1]]):
             unseen = [f for f in chosen.faults if f["kind"] == "offset" and f["signal"] == name]
             low, high = float(domain.u_min[j]), float(domain.u_max[j])
@@ -430,7 +461,8 @@ class _Search:
                 continue
             for allowed in sorted({allowed_alarms(self.rate, hours), 0, 2, 5, 15, 50}):
                 try:
-                    rules, counts = quiet(trial.family, left.model, left.parts, allowed)
+                    halves = self._halves(trial.setting)
+                    rules, counts = steady(trial.family, left.model, left.parts, halves, allowed)
                     model = left.model.replace(alarm=rules)
                     found = detectable(model, left.parts, self.within, kinds=COMPARED, cases=COMPARED_CASES)
                 except (FitError, ModelError):

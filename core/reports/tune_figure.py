@@ -38,9 +38,7 @@ def tune_figure(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
 
     figure, axes = plt.subplots(figsize=(7.0, 4.5), layout="constrained")
     judged = [t for t in data["trials"] if "refused" not in t and t["size"] is not None]
-    hours = next((t["alarms"] / t["per_hour"] for t in judged if t["alarms"]), None)
-    if hours is None:
-        hours = next((p["alarms"] / p["per_hour"] for p in data["curve"] if p["alarms"]), 1.0)
+    hours = data["hours"]
     rate = [max(t["alarms"], NONE) / hours for t in judged]
     axes.plot(rate, [t["size"] for t in judged], ".", color="0.6", label="every way at the rate asked for")
     chosen = data["trials"][data["chosen"]]

@@ -372,3 +372,76 @@ def quiet(
     found = armed.lowest(factors.tolist(), lambda _, counts: counts.sum() <= allowed)
     assert found is not None  # above the largest level there is no alarm
     return armed.at(found[0]), found[1]
+
+
+def steady(
+    family: Family, model: UncertainLTI, parts: Sequence[Part], halves: Sequence[Sequence[Part]], allowed: int
+) -> tuple[tuple[Rule, ...], NDArray[np.intp]]:
+    """The rules of `quiet`, no lower than on recordings of which half was left out.
+
+    Of few recordings left out one at a time and of many ways, the one with the lowest thresholds owes them to chance:
+    fresh recordings then raise its alarm several times as often. What half of the recordings bound badly shows it.
+
+    Parameters
+    ----------
+    family : Family
+        What is armed.
+    model : UncertainLTI
+        The full model.
+    parts : sequence of Part
+        What was left out.
+    halves : sequence of sequence of Part
+        The same recordings, judged by models of half of them, for several ways to halve them: the median counts.
+    allowed : int
+        Alarms, on `parts` and on each of `halves`.
+
+    Returns
+    -------
+    tuple of Rule
+        The alarm.
+    array (parts,) of int
+        Alarms of each of `parts`.
+
+    Raises
+    ------
+    FitError
+        No threshold is quiet on `parts`: bounds without width are left.
+    """
+    rules, counts = quiet(family, model, parts, allowed)
+    others = []
+    for half in halves:
+        try:
+            others.append(_thresholds(quiet(family, model, half, allowed)[0], model.n))
+        except FitError:
+            continue  # that half says nothing of how high is high enough
+    if not others:
+        return rules, counts
+    own = _thresholds(rules, model.n)
+    raised = [
+        np.maximum(one, np.median(every, axis=0)) for one, every in zip(own, zip(*others, strict=True), strict=True)
+    ]
+    rules = tuple(_with_thresholds(rule, limits) for rule, limits in zip(rules, raised, strict=True))
+    return rules, np.array([_alarms(rules, part) for part in parts], dtype=np.intp)
+
+
+def _thresholds(rules: Sequence[Rule], n: int) -> list[Array]:
+    """Margin or thresholds of each rule, (c,)."""
+    return [
+        np.array([rule.margin] if isinstance(rule, AlarmRule) else rule.thresholds(n), dtype=np.float64)
+        for rule in rules
+    ]
+
+
+def _with_thresholds(rule: Rule, limits: Array) -> Rule:
+    each = tuple(limits.tolist())
+    if isinstance(rule, AlarmRule):
+        return replace(rule, margin=each[0])
+    return replace(rule, threshold=each[0] if len(each) == 1 else each)
+
+
+def _alarms(rules: Sequence[Rule], part: Part) -> int:
+    """How often rules raise the alarm on one part."""
+    raised = np.zeros(part.judged, dtype=bool)
+    for rule, values in zip(rules, values_of(rules, part), strict=True):
+        raised |= (values > (rule.margin if isinstance(rule, AlarmRule) else 1.0)).any(axis=1)
+    return rising(raised, part.starts)

@@ -69,7 +69,8 @@ def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
     if len(usable) < 2 * blocks:
         raise FitError(
             f"{transient.name}: {plural(len(usable), 'usable transition')} "
-            f"{'is' if len(usable) == 1 else 'are'} too few for {plural(blocks, 'block')}; use fewer blocks"
+            f"{'is' if len(usable) == 1 else 'are'} too few for {plural(blocks, 'block')}; use fewer blocks, or "
+            f"record longer"
         )
     edges = [int(part[0]) for part in np.array_split(usable, blocks)] + [int(usable[-1]) + 1]
     return [(a, b + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]

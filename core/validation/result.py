@@ -220,7 +220,7 @@ def short_condition(validation: Validation) -> str:
     str
         A clause that follows an interval.
     """
-    return f"if the {validation.what}s are independent"
+    return f"if the {validation.what}s are independent and show all that happens"
 
 
 def condition(validation: Validation) -> str:
@@ -243,10 +243,12 @@ def condition(validation: Validation) -> str:
             f"independent of one another; it says nothing about another day, machine or operator"
         )
     alike = "" if v.grouping else ", machines or operators"
+    unseen = 1.0 - (1.0 - v.confidence) ** (1.0 / max(v.units, 1))
     return (
         f"every interval counts {plural(v.units, v.what)}, and holds if they are independent of one another and the "
         f"machine is run like that again: no other days{alike} that differ by more than these do, no wear, no kind of "
-        f"event that none of them shows"
+        f"event that none of them shows; one that comes in less than {unseen:.0%} of the {v.what}s may be in none of "
+        f"them"
     )
 
 
