@@ -363,7 +363,7 @@ STUDIES: dict[str, Callable[[Iterable[int]], Held]] = {
     "drift": drift,
     "detectable": detectable_faults,
 }
-SLOW = {"statistics": 4, "rare": 20, "drift": 16, "detectable": 2}
+SLOW = {"statistics": 12, "rare": 20, "drift": 16, "detectable": 2}
 """Studies that take about a second of processor time a plant, and how many plants the suite has of them."""
 
 
