@@ -16,9 +16,10 @@
     ./run python benchmarks/regimes.py bags           # the three shipped noisy recordings: one knot is right
     ./run python benchmarks/regimes.py gas-turbine    # the real micro gas turbine, each recording left out in turn
     ./run python benchmarks/regimes.py linear minute  # a linear plant; a minute of data
-    ./run python benchmarks/regimes.py million        # 1e6 transitions, 5 knots, against least squares
     ./run python benchmarks/regimes.py live           # CPU time of a verdict, with one knot and more
     ./run python benchmarks/regimes.py all
+
+The time of a fit with five knots: `fit.py scheduled`.
 
 PARC and jax-sysid are asked from the interpreter --peers (default: .venv-regimes/bin/python); make one with
 
@@ -625,49 +626,6 @@ def minute(keep: Path | None) -> None:
     left_out("CrazyPAD: four healthy flights", transients, "thrust", "both", (1, 3, "auto"))
 
 
-def million(keep: Path | None, count: int) -> None:
-    """The public fit with five knots, against least squares on the same regressors: CPU time, the two in turn."""
-    from fit import recorded
-
-    clean = recorded(count)
-    rows = []
-    for noise, additive in ((0.0, "none"), (NOISE, "noise")):
-        x = clean.x + noise * np.random.default_rng(1).standard_normal(clean.x.shape)
-        run = Transient(clean.t_ns, x, clean.u)
-        low, high = np.quantile(x[:, 0], [0.005, 0.995])
-        knots = np.linspace(low, high, 5)
-        z, step, dt = np.hstack([x, clean.u])[:-1], np.diff(x, axis=0), run.dt[:, None]
-        hats = np.stack([np.interp(x[:-1, 0], knots, row) for row in np.eye(5)], axis=1)
-        phi = ((dt * hats)[:, :, None] * z[:, None]).reshape(len(z), -1)
-        for criterion, name in CRITERIA.items():
-            peer = ours = plain = math.inf
-            for _ in range(3):
-                marks = [time.process_time()]
-                np.linalg.lstsq(phi, step, rcond=None)
-                marks.append(time.process_time())
-                model = fit(run, criterion, additive=additive, schedule={"x1": knots.tolist()})  # type: ignore[arg-type]
-                marks.append(time.process_time())
-                one = fit(run, criterion, additive=additive)  # type: ignore[arg-type]
-                marks.append(time.process_time())
-                taken = np.diff(marks)
-                peer, ours, plain = min(peer, taken[0]), min(ours, taken[1]), min(plain, taken[2])
-            lower, upper = model.bounds(x[:-1], clean.u[:-1], run.dt)
-            left = int((~((lower <= x[1:]) & (x[1:] <= upper))).any(axis=1).sum())
-            rows.append(
-                [
-                    f"{noise:g}", additive, name, f"{peer:.2f} s", f"{ours:.2f} s", f"{ours / peer:.2f}",
-                    f"{plain:.2f} s",
-                    *(f"{m.fit_summary['optimality_gap']:.0e}" for m in (model, one)), str(left),
-                ]
-            )  # fmt: skip
-    header = ["noise", "additive", "criterion", "lstsq, 45 columns", "fit, 5 knots", "ratio", "fit, 1 knot"]
-    table(
-        f"{count} transitions, n = 5, m = 4, 5 knots: CPU time (aim: ratio at most 2)",
-        [*header, "gap, 5 knots", "gap, 1 knot", "outside"],
-        rows,
-    )
-
-
 def live(keep: Path | None) -> None:
     """CPU time of the monitor's verdict on one sample after the other, models of one knot and of more in turn."""
     rng, rows, count = np.random.default_rng(0), [], 2000
@@ -707,21 +665,23 @@ PARTS: dict[str, Callable[[Path | None], None]] = {
 def main() -> None:
     """Run the parts that are named."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="+", choices=[*PARTS, "coil", "million", "all"])
+    parser.add_argument("parts", nargs="+", choices=[*PARTS, "coil", "all"])
     parser.add_argument("--keep", type=Path, help="folder for simulated runs")
     parser.add_argument(
         "--without-auto", action="store_true", help="leave out the automatic choice, which takes longest"
     )
+    parser.add_argument("--criterion", choices=CRITERIA, help="this one alone")
     parser.add_argument("--peers", default=str(ROOT / ".venv-regimes/bin/python"), help="interpreter of the peers")
-    parser.add_argument("--transitions", type=int, default=10**6, help="for million")
     options = parser.parse_args()
     if options.without_auto:
         global KNOTS
         KNOTS = tuple(k for k in KNOTS if k != "auto")
+    if options.criterion:
+        for other in [c for c in CRITERIA if c != options.criterion]:
+            del CRITERIA[other]
     every = {
         **PARTS,
         "coil": lambda keep: coil(keep, options.peers),
-        "million": lambda keep: million(keep, options.transitions),
     }
     for part in every if "all" in options.parts else options.parts:
         began = time.perf_counter()
