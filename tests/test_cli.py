@@ -372,6 +372,7 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
     [
         (["fit", "a.mcap", "--signls", "s.yaml", "--output", "m"], "there is no --signls (is --signals meant?)"),
         (["check", "m", "a.mcap", "--jsn"], "unrecognized arguments: --jsn (is --json meant?)"),
+        (["check", "m", "a.mcap", "--discard", "1"], "--discard 1 (an option of fit)"),
         (["chek", "m"], "(is check meant?)"),
         (["fti", "m"], "(is fit meant?)"),
     ],

@@ -237,7 +237,9 @@ class _Parser(argparse.ArgumentParser):
                 a.choices for a in self._actions if isinstance(a.choices, dict)
             ]
             known = {o for group in commands for p in group.values() for o in p._option_string_actions}
-            message += meant(message.split(": ")[1].split()[0].partition("=")[0], known, 1)
+            word = message.split(": ")[1].split()[0].partition("=")[0]
+            takes = sorted({name for g in commands for name, p in g.items() if word in p._option_string_actions})
+            message += f" (an option of {', '.join(takes)})" if takes else meant(word, known, 1)
         super().error(message)
 
 
