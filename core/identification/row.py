@@ -52,7 +52,7 @@ of the squared widths. Whether it was is seen from the optimum of δ alone, at t
 it seldom is small enough, so they are left to the simplex method at once.
 """
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
-_HELD = 6
+_HELD = 12
 """Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
 _RIDGE = 1e-9
 """Share of the largest weight with which the ties of (11) hold on to the vertex where nothing else decides."""
