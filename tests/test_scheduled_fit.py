@@ -414,6 +414,13 @@ def test_schedules_that_make_no_sense_are_refused(schedule, words):
         fit(drawn(THREE, 300, 1), schedule=schedule)
 
 
+def test_knots_that_do_not_increase_are_named_in_recorded_units():
+    transient = drawn(THREE, 300, 1)
+    point = OperatingPoint(np.zeros(2), np.array([0.5, 0.0]), np.ones(2), np.array([2.0, 1.0]))
+    with pytest.raises(FitError, match=r"knots of 'u1' must increase, and are \[1.0, -1.0\]"):
+        fit(transient, operating_point=point, schedule={"u1": (1, -1)})
+
+
 def test_a_signal_that_stands_still_has_no_knots():
     transient = drawn(THREE, 300, 1)
     still = Transient(transient.t_ns, transient.x, np.column_stack([np.ones(301), transient.u[:, 1]]))

@@ -16,13 +16,15 @@ import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import Transient, UncertainLTI, fit, validate
+from uncertain_lti import EnvelopeMonitor, OperatingPoint, Transient, UncertainLTI, fit, validate
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Modes
+from uncertain_lti.model.free_run import free_run
 from uncertain_lti.proposal.scheduling import EXCESS_FOR_MUCH, WANTED, choose_knots
 from uncertain_lti.proposal.suggestion import promise, suggest_schedule, thinned
+from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
 from uncertain_lti.validation.fitted_model import validate_model
 
 DT = 0.05
@@ -128,6 +130,48 @@ def test_knots_on_one_signal_beside_modes_of_another():
     model = fit(runs, schedule={"gear": Modes([1, 2]), "x1": "auto"}, **options())
     assert [axis.signal for axis in model.schedule.axes] in (["gear"], ["x1", "gear"], ["gear", "x1"])
     assert model.fit_summary["schedule"][0]["candidates"][0]["knots"] == 1
+
+
+def with_further(transients):
+    """The runs with a signal that is neither state nor control: what bends the plant, and one that is nothing to it."""
+    rng = np.random.default_rng(3)
+    signals = SignalMap(
+        tuple(Signal(f"x{i}", "/t", f"x{i}", steady=0.0, scale=1.0) for i in (1, 2)),
+        tuple(Signal(f"u{i}", "/t", f"u{i}", steady=0.0, scale=1.0) for i in (1, 2)),
+        tuple(Signal(name, "/t", name, steady=0.0, scale=1.0) for name in ("level", "weather")),
+        schedule=(ScheduleRule("weather", "auto"),),
+    )
+    further = [np.column_stack([t.x[:, 0], np.repeat(rng.uniform(-1, 1, len(t)), 9)[: len(t)]]) for t in transients]
+    return [t.replace(s=s, signals=signals) for t, s in zip(transients, further, strict=True)]
+
+
+def test_a_further_signal_that_is_not_worth_knots_is_no_part_of_the_model():
+    runs = with_further(LINEAR)
+    model = fit(runs, additive="noise")  # scheduled on the weather, as the signals say, with knots auto
+    assert model.schedule is None and model.q == 0 and not model.signals.schedule
+    assert model.fit_summary["schedule"][0]["chosen"] == 1
+    assert any("'level' schedules nothing" in m for m in model.fit_summary["messages"])
+    plain = fit(LINEAR, schedule={}, additive="noise", operating_point=model.operating_point)
+    np.testing.assert_array_equal(model.dA, plain.dA)
+    left = [[part.violated for part in validate(t, full=model, additive="noise").parts] for t in (runs, LINEAR)]
+    assert left[0] == left[1]
+    np.testing.assert_array_equal(
+        EnvelopeMonitor(model).check(runs[0]).upper, EnvelopeMonitor(model).check(LINEAR[0]).upper
+    )
+    discrepancies = [free_run(model, t) for t in (runs[0], LINEAR[0])]
+    np.testing.assert_array_equal(*discrepancies)
+
+
+def test_a_further_signal_is_suggested_and_the_other_left_out():
+    runs = with_further(RUNS)
+    model = fit(runs, schedule={}, suggest=True, **options())
+    assert any("'weather' schedules nothing" in m for m in model.fit_summary["messages"])
+    assert model.fit_summary["suggestion"]["suggested"] in ("level", "x1")
+    scheduled = fit(runs, schedule={"level": 3}, **options())
+    assert [s.name for s in scheduled.signals.scheduling] == ["level"]
+    point = OperatingPoint.of(*(getattr(runs[0].signals, kind) for kind in ("states", "controls", "scheduling")))
+    again = fit(runs, schedule={"level": 3}, operating_point=point, **options())
+    np.testing.assert_array_equal(scheduled.dA, again.dA)
 
 
 def test_what_is_no_choice_is_refused_by_name():

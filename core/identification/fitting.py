@@ -32,7 +32,7 @@ from uncertain_lti.identification.horizons import better_run, fit_horizons
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.identification.regimes import Knots, block_data, scheduled_by
+from uncertain_lti.identification.regimes import Knots, asked_by, block_data, scheduled_by, signals_of
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
@@ -132,6 +132,10 @@ def fit(
     if any(isinstance(h, bool) or not isinstance(h, (int, np.integer)) or not 2 <= h <= MOST_STEPS for h in horizons):
         raise FitError(f"horizons are {list(horizons)}; give whole numbers of steps, 2 to {MOST_STEPS}")
     signals = _common_signals(transients)
+    on = signals_of(asked_by(signals) if schedule is None else schedule, [s.name for s in signals.signals])
+    if operating_point is not None:
+        operating_point = operating_point.scheduled_on([s.name in on for s in signals.scheduling])
+    transients, signals = [t.scheduled_on(on) for t in transients], signals.scheduled_on(on)
     n, m = len(signals.states), len(signals.controls)
     if operating_point is None:
         operating_point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)

@@ -219,6 +219,34 @@ def asked_by(signals: SignalMap) -> dict[str, Knots]:
     return {rule.signal: Modes(rule.modes) if rule.knots is None else rule.knots for rule in signals.schedule}
 
 
+def signals_of(schedule: Schedule | Mapping[str, Knots] | None, names: Sequence[str]) -> list[str]:
+    """The signals that a fit is scheduled on.
+
+    Parameters
+    ----------
+    schedule : Schedule or mapping
+        As `fit` takes it, but not None.
+    names : sequence of str
+        Names of all signals.
+
+    Returns
+    -------
+    list of str
+        Their names; without those that are to have one knot.
+
+    Raises
+    ------
+    FitError
+        There is no such signal.
+    """
+    if isinstance(schedule, Schedule):
+        return [axis.signal for axis in schedule.axes]
+    if not isinstance(schedule, Mapping):
+        return list(names)  # `scheduled_by` refuses it
+    check_names(schedule, names)
+    return [name for name, knots in schedule.items() if isinstance(knots, bool) or knots != 1]
+
+
 def check_names(schedule: Iterable[str], names: Sequence[str]) -> None:
     """Check that there are one or two scheduling signals at most, and that they exist.
 
@@ -328,6 +356,8 @@ def _axis(signal: Signal, row: int, knots: Knots, problem: Problem | None) -> Ax
         raise FitError(
             f"schedule: the knots of '{signal.name}' are no numbers; give numbers, Modes, or how many"
         ) from None
+    if not isinstance(knots, Modes) and (np.diff(values) <= 0.0).any():
+        raise FitError(f"schedule: the knots of '{signal.name}' must increase, and are {values.tolist()}")
     # as the samples are normalised, to the bit: a mode is met exactly
     normalised = tuple(((values - float(signal.steady)) / float(signal.scale)).tolist())
     return Axis(signal.name, **{"modes" if isinstance(knots, Modes) else "knots": normalised})

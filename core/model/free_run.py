@@ -95,6 +95,7 @@ def free_run(model: Any, transient: Transient) -> Array:
         The transient has other numbers of signals than the model.
     """
     refuse_other(transient, Transient, "the recording", "give a Transient", ModelError)
+    transient = transient.scheduled_on([s.name for s in model.signals.scheduling])
     given = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
     if given != (model.n, model.m, model.q):
         raise ModelError(

@@ -171,6 +171,23 @@ class OperatingPoint:
         """
         return np.asarray(normalised(np.asarray(u, dtype=np.float64), self.u_s, self.U))
 
+    def scheduled_on(self, stays: Sequence[bool]) -> OperatingPoint:
+        """The same point without some of the further scheduling signals.
+
+        Parameters
+        ----------
+        stays : sequence of bool
+            One per further scheduling signal.
+
+        Returns
+        -------
+        OperatingPoint
+            This one if all of them stay, or if it is not for as many.
+        """
+        if all(stays) or len(stays) != len(self.s_s):
+            return self
+        return OperatingPoint(self.x_s, self.u_s, self.X, self.U, self.s_s[list(stays)], self.S[list(stays)])
+
     def normalise_s(self, s: ArrayLike) -> Array:
         """Further scheduling signals as deviations.
 

@@ -369,9 +369,7 @@ class UncertainLTI:
         read = {s.topic for s in (*self.signals.states, *self.signals.controls)}
         return UncertainLTI(
             **arrays,
-            signals=replace(
-                self.signals, scheduling=(), schedule=(), time={t: k for t, k in self.signals.time.items() if t in read}
-            ),
+            signals=replace(self.signals.scheduled_on(()), schedule=()),
             sampling=replace(self.sampling, time={t: k for t, k in self.sampling.time.items() if t in read}),
             domain=self.domain,
             alarm_rule=self.alarm_rule,

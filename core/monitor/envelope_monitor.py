@@ -368,6 +368,7 @@ class EnvelopeMonitor:
                 f"{plural(transient.u.shape[1], 'control')}, and the "
                 f"model has {model.n} and {model.m}"
             )
+        transient = transient.scheduled_on([s.name for s in model.signals.scheduling])
         if transient.s.shape[1] != model.q:
             raise ModelError(
                 f"{transient.name}: {plural(transient.s.shape[1], 'further scheduling signal')}, and the model has "

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.identification import fitting
-from uncertain_lti.identification.regimes import Knots, asked_by, check_names
+from uncertain_lti.identification.regimes import Knots, asked_by, check_names, signals_of
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.horizon import Widths
@@ -172,6 +172,13 @@ def fit(
         chosen = {**chosen, name: at or 1}
         resolved = choice.chosen.model.schedule if choice.chosen.model is not None else None
     asked = (resolved or {}) if automatic else asked  # to the bit as it was judged
+    first = transients[0]
+    on = signals_of(asked, [*first.state_names, *first.control_names, *first.scheduling_names])
+    messages += [
+        f"scheduling signal '{name}' schedules nothing, and the model leaves it out; use it with --schedule {name}=auto"
+        for name in first.scheduling_names
+        if name not in on and name not in automatic
+    ]
     lengths: dict[int, Widths] = {}
     choice_of_horizons: dict[str, Any] = {}
     if rule is not None:
@@ -184,8 +191,15 @@ def fit(
                 "or seconds with widths, or count='transient'"
             )
         else:
+            point = operating_point and operating_point.scheduled_on([n in on for n in first.scheduling_names])
             chosen_horizons = choose_horizons(
-                transients, rule, steps, groups=groups, progress=progress, schedule=asked, **options
+                [t.scheduled_on(on) for t in transients],
+                rule,
+                steps,
+                groups=groups,
+                progress=progress,
+                schedule=asked,
+                **{**options, "operating_point": point},
             )
             lengths, choice_of_horizons = chosen_horizons.chosen, chosen_horizons.facts()
             listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"

@@ -15,7 +15,7 @@ import csv
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -226,6 +226,26 @@ class Transient:
             for which in ("state_names", "control_names", "scheduling_names"):
                 arguments[which] = changes.get(which)
         return Transient(self.t_ns[part], x, u, **arguments)
+
+    def scheduled_on(self, names: Collection[str]) -> Transient:
+        """The same run without the further scheduling signals that are not named.
+
+        Parameters
+        ----------
+        names : collection of str
+            Scheduling signals that stay.
+
+        Returns
+        -------
+        Transient
+            This one if all of them stay.
+        """
+        keep = [j for j, name in enumerate(self.scheduling_names) if name in names]
+        if len(keep) == len(self.scheduling_names):
+            return self
+        if self.signals is not None:
+            return self.replace(s=self.s[:, keep], signals=self.signals.scheduled_on(names))
+        return self.replace(s=self.s[:, keep], scheduling_names=[self.scheduling_names[j] for j in keep])
 
     @property
     def t(self) -> Array:

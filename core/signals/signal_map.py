@@ -16,7 +16,7 @@ import math
 import os
 import reprlib
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -440,6 +440,30 @@ class SignalMap:
             controls=tuple(signals[n : n + m]),
             scheduling=tuple(signals[n + m :]),
         )
+
+    def scheduled_on(self, names: Collection[str]) -> SignalMap:
+        """Leave out the further scheduling signals that are not named, and what is said of them.
+
+        Parameters
+        ----------
+        names : collection of str
+            Scheduling signals that stay.
+
+        Returns
+        -------
+        SignalMap
+            With the same states and controls.
+        """
+        gone = {s.name for s in self.scheduling if s.name not in names}
+        if not gone:
+            return self
+        left = replace(
+            self,
+            scheduling=tuple(s for s in self.scheduling if s.name not in gone),
+            schedule=tuple(rule for rule in self.schedule if rule.signal not in gone),
+            time={},
+        )
+        return replace(left, time={topic: kind for topic, kind in self.time.items() if topic in left.topics})
 
     @property
     def topics(self) -> tuple[str, ...]:

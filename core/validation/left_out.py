@@ -98,6 +98,7 @@ def validate(
         full = fit(transients, weights=weights, operating_point=operating_point, alarm_rule=alarm_rule, **options)
     elif alarm_rule is not None:
         full = full.replace(alarm_rule=alarm_rule)
+    transients = [t.scheduled_on([s.name for s in full.signals.scheduling]) for t in transients]
     options["schedule"] = full.schedule or {}  # none, even where the signals file asks for one
     options["horizons"] = [horizon.steps for horizon in full.horizons]
     options["widths"] = {horizon.steps: horizon.widths for horizon in full.horizons}
