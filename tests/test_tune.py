@@ -11,6 +11,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import matplotlib
 import numpy as np
@@ -128,6 +129,26 @@ def test_a_plain_fit_that_is_chosen_is_set_beside_the_best_of_the_others(tuned):
     best = min(search.trials[1:], key=search.score)
     reason = search._reason(search.plain, search.plain)
     assert f"the best of 2 others, {best.words}, needs {math.exp(search.score(best)):.3g} times" in reason
+
+
+def test_what_is_worse_than_the_plain_fit_is_never_chosen(tuned):
+    """However simple it is; what is a little better and simpler than the best is, where its error allows that."""
+
+    def other(factor, unknowns):
+        faults = [{**f, "thresholds": (factor * np.array(f["thresholds"])).tolist()} for f in plain.faults]
+        return replace(plain, faults=tuple(faults), unknowns=unknowns, family=plain.family)
+
+    plain = tuned.trials[0]
+    search = object.__new__(module._Search)
+    search.plain, search.faulty, search.families = plain, {}, [plain.family]
+    worse, same, better = other(1.3, 1), other(0.99, 1), other(0.5, 1000)
+    search.trials = [plain, worse]
+    assert search.choose()[0] is plain
+    search.trials = [plain, worse, same]  # within MARGIN it is no better
+    assert search.choose()[0] is plain
+    search.trials = [plain, worse, same, better]
+    assert search.choose() == (better, better)
+    assert search.score(worse) > 0.0 > search.score(better)
 
 
 def test_the_budget_ends_it_and_what_was_not_tried_is_named(runs):

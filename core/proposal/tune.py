@@ -364,8 +364,8 @@ class _Search:
             },
         )
 
-    def finish(self) -> Tuned:
-        """Choose, and fit the chosen way to everything."""
+    def choose(self) -> tuple[Trial, Trial]:
+        """What is chosen, and what detects most; never one that is worse than the plain fit where that may be taken."""
         good = [t for t in self.trials if not t.refused]
         most = max(t.seen_share for t in good)
         labelled = sum(len(v) for v in self.faulty.values())
@@ -378,6 +378,11 @@ class _Search:
         chosen = min(near, key=lambda t: (t.unknowns, order[t.family], self.score(t)))
         if self.score(chosen) > -MARGIN and self.plain in able:
             chosen = self.plain
+        return chosen, best
+
+    def finish(self) -> Tuned:
+        """Choose, and fit the chosen way to everything."""
+        chosen, best = self.choose()
         left = self._validated(chosen.setting)
         assert left is not None
         model = left.model.replace(alarm=chosen.rules)
