@@ -31,6 +31,7 @@ from conftest import ROOT
 
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.monitor.sender import Sender
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.monitor.verdict_messages import TRUE
 from uncertain_lti.sampling.status import Status
@@ -71,8 +72,6 @@ from test_live import (
     stamp_of,
     vector,
 )  # fmt: skip
-
-from uncertain_lti_ros import publishers
 
 NODE = "/envelope_monitor"
 
@@ -487,7 +486,8 @@ def test_a_subscriber_that_stands_still_costs_outputs_and_no_verdict(
 ) -> None:
     """Each message takes 1 ms to send, as Fast DDS does to a stopped process; later it takes 5 µs again."""
     clock = SimpleNamespace(now=100.0, sending=1e-3)
-    monkeypatch.setattr(publishers, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    its_module = sys.modules[Sender.__module__]  # compiled or not
+    monkeypatch.setattr(its_module, "time", SimpleNamespace(monotonic=lambda: clock.now))
     model = compiled_cases.saved(tmp_path / "m.json", 2, np.random.default_rng(5))
     node = compiled_cases.Node(tmp_path / "m.json")
     sent: Counter[str] = Counter()
@@ -516,12 +516,12 @@ def test_a_subscriber_that_stands_still_costs_outputs_and_no_verdict(
             assert alarms[-1] == heard[-1], "each change of the alarm is published at once"
         if samples == 2000 and clock.sending > 1e-4:
             assert sent["flags"] < 400, "most verdicts are held back"
-            assert sent["flags"] + node.outputs.held_back >= verdicts > 1000, "nothing else is"
+            assert sent["flags"] + node.outputs.sender.held_back >= verdicts > 1000, "nothing else is"
             assert clock.now - began < 1.4 * 5e-4 * received + 0.6, "what is left of the time is for the inputs"
-            assert node.outputs.problems and "stands still" in node.outputs.problems[0]
-            clock.sending, before = 5e-6, (verdicts, sent["flags"], node.outputs.held_back)
-    assert len(heard) > 2 and not node.outputs.problems
-    judged, published, held = verdicts - before[0], sent["flags"] - before[1], node.outputs.held_back - before[2]
+            assert node.outputs.sender.problems and "stands still" in node.outputs.sender.problems[0]
+            clock.sending, before = 5e-6, (verdicts, sent["flags"], node.outputs.sender.held_back)
+    assert len(heard) > 2 and not node.outputs.sender.problems
+    judged, published, held = verdicts - before[0], sent["flags"] - before[1], node.outputs.sender.held_back - before[2]
     assert published >= judged - held > 0.9 * judged, "all of them again"
     compiled_cases.end([node])
 

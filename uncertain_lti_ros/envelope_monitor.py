@@ -31,11 +31,11 @@ from std_srvs.srv import Trigger
 from uncertain_lti.base.compiled import why_not
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.arming import Condition
-from uncertain_lti.monitor.catch_up import Waiting
 from uncertain_lti.monitor.event_log import EventLog
 from uncertain_lti.monitor.failures import Failures
+from uncertain_lti.monitor.intake import Intake
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session
-from uncertain_lti.monitor.snapshot import Entry
+from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti_ros.arguments import BAD_USAGE, declare, run_node, whole_to_real
 from uncertain_lti_ros.diagnostics import Diagnostics, input_values
 from uncertain_lti_ros.messages import message_class
@@ -56,7 +56,6 @@ _SUMMARY = (
 )
 _TICK = 0.2  # s between two runs of the periodic tasks
 _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring it forward
-_AT_ONCE, _PAUSE = 200, 0.01  # messages that had waited are taken so many at once, with so many s in between
 _NOTE = 0.05  # s between two checks for changes to log
 _LAST_WORDS = 1.0  # s that the end waits until readers of /diagnostics have the last report
 
@@ -108,8 +107,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         super().__init__(name, **options)
         declare(self, PARAMETERS)
         self.settings = Settings(self)
-        self.session: Session | None = None
-        self.active = False
         self.reason = ""
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self.inputs: dict[str, MatchedSubscription] = {}
@@ -121,9 +118,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.outputs = Outputs(self, self._looked)
         self.failures = Failures(self.get_logger().error)
         self.clock: ROSClock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
-        self._simulated = self.clock.ros_time_is_active
         self.snapshots = Snapshots(self, self.settings)
         self._event_log = EventLog(self._log)
+        self.intake = Intake(self.outputs.sender, self.snapshots, self._on_turned, self.note_failure)
+        self._look_at_clock()
         self._noted = 0.0
         self._diagnostics = Diagnostics(self, str(self.settings.value("hardware_id")))
         services = {
@@ -139,6 +137,39 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.create_timer(POLL, self._on_poll, clock=self._steady)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
+
+    @property
+    def session(self) -> Session | None:
+        """What judges; None while not configured."""
+        session: Session | None = self.intake.session
+        return session
+
+    @session.setter
+    def session(self, session: Session | None) -> None:
+        """Judge by another.
+
+        Parameters
+        ----------
+        session : Session or None
+            None to stop.
+        """
+        self.intake.session = session
+
+    @property
+    def active(self) -> bool:
+        """Whether verdicts are given."""
+        return self.intake.active
+
+    @active.setter
+    def active(self, active: bool) -> None:
+        """Begin or cease to take messages.
+
+        Parameters
+        ----------
+        active : bool
+            Whether they are taken.
+        """
+        self.intake.active = active
 
     # --- parameters ---
 
@@ -190,7 +221,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _swap(self, session: Session) -> None:
         """Replace the model, between two messages."""
         if self.session is not None and self.active:
-            self._take_waiting(self.session)
+            self.intake.waiting(all_of_them=True)
             session.go_on_from(self.session)
         self.session = session
         self.outputs.prepare(self.session)
@@ -284,7 +315,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         assert self.session is not None
         result = super().on_activate(state)
         self.session.restart(time.monotonic())
-        self._simulated = self.clock.ros_time_is_active
+        self._look_at_clock()
         self.subscribe()
         self._event_log.begin(self.session, time.monotonic())
         resolved = {topic: self.resolve_topic_name(self._there(topic)) for topic in self.session.types}
@@ -407,7 +438,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         for topic, type_name in types.items():
             if topic not in self.inputs:
                 self.inputs[topic] = MatchedSubscription(
-                    self, self._there(topic), type_name, message_class(type_name), partial(self._on_message, topic),
+                    self, self._there(topic), type_name, message_class(type_name), partial(self.intake.message, topic),
                     self.settings.requested_qos(), raw=True,
                 )  # fmt: skip
 
@@ -416,67 +447,18 @@ class EnvelopeMonitorNode(LifecycleNode):
         return f"{self._prefix}/{topic.removeprefix('/')}" if self._prefix else topic
 
     def _unsubscribe(self) -> None:
-        if self.active and self.session is not None:
-            self._take_waiting(self.session)
+        self.intake.waiting(all_of_them=True)
         self.active = False
         for subscription in self.inputs.values():
             subscription.destroy()
         self.inputs.clear()
 
-    def _on_message(self, topic: str, data: bytes) -> None:
-        session = self.session
-        if session is None or not self.active:
-            return
-        now = time.monotonic()
-        try:
-            messages = session.accept(topic, self._arrival(), data, now)
-        except Exception as error:
-            self._note_failed_message(topic, error)
-        else:
-            self._take_all(session, messages, now)
-
-    def _take_waiting(self, session: Session) -> None:
-        """Take what still waits, as nothing more is accepted."""
-        now = time.monotonic()
-        self._take_all(session, session.release(now, all_of_them=True), now)
-
-    def _take_all(self, session: Session, messages: Sequence[Waiting], now: float) -> None:
-        for number, message in enumerate(messages, 1):
-            if number % _AT_ONCE == 0:  # readers would have to ask again for much of a longer burst of outputs
-                time.sleep(_PAUSE)
-            try:
-                self._take(session, message, now)
-            except Exception as error:
-                self._note_failed_message(message[0], error)
-
-    def _note_failed_message(self, topic: str, error: Exception) -> None:
-        self.note_failure(f"on a message of {topic}", error)
-        assert self.session is not None
-        self.session.failed()
-
-    def _take(self, session: Session, message: Waiting, now: float) -> None:
-        topic, arrival, data = message
-        alarms, before = session.alarms, session.alarm
-        verdicts, opened = session.take(topic, arrival, data, now)
-        alarm = session.alarm
-        turned = alarm != before
-        if turned:
-            self._event_log.turned(session, verdicts, now)
-        if self.snapshots.recent is not None:
-            self.snapshots.add(Entry(now, arrival, topic, data, verdicts, alarm), session.alarms > alarms)
-        if turned and not alarm:
-            self.snapshots.alarm_over(now)
-        if opened or verdicts or turned:
-            self.outputs.publish(session, verdicts, opened, now, turned)
-
-    def _arrival(self) -> int:
-        """Time of receipt, ns; the clock's own call makes three objects."""
-        nanoseconds: int = self.clock.now().nanoseconds if self._simulated else time.time_ns()
-        return nanoseconds
+    def _on_turned(self, session: Session, verdicts: Sequence[Verdict], now: float) -> None:
+        self._event_log.turned(session, verdicts, now)
 
     def _beat(self) -> None:
         assert self.session is not None
-        self.outputs.send_alarm(self.session.alarm, time.monotonic())
+        self.outputs.sender.send_alarm(self.session.alarm, time.monotonic())
 
     # --- heartbeat, graph, diagnostics ---
 
@@ -497,18 +479,16 @@ class EnvelopeMonitorNode(LifecycleNode):
         for subscription in self.inputs.values():
             subscription.poll()
         self.outputs.poll()
-        if self.session is not None and self.active:
-            now = time.monotonic()
-            self._take_all(self.session, self.session.release(now), now)
+        self.intake.waiting()
         if any(s.look_soon for s in self.inputs.values()):
             self._look_around()
 
     def _look_at_clock(self) -> None:
-        if self._simulated != self.clock.ros_time_is_active:
-            self._simulated = self.clock.ros_time_is_active
+        """Take arrivals from /clock while that is in use."""
+        self.intake.clock = (lambda: self.clock.now().nanoseconds) if self.clock.ros_time_is_active else None
 
     def _keep_beating(self) -> None:
-        if self.active and time.monotonic() - self.outputs.alarm_sent >= self.settings.real("heartbeat") / 2:
+        if self.active and time.monotonic() - self.outputs.sender.alarm_sent >= self.settings.real("heartbeat") / 2:
             self._beat()
 
     def _look_around(self) -> None:
@@ -537,7 +517,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _keep_reason(self) -> None:
         """Publish ~/reason also while nobody subscribes, for whoever will, and where nothing comes any more."""
         if self.active and self.session is not None:
-            self.outputs.send_reason(self.session.reason(time.monotonic(), self.settings.real("state_timeout")))
+            self.outputs.sender.send_reason(self.session.reason(time.monotonic(), self.settings.real("state_timeout")))
 
     def _keep_reporting(self) -> None:
         now = time.monotonic()
@@ -573,7 +553,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _lasting_problems(self) -> list[str]:
         """Problems that last and concern no topic of the model."""
         problems = [self._enable_problem] if self._enable_problem else []
-        problems += self.outputs.problems
+        problems += self.outputs.sender.problems
         if self.clock.ros_time_is_active and not self.clock.now().nanoseconds:
             problems.append("use_sim_time is true, and no time has come on /clock")
         return problems
@@ -589,7 +569,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is not None and self.active:
             reports = self.session.report(now, self.settings.real("state_timeout"), self._problems())
             extra = input_values(self.inputs)
-            extra |= {"unexpected errors": str(self.failures.count), "held back": str(self.outputs.held_back)}
+            extra |= {"unexpected errors": str(self.failures.count), "held back": str(self.outputs.sender.held_back)}
             extra |= self.snapshots.values
             reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
         else:
@@ -663,7 +643,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "alarm": session.alarm if session else False,
                 "latched": session.latched if session else False,
                 "armed": session.arming.on if session else None,
-                "held_back": self.outputs.held_back,
+                "held_back": self.outputs.sender.held_back,
                 "counters": dict(session.sampler.counters) if session else {},
                 "unreadable": dict(session.unreadable) if session else {},
                 "future": dict(session.future) if session else {},

@@ -7,13 +7,12 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Publishers of the node's outputs: messages are laid out for topics with subscribers, then sent together."""
+"""Publishers of the node's outputs, and who listens to them."""
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.duration import Duration
@@ -23,25 +22,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from uncertain_lti.monitor.catch_up import MOST
 from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION
+from uncertain_lti.monitor.sender import Sender
 from uncertain_lti.monitor.session import Session
-from uncertain_lti.monitor.verdict import Verdict
-from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, Encoder, VerdictMessages, text_message
+from uncertain_lti.monitor.verdict_messages import VerdictMessages
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.outputs import sendable
 from uncertain_lti_ros.polled_events import PolledEvents
 
 _OUTPUT_DEPTH = MOST // 5  # samples that a start or a stall may send at once; what readers have is kept no longer
-_SLOW = 0.0001  # s to send one message; it takes 3 to 10 µs, unless Fast DDS makes the way to a reader anew each time
-_PATIENCE = 60  # samples that are sent so slowly, less those that are not; a busy machine delays one of many
-_REST = 4.0  # times what the last try took pass until the next
 _LAST_WORDS = 1.0  # s that the end waits until readers have the last messages
-_WHEN = {
-    "message": ("message",),
-    "judged": ("message", "judged"),
-    "predicted": ("predicted",),
-    "predicted over": ("predicted over",),
-}
-"""Of a message without a verdict, one with a verdict and predictions: which outputs are published."""
 
 
 class OutputPublisher:
@@ -113,10 +102,6 @@ class OutputPublisher:
         self._node.destroy_lifecycle_publisher(self._publisher)
 
 
-_Heard = tuple[list[OutputPublisher], Encoder]
-"""Publishers of vectors that somebody listens to, and what makes their messages of a verdict."""
-
-
 class Outputs:
     """The publishers of all `OUTPUTS`.
 
@@ -129,23 +114,16 @@ class Outputs:
 
     Attributes
     ----------
+    sender : Sender
+        Publishes on them.
     publishers : dict of str to OutputPublisher
         By name of the output; empty while the node is not configured.
-    alarm_sent : float
-        When ~/violation was last published, steady time in s.
-    held_back : int
-        Verdicts that were not published, as sending took so long that inputs would have been lost.
     """
 
     def __init__(self, node: LifecycleNode, now: float) -> None:
         self._node = node
+        self.sender = Sender(now)
         self.publishers: dict[str, OutputPublisher] = {}
-        self.alarm_sent = now
-        self._reason_sent = ""
-        # By what they are published for, None where nobody listens; empty when it must be made again.
-        self._heard: dict[str, _Heard | None] = {}
-        self._alarm_heard = self._reason_heard = False
-        self.held_back, self._slow, self._until = 0, 0, -math.inf
 
     def open(self, heartbeat: float) -> None:
         """Make the publishers.
@@ -162,9 +140,8 @@ class Outputs:
         for output in OUTPUTS:
             offered = offers.get(output, qos)
             kind = message_class(output.type)
-            self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered, self._heard.clear)
-        self._violation, self._reason = self.publishers[VIOLATION.name], self.publishers[REASON.name]
-        self._reason_sent = ""
+            self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered, self.sender.changed)
+        self.sender.open(self.publishers)
 
     def prepare(self, session: Session) -> None:
         """Lay out the messages of a model and its alarm.
@@ -175,115 +152,12 @@ class Outputs:
             Has both.
         """
         model = session.model
-        self._messages = VerdictMessages(model.state_names, sendable, model.steps, session.monitor.alarms.names)
-        self._heard.clear()
-
-    def _listen(self) -> None:
-        """Choose the vectors that somebody listens to, and lay out their messages."""
-        vectors = self._messages.outputs
-        for made_for, when in _WHEN.items():
-            names = [name for name in vectors if vectors[name].when in when and self.publishers[name].listeners]
-            heard = [self.publishers[name] for name in names], self._messages.encoder(names)
-            self._heard[made_for] = heard if names else None
-        self._alarm_heard, self._reason_heard = self._violation.listeners > 0, self._reason.listeners > 0
+        self.sender.prepare(VerdictMessages(model.state_names, sendable, model.steps, session.monitor.alarms.names))
 
     def poll(self) -> None:
         """Update the numbers of listeners."""
         for publisher in self.publishers.values():
             publisher.poll()
-
-    def publish(self, session: Session, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
-        """Publish on the topics that have subscribers.
-
-        First all messages are laid out, then all are sent together: threads of the middleware that are woken by
-        one message then find the others too, and need not be woken again.
-
-        A subscriber that stands still can make sending a hundred times slower, so that inputs would be lost. Then
-        verdicts are held back, but for a try now and then; the alarm is published when it changes.
-
-        Parameters
-        ----------
-        session : Session
-            Gives the alarm and the prediction.
-        verdicts : sequence of Verdict
-            On the clock messages that were decided.
-        opened : bool
-            A sample was opened, from which bounds can be predicted.
-        now : float
-            Steady time, s.
-        turned : bool
-            The alarm changed; it is published in any case.
-        """
-        if not self._heard:
-            self._listen()
-        heard = self._heard
-        messages: list[tuple[OutputPublisher, bytes]] = []
-        if self._slow >= _PATIENCE and time.monotonic() < self._until:
-            self.held_back += len(verdicts)
-            verdicts, opened = (), False
-        for verdict in verdicts:
-            judged = verdict.judged
-            if made := heard.get("judged" if judged else "message"):
-                publishers, encode = made
-                messages += zip(publishers, encode(verdict), strict=True)
-            turned = turned or (judged and self._alarm_heard)
-        if opened and (made := heard.get("predicted")) and (expected := session.predict()) is not None:
-            publishers, encode = made
-            messages += zip(publishers, encode(expected), strict=True)
-        if opened and (made := heard.get("predicted over")) and (foreseen := session.foresee()) is not None:
-            publishers, encode = made
-            messages += zip(publishers, encode(foreseen), strict=True)
-        if turned:
-            self.alarm_sent = now
-            messages.append((self._violation, TRUE if session.alarm else FALSE))
-        if messages:
-            self._send(messages)
-        if self._reason_heard:
-            self.send_reason(session.reasons.text)
-
-    def _send(self, messages: Sequence[tuple[OutputPublisher, bytes]]) -> None:
-        began = time.monotonic()
-        for publisher, message in messages:
-            publisher.send(message)
-        took = (ended := time.monotonic()) - began
-        slow = self._slow + (1 if took > _SLOW * len(messages) else -1)
-        self._slow = max(0, min(slow, 2 * _PATIENCE))
-        self._until = ended + _REST * took
-
-    @property
-    def problems(self) -> list[str]:
-        """Why verdicts are held back, one sentence; empty if they are not."""
-        if self._slow < _PATIENCE:
-            return []
-        return [
-            "a subscriber of the outputs stands still: sending to it takes so long that most verdicts are not "
-            "published, the alarm is"
-        ]
-
-    def send_alarm(self, alarm: bool, now: float) -> None:
-        """Publish ~/violation.
-
-        Parameters
-        ----------
-        alarm : bool
-            Whether the alarm is raised.
-        now : float
-            Steady time, s.
-        """
-        self.alarm_sent = now
-        self._violation.send(TRUE if alarm else FALSE)
-
-    def send_reason(self, text: str) -> None:
-        """Publish ~/reason if it has changed.
-
-        Parameters
-        ----------
-        text : str
-            What is said now.
-        """
-        if text != self._reason_sent:
-            self._reason_sent = text
-            self._reason.send(text_message(text))
 
     def close(self) -> None:
         """Stop publishing, once readers have what was published last."""

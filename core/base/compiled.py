@@ -27,6 +27,8 @@ from zlib import crc32
 MODULES = (
     "model.bounds",
     "monitor.envelope_monitor",
+    "monitor.intake",
+    "monitor.sender",
     "monitor.statistics",
     "monitor.stream",
     "monitor.verdict",

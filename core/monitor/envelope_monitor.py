@@ -68,6 +68,19 @@ def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int
     return [(int(a), int(b)) for a, b in zip(edges, [*edges[1:], count], strict=True) if counts[a]]
 
 
+_OK, _RESET = Status.OK, Status.RESET  # an enum looks its members up at each use
+
+
+@cython.cfunc
+def _beyond(values: Sequence[float], most: cython.double) -> cython.bint:
+    """Whether some value lies outside -most to most; NaN does."""
+    value: cython.double
+    for value in values:
+        if not -most <= value <= most:
+            return True
+    return False
+
+
 @cython.cclass
 class EnvelopeMonitor:
     """Judges one-step transitions by the bounds of a model, and raises the alarm while one of its rules does.
@@ -299,14 +312,15 @@ class EnvelopeMonitor:
             With the alarm after it.
         """
         alarms, watch = self.alarms, self.frozen_watch
-        if step.status is Status.RESET or not armed:
+        if step.status is _RESET or not armed:
             alarms.reset()
             self._frozen_alarm = False
         judgement, status, looked = None, step.status, None
-        if status is Status.OK:
-            if not contained(self._shortest, step.dt, self._longest):
+        if status is _OK:
+            dt: cython.double = step.dt
+            if not self._shortest <= dt <= self._longest:
                 status = Status.STEP
-            elif not -LARGEST <= min(step.before) <= max(step.before) <= LARGEST:  # the bounds would be no numbers
+            elif _beyond(step.before, LARGEST):  # the bounds would be no numbers
                 status = Status.MISSING
             elif (judgement := self._judge.judge(step.before, step.after, step.dt)) is None:
                 status = Status.MODE

@@ -100,6 +100,7 @@ class NamedVector:
         """The message; position, and velocity if there is one, as little-endian doubles, all of them."""
         return b"".join((self.head(t_ns), position, self.tail(velocity)))
 
+    @cython.ccall
     def head(self, t_ns: int) -> bytes:
         """Everything before the positions, which does not depend on whether there are velocities.
 
@@ -215,8 +216,11 @@ class Encoder:
             One per output.
         """
         row: _Row
-        numbers = verdict.packed(self._kinds)
-        heads = [vector.head(verdict.t_ns) for vector in self._vectors]
+        vector: NamedVector
+        t_ns, numbers = verdict.t_ns, verdict.packed(self._kinds)
+        heads = []
+        for vector in self._vectors:
+            heads.append(vector.head(t_ns))
         messages = []
         for row in self._rows:
             tail = row.tails[getattr(verdict, row.velocity) if verdict.judged else None] if row.velocity else row.tail

@@ -161,7 +161,8 @@ class _Topic:
         self.closed = deque(maxlen=REMEMBERED_SAMPLES)
         self.previous = list(self.steady)
 
-    def steps_back(self, message: _Message, limit: int) -> bool:
+    @cython.cfunc
+    def steps_back(self, message: _Message, limit: cython.longlong) -> cython.bint:
         """Whether a message is more than limit before the last one on the same clock."""
         stamped = message.stamp != 0
         instant = message.stamp or message.arrival
@@ -174,7 +175,8 @@ class _Topic:
             self.ahead = False  # single messages had stepped back, and no time
         return False
 
-    def came_late(self, message: _Message) -> bool:
+    @cython.cfunc
+    def came_late(self, message: _Message) -> cython.bint:
         """Whether a closed sample would have chosen this message."""
         for sample, chosen in reversed(self.closed):
             behind = _behind(sample, message)
@@ -184,6 +186,7 @@ class _Topic:
                 return True
         return False
 
+    @cython.cfunc
     def choose(self, sample: _Message) -> _Message | None:
         """The message with the greatest stamp at or before the sample, ties to the latest arrival.
 
@@ -205,6 +208,7 @@ class _Topic:
                 return None  # perhaps; there may be nothing between the sample and what would be chosen
         return chosen
 
+    @cython.cfunc
     def keep(self, message: _Message, sample: _Message | None) -> None:
         """Take a message that may be chosen; sample is the open one."""
         m: _Message
@@ -221,6 +225,7 @@ class _Topic:
                     self.forgotten[by_stamp] = min(first, instant), max(last, instant)
         self.kept.append(message)
 
+    @cython.cfunc
     def start_anew(self, sample: _Message | None, message: _Message) -> None:
         """The topic's time has stepped back to a message, as in a bag that is played again; the last pass is forgotten.
 
@@ -239,7 +244,8 @@ class _Topic:
         self.ahead, self.behind = not self.behind, False
         self.previous = list(self.steady)
 
-    def close(self, sample: _Message, chosen: _Message | None, reset: bool) -> None:
+    @cython.cfunc
+    def close(self, sample: _Message, chosen: _Message | None, reset: cython.bint) -> None:
         """Forget what no later sample can choose.
 
         Where time jumps, later samples are earlier: what came before them on the new time is kept.
@@ -262,6 +268,7 @@ class _Topic:
         else:
             self.closed.append((sample, chosen))
 
+    @cython.cfunc
     def _forget_until(self, sample: _Message) -> None:
         """What was forgotten of the time before a sample that has chosen matters to no later one."""
         for by_stamp, (first, last) in list(self.forgotten.items()):
@@ -273,6 +280,7 @@ class _Topic:
             else:
                 self.forgotten[by_stamp] = max(first, instant + 1), last
 
+    @cython.cfunc
     def unwrapped(self, values: list[float]) -> list[float]:
         for i in self.unwrap:
             if math.isfinite(values[i]):
@@ -600,4 +608,4 @@ def all_finite(values: Sequence[float]) -> bool:
 
 
 if not cython.compiled:
-    use_twin(globals(), ("Sampler", "Step"))
+    use_twin(globals(), ("Sampler", "Step", "all_finite"))
