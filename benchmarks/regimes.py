@@ -103,11 +103,15 @@ def why(model: UncertainLTI) -> str:
 
 @dataclass(frozen=True)
 class Judged:
-    """Verdicts on one run by its samples k = 1..N: outside (N, n), half-widths (N, n) normalised, judged (N,)."""
+    """Verdicts on one run by its samples k = 1..N: outside (N, n), half-widths (N, n) normalised, judged (N,).
+
+    used: largest distance from the centre of the bounds, of all states, over the half-width (N,).
+    """
 
     outside: Array
     half: Array
     judged: Array
+    used: Array
 
     @property
     def inside_all(self) -> float:
@@ -118,8 +122,10 @@ class Judged:
 def judge(model: UncertainLTI, transient: Transient) -> Judged:
     """Every transition by the monitor's own verdict, whatever the model's alarm rule."""
     verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
-    half = 0.5 * (verdicts.upper - verdicts.lower) / model.operating_point.X
-    return Judged((verdicts.flags == 1.0)[1:], half[1:], verdicts.judged[1:])
+    half = 0.5 * (verdicts.upper - verdicts.lower)
+    away = np.abs(transient.x - 0.5 * (verdicts.upper + verdicts.lower)) / half
+    half = half / model.operating_point.X
+    return Judged((verdicts.flags == 1.0)[1:], half[1:], verdicts.judged[1:], away[1:].max(axis=1))
 
 
 def left_outside(model: UncertainLTI, transients: Sequence[Transient]) -> int:
@@ -146,6 +152,7 @@ def slams(seconds: float) -> tuple[tuple[float, float], ...]:
     return tuple(corners)
 
 
+WANTED = 0.997
 LONG, SHORT_RUN, ONSET = 2401, 1401, 24.0
 FITTED_MOVES = tuple(lever_moves(58.0, seed) for seed in range(1, 13))
 TESTED_MOVES = {
@@ -231,6 +238,7 @@ def turbofan(keep: Path | None) -> None:
                     halves_text(half),
                     " ".join(f"{r:.2f}" for r in (half / single[criterion])[2:]),
                     *(f"{j.inside_all:.2%}" for j in seen),
+                    f"{max(np.quantile(j.used[j.judged], WANTED, method='higher') for j in seen):.2f}",
                     f"{seconds:.1f} s",
                 ]
             )
@@ -267,6 +275,7 @@ def turbofan(keep: Path | None) -> None:
             "half-widths",
             "over one knot's",
             *TESTED_MOVES,
+            f"half-widths times, for {WANTED:.1%} inside of each",
             "CPU of the fit",
         ],
         envelopes,
