@@ -186,6 +186,15 @@ def test_all_blocks_shared_is_one_block(criterion, N, coupled):
         assert outside_normalised(model, transient) == 0
 
 
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), which=st.sampled_from(list(SCHEDULES)), criterion=st.sampled_from(["qp", "lp"]))
+def test_all_blocks_shared_is_one_block_of_any_plant(seed, which, criterion):
+    transient = drawn(SCHEDULES[which], 300, seed, noise=1e-3)
+    one = fit(transient, criterion, additive="both", schedule={})
+    model = fit(transient, criterion, additive="both", schedule=SCHEDULES[which], structure=everything_shared())
+    assert model.fit_summary["objective"] == pytest.approx(one.fit_summary["objective"], rel=1e-9)
+
+
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
 def test_large_problem_reaches_the_same_optimum(criterion):
     transient = drawn(THREE, 2 * SUBSAMPLE + 5, 4, noise=1e-4)
