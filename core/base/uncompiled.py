@@ -30,7 +30,7 @@ def _decorator(*_: Any, **__: Any) -> Callable[[_T], _T]:
     return _same
 
 
-cclass = cfunc = inline = final = _same
+cclass = ccall = cfunc = inline = final = _same
 locals = returns = exceptval = boundscheck = wraparound = cdivision = initializedcheck = freelist = _decorator
 
 
