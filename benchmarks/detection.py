@@ -82,11 +82,12 @@ OF_UTILISATION = (
         Kind(kind, window, h)
         for h in HORIZONS
         for kind, window in (
-            ("containment", 0.0), ("energy", 2.0), ("mean", 2.0), ("chi2", 0.0), ("chi2", 2.0), ("mewma", 1.2),
+            ("containment", 0.0), ("energy", 2.0), ("mean", 2.0), ("chi2", 0.0), ("chi2", 2.0), ("mewma", 0.5),
+            ("mewma", 1.2),
         )
     ),
 )  # fmt: skip
-TOGETHER = (Kind("containment"), Kind("containment", 0.0, 10), Kind("energy", 2.0, 10))
+TOGETHER = (Kind("containment"), Kind("energy", 2.0, 10), Kind("mewma", 1.2, 40))
 """Rules that are armed together, the false alarms shared."""
 
 

@@ -240,8 +240,9 @@ def fit(
     if not horizons:
         return model.replace(fit_summary=facts)
     lengths = [int(h) for h in horizons]
-    model = model.replace(run=better_run(model, problem, lengths, structure))
-    found, facts["horizons"], dropped = fit_horizons(model, problem, lengths, widths, criterion, progress)
+    run, corrected = better_run(model, problem, lengths, structure)
+    model = model.replace(run=run)
+    found, facts["horizons"], dropped = fit_horizons(model, problem, lengths, widths, criterion, progress, corrected)
     if "messages" in facts or dropped:
         facts["messages"] = [*facts.get("messages", []), *dropped]
     return model.replace(fit_summary=facts, horizons=found, run=model.run if found else None)

@@ -10,8 +10,8 @@
 """Envelopes over several steps: the same programmes, whose transitions are windows.
 
 A window of h transitions in a row gives one transition of step T from x_k with the mean control ū; the state at its end
-is counted from x̂, the run of the model or of the least squares of its elements. What is unknown is linear again, so
-working set, proof and repair are those of one step.
+is counted from x̂, the run of the model or of the least squares of its elements, one step or several ahead. What is
+unknown is linear again, so working set, proof and repair are those of one step.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.row import Row
+from uncertain_lti.identification.several_steps import runs_over_steps
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.horizon import Horizon, Run, Widths
@@ -39,7 +41,10 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 _UNKNOWN = frozenset({"c", "v"})
 _COMPARED = 20_000  # transitions, about, on which two runs are compared
+_ROUNDING = 1e-12  # a smaller distance is none
 _LOOKED_AT = 100_000  # windows, about, that mean and covariance of the residuals are taken from
+PAYS = 0.1
+"""Share, as a logarithm, by which least squares several steps ahead must bring the run nearer to be taken."""
 WIDER = 1.1
 """An envelope whose mean half-width is this many times the largest move of a state over as many steps is useless: that
 the state stays where it is, give or take what it ever moved, says more."""
@@ -66,7 +71,7 @@ class _Envelope:
 
 
 def run_of(problem: Problem, structure: Structure | None = None) -> Run:
-    """The least squares of the elements of a model, one step ahead: what is run over the windows.
+    """The least squares of the elements of a model, one step ahead.
 
     Parameters
     ----------
@@ -80,22 +85,37 @@ def run_of(problem: Problem, structure: Structure | None = None) -> Run:
     Run
         With one block for each of the schedule.
     """
-    engine = WorkingSet(Fleet.of(problem), structure)
-    for row in engine.rows:
+    rows = _started(problem, structure)
+    theta = np.column_stack([row.theta for row in rows]).reshape(problem.columns.count, -1, problem.n)
+    return _as_run(problem, theta)
+
+
+def _started(problem: Problem, structure: Structure | None) -> list[Row]:
+    """Rows with the elements by least squares of one step."""
+    rows = WorkingSet(Fleet.of(problem), structure).rows
+    for row in rows:
         row.start()
+    return list(rows)
+
+
+def _as_run(problem: Problem, theta: Array) -> Run:
+    """Elements (blocks, q, n) as what is run."""
     n, p, columns = problem.n, problem.p, problem.columns
-    theta = np.column_stack([row.theta for row in engine.rows]).reshape(columns.count, -1, n)
     names = [term.nominal for term in columns.nominal]
     drift = theta[:, p + names.index("c")] if "c" in names else np.zeros((columns.count, n))
     found = theta[:, :n].transpose(0, 2, 1), theta[:, n:p].transpose(0, 2, 1), drift
     return Run(*(found if columns.regimes is not None else (values[0] for values in found)))
 
 
-def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None) -> Run | None:
-    """What is to be run over the windows: least squares where their run stays nearer to the recordings.
+def better_run(
+    model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None
+) -> tuple[Run | None, bool]:
+    """What is to be run over the windows: least squares, one step or several ahead, where it stays nearer.
 
     Compared is the largest distance of a window's end from the run with a linear correction, which is what widths are
     made of: its geometric mean over horizons and states. Of many transitions, pieces of the recordings are looked at.
+    Least squares several steps ahead go without the correction: it would follow the largest errors, as the narrowest
+    envelope does, and move the mean, which statistics look at, from 0. They have to be nearer by a tenth without it.
 
     Parameters
     ----------
@@ -111,7 +131,9 @@ def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], stru
     Returns
     -------
     Run or None
-        None where the nominal model stays nearer.
+        None where the nominal model stays nearest to the recordings.
+    bool
+        Whether its envelopes need a correction.
     """
     lengths = sorted(set(steps))
     k, signals, dt, after = *_in_order(problem), problem.dt, problem.next_columns
@@ -121,19 +143,29 @@ def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], stru
         some = np.unique((starts[:, None] + np.arange(piece)).ravel())
         k, signals, dt, after = k[some], signals[:, some], dt[some], after[:, some]
 
-    def distance(which: UncertainLTI) -> float:
+    def distance(which: UncertainLTI, corrected: bool = True) -> float:
         logs = []
         for windows in which.windows(k, signals, dt, lengths):
             left = (after[:, windows.last] - windows.run).T
             if not np.isfinite(left).all():
                 return np.inf
-            phi = np.vstack([windows.z[: problem.p], np.ones(len(left))]).T
-            left = left - phi @ np.linalg.lstsq(phi, left, rcond=None)[0]
-            logs.append(np.log(np.maximum(np.abs(left).max(axis=0, initial=0.0), 1e-300)))
+            if corrected:
+                phi = np.vstack([windows.z[: problem.p], np.ones(len(left))]).T
+                left = left - phi @ np.linalg.lstsq(phi, left, rcond=None)[0]
+            logs.append(np.log(np.maximum(np.abs(left).max(axis=0, initial=0.0), _ROUNDING)))
         return float(np.mean(logs)) if logs else 0.0
 
-    run = run_of(problem, structure)
-    return run if distance(model.replace(run=run)) < distance(model) else None
+    rows, order = _started(problem, structure), _in_order(problem)[0]
+    one = np.column_stack([row.theta for row in rows]).reshape(problem.columns.count, -1, problem.n)
+    found, corrected, nearest = None, True, distance(model)
+    for several, theta in enumerate([one, *runs_over_steps(problem, order, rows, lengths[-1])]):
+        if not np.isfinite(theta).all():
+            continue
+        run = _as_run(problem, theta)
+        far = distance(model.replace(run=run), not several)
+        if far < nearest - (PAYS if several and corrected else 0.0):
+            found, corrected, nearest = run, not several, far
+    return found, corrected
 
 
 def _in_order(problem: Problem) -> tuple[NDArray[np.intp], Array]:
@@ -149,6 +181,7 @@ def fit_horizons(
     widths: Widths | Mapping[int, Widths] = "growing",
     criterion: str = "qp",
     progress: Callable[[str], None] | None = None,
+    corrected: bool = True,
 ) -> tuple[tuple[Horizon, ...], list[dict[str, Any]], list[str]]:
     """Envelopes of a fitted model over several steps.
 
@@ -166,6 +199,8 @@ def fit_horizons(
         Eq. (10) or eq. (11).
     progress : callable, optional
         Called with one line of text per horizon.
+    corrected : bool, default True
+        Whether the centre has a linear correction besides what is run.
 
     Returns
     -------
@@ -189,7 +224,8 @@ def fit_horizons(
     axes = 0 if model.schedule is None else len(model.schedule.axes)
     regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))
     columns = Columns(_UNKNOWN, regimes)
-    zeros = {"dA": np.zeros((n, n)), "dB": np.zeros((n, p - n))}
+    halves = {"dA": np.zeros((n, n)), "dB": np.zeros((n, p - n))}
+    centre = {} if corrected else {"A": np.zeros((n, n)), "B": np.zeros((n, p - n)), "c": np.zeros(n)}
     lengths = sorted(set(steps))
     for windows in model.windows(k, signals, problem.dt, lengths):
         if progress is not None:
@@ -222,7 +258,8 @@ def fit_horizons(
             windows.run,
         )
         kind = widths[windows.steps] if isinstance(widths, Mapping) else widths
-        structure = Structure(n, p - n, fixed=zeros) if kind == "constant" else None
+        fixed = centre | (halves if kind == "constant" else {})
+        structure = Structure(n, p - n, fixed=fixed) if fixed else None
         horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
         move = np.abs(part.next_columns - part.z_columns[:n]).max(axis=1)
         if (0.5 * fact["mean_width"] > WIDER * move).all():
