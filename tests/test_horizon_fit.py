@@ -20,10 +20,10 @@ from scipy.optimize import linprog
 
 from uncertain_lti import EnvelopeMonitor, Transient
 from uncertain_lti.base.errors import FitError, ModelError
-from uncertain_lti.identification import fit
+from uncertain_lti.identification import fit, horizons
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Regimes
-from uncertain_lti.identification.horizons import PAYS, better_run, fit_horizons, run_of
+from uncertain_lti.identification.horizons import better_run, fit_horizons, run_of
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.horizon import Run
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -141,7 +141,8 @@ def test_what_is_run_are_the_least_squares_of_the_elements_that_the_model_has(
     np.testing.assert_allclose(run.c.reshape(-1, 2), expected[:, 3] if one else 0.0 * run.c.reshape(-1, 2), atol=1e-8)
 
 
-def test_the_run_that_stays_nearer_to_the_recordings_is_taken() -> None:
+def test_the_run_that_stays_nearer_to_the_recordings_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(horizons, "PAYS", 0.1)
     transients = runs()
     model = fit(transients, additive="noise", horizons=[20])
     problem = assemble(transients, model.operating_point, None, "noise")
@@ -155,7 +156,9 @@ def test_the_run_that_stays_nearer_to_the_recordings_is_taken() -> None:
         if run is not taken:
             far -= phi @ np.linalg.lstsq(phi, far, rcond=None)[0]
         left.append(np.log(np.abs(far).max(axis=0)).mean())
-    assert left[0] + PAYS < left[1] < left[2]
+    assert left[0] + 0.1 < left[1] < left[2]
+    monkeypatch.undo()  # nearer by less than a third is no reason
+    assert better_run(worse, problem, [20], None)[1]
 
 
 def test_several_steps_are_not_run_where_they_are_hardly_nearer() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from uncertain_lti import Transient
-from uncertain_lti.identification import fit, several_steps
+from uncertain_lti.identification import fit, horizons, several_steps
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Regimes
 from uncertain_lti.identification.fleet import Fleet
@@ -58,7 +58,8 @@ def started(problem: Problem, structure: Structure | None = None) -> Any:
     return rows
 
 
-def test_noise_of_the_readings_does_not_bias_what_is_run() -> None:
+def test_noise_of_the_readings_does_not_bias_what_is_run(monkeypatch: Any) -> None:
+    monkeypatch.setattr(horizons, "PAYS", 0.1)
     transients = recordings(0.05)
     one = run_of(assembled(transients))
     model = fit(transients, additive="noise", operating_point=POINT, horizons=[20])
@@ -128,7 +129,8 @@ def test_without_noise_and_with_too_many_elements_least_squares_stay(monkeypatch
     assert not list(runs_over_steps(few, few.k, started(few), 8))
 
 
-def test_a_fitted_model_that_is_nearest_is_run_itself() -> None:
+def test_a_fitted_model_that_is_nearest_is_run_itself(monkeypatch: Any) -> None:
+    monkeypatch.setattr(horizons, "PAYS", 0.1)
     transients = recordings(0.05)
     model = fit(transients, additive="noise", operating_point=POINT)
     problem = assembled(transients)

@@ -43,7 +43,7 @@ _UNKNOWN = frozenset({"c", "v"})
 _COMPARED = 20_000  # transitions, about, on which two runs are compared
 _ROUNDING = 1e-12  # a smaller distance is none
 _LOOKED_AT = 100_000  # windows, about, that mean and covariance of the residuals are taken from
-PAYS = 0.1
+PAYS = 0.4
 """Share, as a logarithm, by which least squares several steps ahead must bring the run nearer to be taken."""
 WIDER = 1.1
 """An envelope whose mean half-width is this many times the largest move of a state over as many steps is useless: that
@@ -115,7 +115,7 @@ def better_run(
     Compared is the largest distance of a window's end from the run with a linear correction, which is what widths are
     made of: its geometric mean over horizons and states. Of many transitions, pieces of the recordings are looked at.
     Least squares several steps ahead go without the correction: it would follow the largest errors, as the narrowest
-    envelope does, and move the mean, which statistics look at, from 0. They have to be nearer by a tenth without it.
+    envelope does, and move the mean, which statistics look at, from 0. They have to be nearer by a third without it.
 
     Parameters
     ----------
