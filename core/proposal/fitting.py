@@ -172,11 +172,11 @@ def fit(
         chosen = {**chosen, name: at or 1}
         resolved = choice.chosen.model.schedule if choice.chosen.model is not None else None
     asked = (resolved or {}) if automatic else asked  # to the bit as it was judged
-    first = transients[0]
-    on = signals_of(asked, [*first.state_names, *first.control_names, *first.scheduling_names])
+    further = transients[0].scheduling_names if transients else ()  # none at all is refused below
+    on = signals_of(asked, [*transients[0].state_names, *transients[0].control_names, *further] if transients else [])
     messages += [
         f"scheduling signal '{name}' schedules nothing, and the model leaves it out; use it with --schedule {name}=auto"
-        for name in first.scheduling_names
+        for name in further
         if name not in on and name not in automatic
     ]
     lengths: dict[int, Widths] = {}
@@ -191,7 +191,7 @@ def fit(
                 "or seconds with widths, or count='transient'"
             )
         else:
-            point = operating_point and operating_point.scheduled_on([n in on for n in first.scheduling_names])
+            point = operating_point and operating_point.scheduled_on([n in on for n in further])
             chosen_horizons = choose_horizons(
                 [t.scheduled_on(on) for t in transients],
                 rule,
