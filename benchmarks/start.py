@@ -154,15 +154,16 @@ def watch(model: str, executor: str) -> None:
     if executor == "default":
         sys.modules["rclpy.experimental"] = None  # type: ignore[assignment]
     from uncertain_lti.monitor.session import Session
-    from uncertain_lti_ros.envelope_monitor import EnvelopeMonitorNode, main
+    from uncertain_lti_ros.envelope_monitor import main
+    from uncertain_lti_ros.subscriptions import MatchedSubscription
 
     received, judged = [], []
-    take, judge = EnvelopeMonitorNode._on_message, Session.take
+    take, judge = MatchedSubscription._take, Session.take
 
-    def noting(node: Any, topic: str, data: bytes) -> None:
+    def noting(subscription: Any, data: bytes) -> None:
         seconds, nanoseconds = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8))
-        received.append((time.monotonic(), topic, seconds * 10**9 + nanoseconds))
-        take(node, topic, data)
+        received.append((time.monotonic(), subscription.topic, seconds * 10**9 + nanoseconds))
+        take(subscription, data)
 
     def judging(session: Any, *message: Any) -> Any:
         verdicts, opened = judge(session, *message)
@@ -173,7 +174,7 @@ def watch(model: str, executor: str) -> None:
                 judged.append((time.monotonic(), verdict.t_ns))
         return verdicts, opened
 
-    EnvelopeMonitorNode._on_message, Session.take = noting, judging  # type: ignore[method-assign]
+    MatchedSubscription._take, Session.take = noting, judging  # type: ignore[method-assign]
     status = main(["--ros-args", "-p", f"model:={model}", "--log-level", "error"])
     print(json.dumps({"received": received, "judged": judged}), flush=True)
     raise SystemExit(status)
