@@ -520,9 +520,17 @@ def test_a_subscriber_that_stands_still_costs_outputs_and_no_verdict(
             assert clock.now - began < 1.4 * 5e-4 * received + 0.6, "what is left of the time is for the inputs"
             assert node.outputs.sender.problems and "stands still" in node.outputs.sender.problems[0]
             clock.sending, before = 5e-6, (verdicts, sent["flags"], node.outputs.sender.held_back)
-    assert len(heard) > 2 and not node.outputs.sender.problems
-    judged, published, held = verdicts - before[0], sent["flags"] - before[1], node.outputs.sender.held_back - before[2]
+    sender = node.outputs.sender
+    assert len(heard) > 2 and not sender.problems
+    judged, published, held = verdicts - before[0], sent["flags"] - before[1], sender.held_back - before[2]
     assert published >= judged - held > 0.9 * judged, "all of them again"
+    clock.sending = 1e-3
+    for _ in range(100):
+        sender.publish(node.session, [node.session.last], False, clock.now, True)
+    assert sender.problems
+    for output in node.outputs.publishers.values():
+        output.listeners = 0
+    assert not sender.problems, "nobody listens that could stand still"
     compiled_cases.end([node])
 
 

@@ -49,6 +49,12 @@ class _Heard:
     def __init__(self, publishers: Sequence[Publisher], encoder: Encoder) -> None:
         self.publishers, self.encoder = list(publishers), encoder
 
+    @cython.cfunc
+    def lay_out(self, verdict: Any, publishers: list[Any], messages: list[bytes]) -> None:
+        """Add the messages of a verdict, or of what is predicted, and who sends each."""
+        publishers += self.publishers
+        messages += self.encoder(verdict)
+
 
 @cython.cclass
 class Sender:
@@ -114,8 +120,8 @@ class Sender:
         self._messages, self._known = messages, False
 
     def changed(self) -> None:
-        """There are more or fewer listeners of some publisher."""
-        self._known = False
+        """There are more or fewer listeners of some publisher; whether sending to them is slow is seen anew."""
+        self._known, self._slow = False, 0
 
     def _heard(self, *when: str) -> Any:
         outputs = self._messages.outputs
@@ -161,20 +167,17 @@ class Sender:
             verdicts, opened = (), False
         for verdict in verdicts:
             judged: cython.bint = verdict.judged
-            if (self._judged if judged else self._given) is not None:
-                heard = self._judged if judged else self._given
-                publishers += heard.publishers
-                messages += heard.encoder(verdict)
+            heard = self._judged if judged else self._given
+            if heard is not None:
+                heard.lay_out(verdict, publishers, messages)
             if judged and self._alarm_heard:
                 turned = True
         if opened and self._predicted is not None and (expected := session.predict()) is not None:
             heard = self._predicted
-            publishers += heard.publishers
-            messages += heard.encoder(expected)
+            heard.lay_out(expected, publishers, messages)
         if opened and self._foreseen is not None and (foreseen := session.foresee()) is not None:
             heard = self._foreseen
-            publishers += heard.publishers
-            messages += heard.encoder(foreseen)
+            heard.lay_out(foreseen, publishers, messages)
         if turned:
             self.alarm_sent = now
             publishers.append(self._violation)
