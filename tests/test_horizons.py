@@ -116,9 +116,12 @@ def test_a_negative_half_width_and_another_number_of_states_are_refused() -> Non
 @pytest.mark.parametrize(
     ("run", "words"),
     [
-        ([], "'run' must be an object with 'blocks'"),
+        ([], "'run' is not an object"),
         ({"blocks": []}, "a list of 1 block"),
-        ({"blocks": [{"A": [[1.0, 0.0], [0.0, 1.0]], "B": [[1.0], [1.0]]}]}, r"'run.blocks\[0\]' must be an object"),
+        (
+            {"blocks": [{"A": [[1.0, 0.0], [0.0, 1.0]], "B": [[1.0], [1.0]]}]},
+            r"'run.blocks\[0\].c' is missing; fit the model",
+        ),
         ({"blocks": [{"A": [[1.0]], "B": [[1.0], [1.0]], "c": [0.0, 0.0]}]}, r"run.blocks\[0\].A"),
         ({"blocks": [{"A": [[1.0, 0.0], [0.0, 1e400]], "B": [[1.0], [1.0]], "c": [0.0, 0.0]}]}, "not finite"),
     ],

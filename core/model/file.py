@@ -34,7 +34,7 @@ from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature
-from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked
+from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.signals.table_layout import TableLayout
 
@@ -263,25 +263,15 @@ def _alarm(data: Any, newer: bool) -> tuple[Rule, ...]:
 def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Arrays, and schedule and data of the blocks, of a scheduled model."""
     schedule = Schedule.from_list(data["schedule"])
-    blocks = data["blocks"]
-    if not isinstance(blocks, list) or len(blocks) != schedule.blocks:
-        raise ModelError(f"field 'blocks' must be a list of {plural(schedule.blocks, 'block')}, one per knot or mode")
-    found: dict[str, list[Array]] = {name: [] for name in ARRAYS}
+    arrays = blocks_of(data["blocks"], "blocks", n, m, schedule.blocks, also=("transitions", "tied_to"))
     facts = []
-    for r, block in enumerate(blocks):
-        block = object_of(block, f"blocks[{r}]", {*ARRAYS, "transitions", "tied_to"})
-        for name in ARRAYS:
-            shape = SHAPES[name].shape(n, m)
-            if name not in block and name in REQUIRED:
-                raise ModelError(f"field 'blocks[{r}].{name}' is missing; fit the model again")
-            value = np.zeros(shape) if block.get(name) is None else block[name]
-            found[name].append(checked(value, f"blocks[{r}].{name}", shape, name in HALF_WIDTHS))
+    for r, block in enumerate(data["blocks"]):
         for name, most in (("transitions", math.inf), ("tied_to", schedule.blocks - 1)):
             value = block.get(name)
             if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most):
                 raise ModelError(f"field 'blocks[{r}].{name}' is {reprlib.repr(value)}; it must be a whole number")
         facts.append(BlockData(block.get("transitions"), block.get("tied_to")))
-    return {name: np.stack(arrays) for name, arrays in found.items()}, {"schedule": schedule, "block_data": facts}
+    return arrays, {"schedule": schedule, "block_data": facts}
 
 
 def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:

@@ -37,7 +37,7 @@ from uncertain_lti.model.bounds import Judge, centre_and_half
 from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Schedule
-from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, checked, regressors, tables
+from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, blocks_of, checked, regressors, tables
 
 Widths = Literal["growing", "constant"]
 """Half-widths that grow with |x| and |u|, or are the same everywhere."""
@@ -162,16 +162,8 @@ class Run:
         ModelError
             It is not that; names the field.
         """
-        parts = data.get("blocks") if isinstance(data, dict) and set(data) == {"blocks"} else None
-        if not isinstance(parts, list) or len(parts) != (blocks or 1):
-            raise ModelError(f"field 'run' must be an object with 'blocks', a list of {plural(blocks or 1, 'block')}")
-        arrays: dict[str, list[Array]] = {name: [] for name in _OF_RUN}
-        for r, part in enumerate(parts):
-            if not isinstance(part, dict) or set(part) != set(_OF_RUN):
-                raise ModelError(f"field 'run.blocks[{r}]' must be an object with {', '.join(_OF_RUN)}")
-            for name, values in arrays.items():
-                values.append(checked(part[name], f"run.blocks[{r}].{name}", SHAPES[name].shape(n, m)))
-        return cls(*(values[0] if blocks is None else np.stack(values) for values in arrays.values()))
+        parts = object_of(data, "run", ("blocks",), ("blocks",))["blocks"]
+        return cls(**blocks_of(parts, "run.blocks", n, m, blocks, _OF_RUN, _OF_RUN))
 
 
 def unbroken_over(k: NDArray[np.intp], vectors: Array, schedule: Schedule | None) -> NDArray[np.int64]:
@@ -426,25 +418,12 @@ class Horizon:
         found = []
         for i, entry in enumerate(data):
             here = f"horizons[{i}]"
-            if not isinstance(entry, dict) or "steps" not in entry or "blocks" not in entry:
-                raise ModelError(f"field '{here}' must be an object with 'steps', 'widths' and 'blocks'")
-            object_of(entry, here, known=("blocks", "residuals", "steps", "widths"))
-            parts = entry["blocks"]
-            if not isinstance(parts, list) or len(parts) != (blocks or 1):
-                raise ModelError(f"field '{here}.blocks' must be a list of {plural(blocks or 1, 'block')}")
-            arrays: dict[str, list[Array]] = {name: [] for name in ARRAYS}
-            for r, part in enumerate(parts):
-                object_of(part, f"{here}.blocks[{r}]", known=ARRAYS, needed=REQUIRED)
-                for name in ARRAYS:
-                    shape = SHAPES[name].shape(n, m)
-                    value = np.zeros(shape) if part.get(name) is None else part[name]
-                    arrays[name].append(checked(value, f"{here}.blocks[{r}].{name}", shape, name in HALF_WIDTHS))
-            stacked = {name: values[0] if blocks is None else np.stack(values) for name, values in arrays.items()}
+            object_of(entry, here, ("blocks", "residuals", "steps", "widths"), ("steps", "blocks"))
             residuals = entry.get("residuals")
             found.append(
                 cls(
                     entry["steps"],
-                    **stacked,
+                    **blocks_of(entry["blocks"], f"{here}.blocks", n, m, blocks),
                     widths=entry.get("widths", "growing"),
                     residuals=None if residuals is None else Residuals.from_dict(residuals, f"{here}.residuals"),
                 )

@@ -19,7 +19,7 @@ Programmes, bounds, model file, monitor and reports take the terms from `TERMS`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -27,8 +27,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.model.objects import object_of
 
 
 @dataclass(frozen=True)
@@ -197,3 +199,57 @@ def _numbers_only(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
         return all(_numbers_only(v) for v in value)
     return not isinstance(value, (str, bool)) and value is not None
+
+
+def blocks_of(
+    data: Any,
+    name: str,
+    n: int,
+    m: int,
+    blocks: int | None,
+    names: Sequence[str] = ARRAYS,
+    needed: Collection[str] = REQUIRED,
+    also: Collection[str] = (),
+) -> dict[str, Array]:
+    """The arrays of the blocks of a schedule, or of the only one, of a model file.
+
+    Parameters
+    ----------
+    data : Any
+        A list of objects as JSON gives it.
+    name : str
+        Of the list in the file, for errors.
+    n : int
+        Number of states.
+    m : int
+        Number of controls.
+    blocks : int or None
+        Number of blocks; None without a schedule.
+    names : sequence of str, optional
+        Arrays of a block, of `ARRAYS`.
+    needed : collection of str, optional
+        Those that must be there; the others are 0 where they are not.
+    also : collection of str, optional
+        Further fields that a block may have.
+
+    Returns
+    -------
+    dict of str to array
+        Of each name; with a schedule one axis more, the first, over the blocks.
+
+    Raises
+    ------
+    ModelError
+        It is no such list, or an array is missing or none of its shape; names the field.
+    """
+    if not isinstance(data, list) or len(data) != (blocks or 1):
+        one_each = "" if blocks is None else ", one per knot or mode"
+        raise ModelError(f"field '{name}' must be a list of {plural(blocks or 1, 'block')}{one_each}")
+    arrays: dict[str, list[Array]] = {array: [] for array in names}
+    for r, block in enumerate(data):
+        object_of(block, f"{name}[{r}]", {*names, *also}, needed)
+        for array, values in arrays.items():
+            shape = SHAPES[array].shape(n, m)
+            value = np.zeros(shape) if block.get(array) is None else block[array]
+            values.append(checked(value, f"{name}[{r}].{array}", shape, array in HALF_WIDTHS))
+    return {array: values[0] if blocks is None else np.stack(values) for array, values in arrays.items()}
