@@ -317,8 +317,7 @@ class EnvelopeMonitor:
             self._frozen_alarm = False
         judgement, status, looked = None, step.status, None
         if status is _OK:
-            dt: cython.double = step.dt
-            if not self._shortest <= dt <= self._longest:
+            if not contained(self._shortest, step.dt, self._longest):
                 status = Status.STEP
             elif _beyond(step.before, LARGEST):  # the bounds would be no numbers
                 status = Status.MISSING

@@ -356,11 +356,9 @@ class Statistics:
 
     _parts = cython.declare(list)
     _begins: cython.longlong[::1]
-    _total: cython.Py_ssize_t
 
     def __init__(self, parts: Sequence[Statistic], begins: Sequence[int]) -> None:
         self._parts, self._begins = list(parts), array("q", begins or [0])
-        self._total = sum([len(part.values()) for part in parts])
 
     def push(self, dt: cython.double, table: Any) -> bool:
         """Take one verdict.
@@ -406,14 +404,9 @@ class Statistics:
             A copy.
         """
         part: Statistic
-        i: cython.Py_ssize_t
-        at: cython.Py_ssize_t = 0
-        found = array("d", bytes(8 * self._total))
-        values: cython.double[::1] = found
+        found = array("d")
         for part in self._parts:
-            for i in range(part._size):
-                values[at + i] = part._values[i] if part._pushed else float("nan")
-            at += part._size
+            found += part.values()
         return found
 
 
