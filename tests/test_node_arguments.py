@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -183,6 +184,33 @@ def test_what_a_shared_file_says_to_other_nodes_is_no_reason_to_refuse(tmp_path:
             starts(
                 world, file, f"{file.name}: nothing in it is for this node; name the section envelope_monitor or /**"
             )
+
+
+_STUCK = """
+import ctypes, os, signal
+from rclpy.node import Node
+from uncertain_lti_ros import process
+
+class Stuck(Node):
+    def destroy_node(self):
+        print("it ends", flush=True)
+        ctypes.PyDLL(None).sleep(600)  # and no other Python runs meanwhile
+
+process._LAST = 1
+with process.living(lambda: Stuck("stuck")) as life:
+    life.node.create_timer(0.1, lambda: os.kill(os.getpid(), signal.SIGINT))
+    life.spin(print)
+"""
+
+
+def test_a_middleware_that_does_not_come_down_does_not_keep_the_process(tmp_path: Path) -> None:
+    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(tmp_path / "log")}
+    with own_domain() as domain:
+        done = subprocess.run(
+            [sys.executable, "-c", _STUCK], env=os.environ | own | {"ROS_DOMAIN_ID": str(domain)}, cwd=tmp_path,
+            capture_output=True, text=True, timeout=300,
+        )  # fmt: skip
+    assert (done.stdout, done.returncode) == ("it ends\n", -signal.SIGALRM), done
 
 
 def test_every_console_script_takes_its_arguments_or_those_of_the_process(capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,6 +32,7 @@ from uncertain_lti_ros.arguments import ArgumentError, hold_overrides, in_words
 _LATENCY = 0.1  # s that a signal waits at most
 _SPIN = 30.0  # s between two checks whether rclpy has been shut down from elsewhere
 _PAUSE = 0.01  # s after an error, which may occur again at once
+_LAST = 20  # s that taking the middleware down may take after a signal
 
 
 class Life:
@@ -127,6 +128,9 @@ def spare_the_middleware() -> None:
 def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
     """Start rclpy with these ROS arguments, make the node, and destroy both at the end.
 
+    Fast DDS 2.14 waits for ever for its own listeners when a participant is destroyed while it comes to know another.
+    After a signal SIGALRM then ends the process, as no Python runs meanwhile.
+
     Parameters
     ----------
     make_node : callable
@@ -167,9 +171,13 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
         lives.append(Life(node, stop))
         yield lives[0]
     finally:
+        if stop:
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.alarm(_LAST)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        signal.alarm(0)
         # A process often gets the signal twice, from the terminal and from its parent.
         for name, handler in before.items():
             signal.signal(name, signal.SIG_IGN if stop else handler)
