@@ -397,7 +397,7 @@ def test_a_scheduled_model_gives_live_what_it_gives_offline(world: World, tmp_pa
     assert [v.unknown_regime for v in again] == [v.unknown_regime for v in verdicts]
     assert [bits(v.lower) for v in again if v.judged] == [bits(v.lower) for v in verdicts if v.judged]
     texts = " ".join(status.message for message in diagnostics.topic.messages for status in message.status)
-    assert "regime not fitted" in texts and "the scheduling signal has a value that the model does not list" in texts
+    assert "regime not fitted" in texts and "gear = 3 is not among the modes of the model, 1, 2" in texts
 
 
 def test_a_looped_bag_starts_anew_and_gives_the_same_again(world: World, tmp_path: Path) -> None:

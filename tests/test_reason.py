@@ -17,12 +17,14 @@ import pytest
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule
 from uncertain_lti.model.repeats import Repeats
+from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.monitor.alarm import Raised
 from uncertain_lti.monitor.reason import Facts, Reasons, over_recording
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 DT = 0.1
 RULES: dict[str, tuple[Rule, ...]] = {
@@ -59,7 +61,8 @@ def live(monitor: EnvelopeMonitor, transient: Transient) -> list[str]:
     reasons, said = Reasons(monitor.model, monitor.alarms.rules), []
     statuses = transient.statuses()
     for k, status in enumerate(statuses):
-        before = np.full(3, np.nan) if status.opens_segment else [*transient.x[k - 1], *transient.u[k - 1]]
+        parts = (transient.x, transient.u, transient.s)
+        before = np.concatenate([np.full(a.shape[1], np.nan) if status.opens_segment else a[k - 1] for a in parts])
         dt = 1e-9 * float(transient.t_ns[k] - transient.t_ns[k - 1]) if k else np.nan
         step = Step(status, int(transient.t_ns[k]), 0, dt, list(before), transient.x[k].tolist())
         verdict = monitor.judge(step)
@@ -80,6 +83,29 @@ def test_live_and_over_a_recording_the_words_are_the_same(rules: tuple[Rule, ...
     assert "no verdict: u1 missing, stale, not valid or not finite" in every
     assert "no verdict: the step is longer than max_gap" in every and "no alarm" in every
     assert f"alarm: {rules[0].words}: " in every or f"alarm: {rules[-1].words}: x2" in every
+
+
+def test_a_mode_that_is_not_listed_is_named_live_and_over_a_recording() -> None:
+    gear = Schedule((Axis("gear", modes=(1.0, 2.0)),))
+    states, controls, further = (
+        tuple(Signal(n, f"/{n}", "data") for n in names) for names in (["x1", "x2"], ["u1"], ["gear"])
+    )
+    plain = model_with(RULES["containment"])
+    model = UncertainLTI(
+        **{name: np.stack([getattr(plain, name)] * 2) for name in ("A", "B", "dA", "dB", "v")},
+        signals=SignalMap(states, controls, further), schedule=gear, alarm=RULES["containment"],
+    )  # fmt: skip
+    one = recording(0)
+    s = np.repeat([1.0, 4.0, 5.0, 2.0, 4.0, 1.0], 50)[:, None]
+    transient = one.replace(s=s, signals=model.signals)
+    monitor = EnvelopeMonitor(model)
+    expected = live(monitor, transient)
+    changes = list(over_recording(monitor.check(transient), model))
+    assert changes == [(k, text) for k, text in enumerate(expected) if k == 0 or text != expected[k - 1]]
+    said = [text.split("no verdict: ")[-1] for _, text in changes]
+    assert said.count("gear = 4 is not among the modes of the model, 1, 2") >= 2
+    assert said.count("gear = 5 is not among the modes of the model, 1, 2") >= 1
+    assert model.why_unlisted([0.0, 0.0, 0.0, 2.0]) == ""
 
 
 def test_the_states_blamed_stay_named_while_the_same_rules_hold_the_alarm() -> None:

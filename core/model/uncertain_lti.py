@@ -578,6 +578,31 @@ class UncertainLTI:
                 found.append(f"no recording visited {self.block_name(r)}")
         return ", and ".join(found)
 
+    def why_unlisted(self, values: Sequence[float]) -> str:
+        """In words, which mode of a sample the model does not list.
+
+        Parameters
+        ----------
+        values : sequence of float (n + m + q,)
+            [x; u; s], recorded units.
+
+        Returns
+        -------
+        str
+            Names the scheduling signals, their values and the modes; empty where every mode is listed.
+        """
+        if self.schedule is None:
+            return ""
+        found = []
+        point = self.operating_point
+        z = normalised(np.asarray(values, dtype=np.float64), point.steady, point.scale)[self._positions]
+        modes = self.schedule.recorded_values(self.signals.signals)
+        for axis, at, i, s in zip(self.schedule.axes, modes, self._positions, z.tolist(), strict=True):
+            if axis.modes and s not in axis.modes:
+                listed = ", ".join(f"{mode:.6g}" for mode in at)
+                found.append(f"{axis.signal} = {values[i]:.6g} is not among the modes of the model, {listed}")
+        return ", and ".join(found)
+
     def block_name(self, r: int) -> str:
         """Where one block holds, in words.
 

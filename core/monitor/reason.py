@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, labels
 from uncertain_lti.model.jumps import jumps, jumps_in_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -58,6 +57,8 @@ class Facts(NamedTuple):
         States that are frozen.
     lacking : sequence of str
         Signals without a value at either end of the transition; looked at if the status is MISSING.
+    unlisted : str
+        Which mode the model does not list, in words; looked at if the status is MODE.
     jumps : sequence of str
         States that left their bounds by a jump larger than any of the fit, in words.
     """
@@ -68,6 +69,7 @@ class Facts(NamedTuple):
     raised: Sequence[Raised] = ()
     frozen: Sequence[str] = ()
     lacking: Sequence[str] = ()
+    unlisted: str = ""
     jumps: Sequence[str] = ()
 
 
@@ -135,11 +137,14 @@ class Reasons:
         lacking: Sequence[str] = ()
         if verdict.status is Status.MISSING:
             lacking = self._lacking([*verdict.before, *verdict.numbers("state")])
+        unlisted = self._model.why_unlisted(verdict.before) if verdict.status is Status.MODE else ""
         frozen = [names[moved.state] for moved in verdict.frozen]
         jumps: Sequence[str] = ()
         if verdict.violated:
             jumps = jumps_in_words(self._model, verdict.before, verdict.numbers("state"), verdict.numbers("flags"))
-        return self.push(Facts(alarm, verdict.status, verdict.unknown_regime, verdict.raised, frozen, lacking, jumps))
+        return self.push(
+            Facts(alarm, verdict.status, verdict.unknown_regime, verdict.raised, frozen, lacking, unlisted, jumps)
+        )
 
     def _lacking(self, values: Sequence[float]) -> list[str]:
         """Names of signals of which some value, of [x; u; s] before and x after, is no number."""
@@ -197,6 +202,8 @@ class Reasons:
     def _why(self, facts: Facts) -> str:
         if facts.status is Status.MISSING and facts.lacking:
             return f"{', '.join(facts.lacking)} missing, stale, not valid or not finite"
+        if facts.status is Status.MODE and facts.unlisted:
+            return facts.unlisted
         return WHY[facts.status]
 
 
@@ -225,14 +232,19 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
         raised = verdicts.raised(k) if alarm else ()
         frozen = [names[i] for i in np.flatnonzero(verdicts.frozen[k])]
         lacking: Sequence[str] = ()
-        if status is Status.MISSING:
-            ends: list[Array] = [transient.x[k - 1], transient.u[k - 1], transient.s[k - 1], transient.x[k]]
-            lacking = reasons._lacking(np.concatenate(ends).tolist())
+        unlisted = ""
+        if status in (Status.MISSING, Status.MODE):
+            before = np.concatenate([transient.x[k - 1], transient.u[k - 1], transient.s[k - 1]]).tolist()
+            if status is Status.MODE:
+                unlisted = model.why_unlisted(before)
+            else:
+                lacking = reasons._lacking([*before, *transient.x[k].tolist()])
         jumps: Sequence[str] = ()
         if alarm and status is Status.OK:
             flags = verdicts.flags[k].tolist()
             jumps = jumps_in_words(model, transient.x[k - 1].tolist(), transient.x[k].tolist(), flags)
-        text = reasons.push(Facts(alarm, status, bool(verdicts.unknown_regime[k]), raised, frozen, lacking, jumps))
+        unknown = bool(verdicts.unknown_regime[k])
+        text = reasons.push(Facts(alarm, status, unknown, raised, frozen, lacking, unlisted, jumps))
         if text != said:
             yield k, text
             said = text
@@ -255,6 +267,9 @@ def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Stat
     transient = verdicts.transient
     unknown = np.isnan(np.column_stack([transient.x, transient.u, transient.s]))
     rows += [np.array([number[status] for status in statuses], dtype=np.int64), unknown]
+    if verdicts.unlisted_mode.any():
+        after = np.column_stack([transient.x, transient.u, transient.s])[:, list(model.scheduling_positions)]
+        rows.append(np.where(verdicts.unlisted_mode[:, None], np.roll(after, 1, axis=0), 0.0))
     facts = np.column_stack(rows)
     changes = np.ones(len(facts), dtype=bool)
     changes[1:] = (facts[1:] != facts[:-1]).any(axis=1)

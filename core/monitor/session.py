@@ -98,7 +98,10 @@ class Session(Stream):
                 which = ""
                 if status is Status.MISSING:
                     which = f" ({shortlist(self.lacking(period.counters), SHOWN)})"
-                complaints.append(f"{period.statuses[status]} samples without a verdict: {WHY[status]}{which}")
+                why = WHY[status]
+                if status is Status.MODE and period.last_unlisted is not None:
+                    why = self.model.why_unlisted(period.last_unlisted.before)
+                complaints.append(f"{period.statuses[status]} samples without a verdict: {why}{which}")
         dropped = sum(count for status, count in period.statuses.items() if status.dropped)
         if dropped:
             which = ", ".join(f"{status.value} {count}" for status, count in period.statuses.items() if status.dropped)

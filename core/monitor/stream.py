@@ -74,6 +74,8 @@ class Period:
         Those of a regime that was not fitted.
     last_unknown : Verdict or None
         The last of these.
+    last_unlisted : Verdict or None
+        The last in it on a mode that the model does not list.
     alarm : bool
         The alarm was raised at some time in it.
     frozen, repeating : dict of int to Moved
@@ -100,6 +102,7 @@ class Period:
     outside: int = cython.declare(cython.Py_ssize_t, visibility="public")
     unknown: int = cython.declare(cython.Py_ssize_t, visibility="public")
     last_unknown: Verdict | None = cython.declare(object, visibility="public")
+    last_unlisted: Verdict | None = cython.declare(object, visibility="public")
     alarm: bool = cython.declare(cython.bint, visibility="public")
     frozen: dict[int, Moved] = cython.declare(object, visibility="readonly")
     repeating: dict[int, Moved] = cython.declare(object, visibility="readonly")
@@ -112,7 +115,7 @@ class Period:
     future: int = cython.declare(cython.Py_ssize_t, visibility="public")
 
     def __init__(self, began: float) -> None:
-        self.began, self.last_unknown, self.alarm = began, None, False
+        self.began, self.last_unknown, self.last_unlisted, self.alarm = began, None, None, False
         self.verdicts = self.outside = self.unknown = 0
         self.frozen, self.repeating = {}, {}
         self.violations, self.statuses, self.counters = Counter(), Counter(), Counter()
@@ -622,6 +625,8 @@ class Stream:
             period.statuses[verdict.status] += 1
             if verdict.status in (Status.STEP, Status.MODE, Status.FROZEN):  # the sampler does not know the model
                 self.sampler.counters[verdict.status.value] += 1
+            if verdict.status is Status.MODE:
+                period.last_unlisted = verdict
         period.frozen.update({moved.state: moved for moved in verdict.frozen})
         period.repeating.update({moved.state: moved for moved in verdict.repeating})
         alarm: cython.bint = verdict.alarm or self.latched
