@@ -220,11 +220,14 @@ def test_a_signals_file_says_how_to_schedule() -> None:
     signals = SignalMap.from_dict(data)
     assert signals.schedule == (ScheduleRule("speed", "auto"), ScheduleRule("gear", None, (1.0, 2.0)))
     assert [s.name for s in signals.signals] == ["speed", "gear"] and signals.topics == ("/s", "/g")
+    flag = SignalMap.from_dict(data | {"schedule": [{"signal": "gear", "modes": [False, True]}]})
+    assert flag.schedule == (ScheduleRule("gear", None, (0.0, 1.0)),)
     for key, value, words in (
         ("schedule", [{"signal": "torque", "knots": 3}], "torque"),
         ("schedule", [{"signal": "speed", "knots": 0}], "knots"),
         ("schedule", [{"signal": "speed"}], "knots"),
         ("schedule", [{"signal": "speed", "knots": [1, "a"]}], r"knots\[1\]"),
+        ("schedule", [{"signal": "speed", "knots": [False, True]}], r"knots\[0\]"),
         ("schedule", {"signal": "speed"}, "list"),
         ("scheduling", [{"name": "gear", "topic": "/g", "field": "data", "delay": 2}], "delay"),
     ):

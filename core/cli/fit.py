@@ -274,7 +274,8 @@ def _schedule(text: str) -> tuple[str, str, Any]:
     try:
         if kind == "knots" and "," not in values:
             return name, kind, int(values)
-        return name, kind, [float(v) for v in values.split(",")]
+        flags = {"false": 0.0, "true": 1.0} if kind == "modes" else {}
+        return name, kind, [flags[v] if v in flags else float(v) for v in values.split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"{knots!r} is neither auto, a number of knots, knots such as 0.2,0.5,0.9 nor modes such as modes:1,2,3"

@@ -738,6 +738,8 @@ def _schedule(data: Any, where: str) -> tuple[ScheduleRule, ...]:
             which, values = ("knots", knots) if modes is None else ("modes", modes)
             if not isinstance(values, list) or not values:
                 raise SignalError(f"{here}: {which} is {reprlib.repr(values)}; write a list of numbers")
+            if modes is not None:  # those of a flag, as its field is read
+                values = [int(v) if isinstance(v, bool) else v for v in values]
             numbers = [checked_number(v, f"{here}: {which}[{i}]") for i, v in enumerate(values)]
             if None in numbers:
                 raise SignalError(f"{here}: {which} has an empty entry; write a number")
