@@ -283,6 +283,8 @@ def test_blocks_without_data_share_those_of_their_neighbour_and_it_is_said():
     assert model.block_data[4].transitions == 0 and not model.block_data[4].known
     said = [m for m in model.fit_summary["messages"] if "shares those" in m]
     assert len(said) == 2 and "u1 = 2" in said[0] and "u1 = 1" in said[0] and "record" in said[0]
+    many = fit(transient, additive="both", schedule={"u1": np.arange(-1, 12)}).fit_summary["messages"]
+    assert sum("shares those" in m for m in many) == 5 and any(m.startswith("5 more blocks have too") for m in many)
     # it costs nothing: what no transition visits has no part in any
     fewer = fit(transient, additive="both", schedule={"u1": (-1, 0, 1)})
     assert model.fit_summary["objective"] == pytest.approx(fewer.fit_summary["objective"], rel=1e-9)

@@ -9,8 +9,10 @@
 
 """Choice of a schedule by what is left out, suggestions, and what the command says of them."""
 
+import argparse
 import inspect
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,11 +20,12 @@ from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, OperatingPoint, Transient, UncertainLTI, fit, validate
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.cli.fit import _schedule
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.free_run import free_run
-from uncertain_lti.proposal.scheduling import EXCESS_FOR_MUCH, WANTED, choose_knots
+from uncertain_lti.proposal.scheduling import EXCESS, EXCESS_FOR_MUCH, WANTED, Candidate, best_of, choose_knots
 from uncertain_lti.proposal.suggestion import promise, suggest_schedule, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
 from uncertain_lti.validation.fitted_model import validate_model
@@ -101,6 +104,32 @@ def test_recordings_that_visit_different_regimes_keep_one_knot_and_hear_what_to_
     assert "record x1 from" in facts["record"] and "more recordings" in facts["record"]
     assert facts["record"] in model.fit_summary["messages"][-1]
     assert f"at least {WANTED - 1} more" in facts["record"]
+
+
+def test_what_to_record_is_said_beside_further_signals_that_schedule_nothing():
+    """In whatever order the signals are; the level is x1."""
+    (alone,) = fit(APART, schedule={"x1": "auto"}, **options()).fit_summary["schedule"]
+    runs = with_further(APART)
+    signals = replace(runs[0].signals, scheduling=runs[0].signals.scheduling[::-1])
+    for some in (runs, [t.replace(s=t.s[:, ::-1], signals=signals) for t in runs]):
+        (facts,) = fit(some, schedule={"level": "auto"}, **options()).fit_summary["schedule"]
+        assert facts["record"] == alone["record"].replace("x1", "level")
+
+
+def test_a_recording_unlike_all_others_excuses_nothing():
+    """One left-out part that no number of knots covers has so large an error that any difference is within it."""
+    judged, one = np.full(10, 2000.0), np.array([900.0, 1, 0, 1, 0, 2, 1, 0, 1, 1])
+    base = Candidate(1, judged=judged, outside=one, log_width=np.zeros(10))
+
+    def knots(more, unlike):
+        outside = np.array([unlike, *(one[1:] + more)])
+        return Candidate(3, judged=judged, outside=outside, log_width=np.full(10, -0.6))
+
+    assert best_of([base, fine := knots(1.0, 1100.0)]) is fine
+    for worse in (knots(4.0, 860.0), knots(4.0, 600.0)):
+        assert worse.more_outside(base)[0] < worse.more_outside(base)[1]
+        assert best_of([base, worse]) is base
+    assert knots(4.0, 1100.0).excess(base) > EXCESS > knots(0.5, 900.0).excess(base)
 
 
 def test_a_choice_is_the_same_again():
@@ -271,6 +300,13 @@ def test_the_command_prints_the_table_and_the_reason(folder, capsys):
     assert "knots on fan, by leaving out one block of 10 at a time" in printed
     assert "1 (chosen)" in printed and "note: schedule: 1 knot on fan" in printed
     assert UncertainLTI.load(folder / "m.model.json").schedule is None
+
+
+def test_the_modes_of_a_flag_may_be_true_and_false():
+    asked = [_schedule(text)[2] for text in ("on=modes:false,true", "on=modes:0,1")]
+    assert asked[0] == asked[1] == [0.0, 1.0]
+    with pytest.raises(argparse.ArgumentTypeError, match="neither auto"):
+        _schedule("on=false,true")
 
 
 @pytest.mark.parametrize(("text", "blocks"), [("fan=2", 2), ("fan=-0.1,0,0.1", 3)])

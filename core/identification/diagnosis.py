@@ -225,7 +225,16 @@ def _tied(model: UncertainLTI, problem: Problem, sums: Moments) -> list[str]:
         return []
     tied = [r if data.tied_to is None else data.tied_to for r, data in enumerate(model.block_data)]
     messages = regimes.tied_words(columns.regimes.schedule, sums, columns, problem.p, tied, model.signals.signals)
+    if (more := len(messages) - MOST_TIED) > 1:
+        messages[MOST_TIED:] = [
+            f"{more} more blocks have too little data and share the elements of others; the table of regimes, of "
+            f"`uncertain-lti info` as well, says which"
+        ]
     return messages
+
+
+MOST_TIED = 5
+"""Blocks that share the elements of another which are named one by one."""
 
 
 def _at(model: UncertainLTI, block: int) -> str:

@@ -244,7 +244,11 @@ def signals_of(schedule: Schedule | Mapping[str, Knots] | None, names: Sequence[
     if not isinstance(schedule, Mapping):
         return list(names)  # `scheduled_by` refuses it
     check_names(schedule, names)
-    return [name for name, knots in schedule.items() if isinstance(knots, bool) or knots != 1]
+    return [
+        name
+        for name, knots in schedule.items()
+        if isinstance(knots, bool) or isinstance(knots, np.ndarray) or knots != 1
+    ]
 
 
 def check_names(schedule: Iterable[str], names: Sequence[str]) -> None:
@@ -392,7 +396,7 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
         if not trials:
             raise FitError(
                 f"schedule: '{name}' takes too few values for {count} knots, or the recordings hold too little near "
-                f"each of them; give fewer, or Modes with its values"
+                f"each of them; give fewer, or list its values as modes"
             )
         knots = sorted([*knots, min(trials)[2]])
     return tuple(knots)

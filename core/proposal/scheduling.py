@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
@@ -40,12 +41,15 @@ FOLDS = 10
 SLACK = 0.25
 """Share of what one knot leaves outside of a left-out part by which more may be outside: the other recordings do not
 represent such a part, and the narrower an envelope is, the more of it is outside."""
-EXCESS = 0.001
+EXCESS = 0.00075
 """Share of all left-out transitions that may be outside beyond that, ..."""
 MUCH, EXCESS_FOR_MUCH = 0.3, 0.005
 """... the mean width, relative to one knot, that is worth a greater one, and that one, ..."""
 WORSE = 0.01
 """... and share that may be if it is within the standard error of the comparison."""
+UNLIKE = 0.05
+"""Share that one knot leaves outside of a left-out part, above which that part is unlike the other recordings: how much
+more of it another number of knots leaves outside is chance, and must not hide what it does to the rest."""
 PAYS = 0.8
 """Mean width relative to one knot up to which more knots are worth having."""
 WANTED = 5
@@ -114,13 +118,15 @@ class Candidate:
         """Share of the left-out transitions outside."""
         return float(self.outside.sum() / self.judged.sum()) if self.judged.sum() else math.nan
 
-    def more_outside(self, base: Candidate) -> tuple[float, float]:
+    def more_outside(self, base: Candidate, of: NDArray[np.bool_] | None = None) -> tuple[float, float]:
         """Share outside beyond that of another candidate, with its standard error.
 
         Parameters
         ----------
         base : Candidate
             The other, on the same left-out transitions.
+        of : array of bool (units,), optional
+            The left-out parts that count; default all.
 
         Returns
         -------
@@ -129,23 +135,40 @@ class Candidate:
         float
             Standard error over what was left out.
         """
-        return jackknife(self.outside - base.outside, self.judged)
+        of = np.ones(len(self.judged), dtype=bool) if of is None else of
+        return jackknife((self.outside - base.outside)[of], self.judged[of])
 
-    def excess(self, base: Candidate) -> float:
+    def excess(self, base: Candidate, of: NDArray[np.bool_] | None = None) -> float:
         """Share outside beyond what may be, summed over the left-out parts in which there is any.
 
         Parameters
         ----------
         base : Candidate
             One knot, on the same left-out transitions.
+        of : array of bool (units,), optional
+            The left-out parts that count; default those in which it is largest, all or the ones that are like others.
 
         Returns
         -------
         float
-            Of all left-out transitions.
+            Of the left-out transitions of these parts.
         """
-        beyond = np.maximum(self.outside - (1.0 + SLACK) * base.outside, 0.0)
-        return float(beyond.sum() / max(self.judged.sum(), 1.0))
+        if of is None:
+            return max(self.excess(base, parts) for parts in base.counted())
+        beyond = np.maximum(self.outside - (1.0 + SLACK) * base.outside, 0.0)[of]
+        return float(beyond.sum() / max(self.judged[of].sum(), 1.0))
+
+    def counted(self) -> list[NDArray[np.bool_]]:
+        """The sets of left-out parts on which coverage has to hold, of one knot.
+
+        Returns
+        -------
+        list of array of bool (units,)
+            All, and those of which it leaves at most UNLIKE outside if they are two at least, and half of all.
+        """
+        like = self.outside <= UNLIKE * self.judged
+        every = np.ones(len(like), dtype=bool)
+        return [every, like] if 1 < like.sum() < len(like) <= 2 * like.sum() else [every]
 
     @property
     def width(self) -> tuple[float, float]:
@@ -322,9 +345,11 @@ def choose_knots(
     Coverage comes first: a number is refused if more than EXCESS of the left-out transitions are outside beyond
     1 + SLACK times those of one knot in the same part (EXCESS_FOR_MUCH, where the widths are at most MUCH of one
     knot's), unless the share outside exceeds that of one knot by less than
-    its standard error, and by less than WORSE. Of those whose mean width (geometric over states and left-out parts) is
-    at most PAYS of one knot's, the one with the least width is the best, and the fewest knots within one standard
-    error of it are chosen. Standard errors are those of the jackknife over what was left out.
+    its standard error, and by less than WORSE. That must hold of all parts, and of those alone that are like others
+    (one knot leaves at most UNLIKE of them outside), if they are half of all: a recording that no other resembles
+    has so large an error that it would excuse anything. Of those whose mean width (geometric over states and left-out
+    parts) is at most PAYS of one knot's, the one with the least width is the best, and the fewest knots within one
+    standard error of it are chosen. Standard errors are those of the jackknife over what was left out.
 
     Parameters
     ----------
@@ -481,10 +506,13 @@ def _admissible(candidate: Candidate, base: Candidate, allowed: float) -> bool:
     """Whether its coverage does not speak against it."""
     if candidate.refused:
         return False
-    more, error = candidate.more_outside(base)
     if candidate.width[0] <= math.log(MUCH):
         allowed = max(allowed, EXCESS_FOR_MUCH)
-    return candidate.excess(base) <= allowed or more < min(error, WORSE)
+    for parts in base.counted():
+        more, error = candidate.more_outside(base, parts)
+        if candidate.excess(base, parts) > allowed and more >= min(error, WORSE):
+            return False
+    return True
 
 
 def best_of(candidates: Sequence[Candidate], allowed: float = EXCESS) -> Candidate:
@@ -598,8 +626,9 @@ def ranges(candidate: Candidate, signal: str, trials: Trials) -> list[dict[str, 
     place = np.array([index[axis] for index in model.schedule.indices])
     enough = 2 * (model.n + model.m)
     there = np.zeros(len(at), dtype=int)
+    further = [s.name for s in model.signals.scheduling]
     for transient in trials.transients:
-        blocks = model.main_block(model.normalised_columns(transient.transitions()))
+        blocks = model.main_block(model.normalised_columns(transient.scheduled_on(further).transitions()))
         there += np.bincount(place[blocks[blocks >= 0]], minlength=len(at)) >= enough
     rows = []
     for k in range(len(at)):

@@ -120,7 +120,7 @@ def schedule_text(choice: Mapping[str, Any]) -> str:
             [
                 f"{c['knots']}{' (chosen)' if c['knots'] == choice['chosen'] else ''}",
                 f"{c['outside']:.2%}",
-                f"{c['excess']:.2%}",
+                f"{c['excess']:.3%}",
                 f"x {c['width']:.3g} ± {c['width_error']:.2g}" if c["knots"] > 1 else "x 1",
                 ", ".join(f"{k:.4g}" for k in c["at"]) or "-",
             ]
