@@ -36,7 +36,7 @@ from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.jumps import largest_steps
 from uncertain_lti.model.operating_point import OperatingPoint
-from uncertain_lti.model.repeats import repeats_in, together
+from uncertain_lti.model.repeats import Found, repeats_in, together
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
@@ -208,10 +208,10 @@ def fit_archive(
         "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
     found = visit("repeats in", repeats, model)
-    step_max = np.max([largest for _, _, largest in found], axis=0)
+    step_max = np.max([largest for _, largest in found], axis=0)
     return model.replace(
         fit_summary=facts,
-        repeats=together(model.n, [(most, windows) for most, windows, _ in found]),
+        repeats=together(model.n, [one for one, _ in found]),
         domain=replace(model.domain, step_max=step_max),
     )
 
@@ -303,7 +303,7 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     )
 
 
-def repeats(recording: Recording, model: UncertainLTI) -> tuple[Array, Array, Array]:
+def repeats(recording: Recording, model: UncertainLTI) -> tuple[Found, Array]:
     """What one recording has of exact repeats, and its largest steps.
 
     Parameters
@@ -315,15 +315,13 @@ def repeats(recording: Recording, model: UncertainLTI) -> tuple[Array, Array, Ar
 
     Returns
     -------
-    array (4, n)
+    Found
         As of `repeats_in`.
-    array (windows, n)
-        Likewise.
     array (n,)
         As of `largest_steps`.
     """
     transient = _sampled(recording, model.signals)
-    return *repeats_in(model, transient), largest_steps(model, [transient])
+    return repeats_in(model, transient), largest_steps(model, [transient])
 
 
 def _constant_dt(recording: Recording, signals: SignalMap) -> bool:

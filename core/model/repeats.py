@@ -19,7 +19,10 @@ was recorded, and the sum holds the state where it was read. Both are given in h
 
 The activity of the machine, as it concerns state i, is the range of (\\hat x_j - r) / Δt_j over the repeat, in
 half-widths: as r stays, it changes with the controls and the other states alone. The fit learns how active the machine
-is in the median second in which the state changes, and while it repeated.
+is in the seconds in which the state changes, and while it repeated.
+
+Noise is told by the steps in which the controls kept their values and the state changed by more than the model moves
+it, if no value of the state came twice in a recording.
 """
 
 from __future__ import annotations
@@ -38,12 +41,15 @@ from uncertain_lti.model.bounds import lower_of, upper_of
 from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.terms import checked
 
-_KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond")
+_KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond", "noisy_steps")
 WINDOW_S = 1.0
-"""Length of the windows of which the median activity is taken, s."""
+"""Length of the windows of which the activity is taken, s."""
 WINDOWS = 20
-"""Windows that the median needs."""
+"""Windows that a share of them needs."""
+ACTIVE = 0.5
+"""Share of the windows that may be less active than a machine that is called active; half of it where it was parked."""
 _BLOCK = 1 << 16  # transitions that are looked at together
+_DISTINCT = 4096  # values of a block that are compared with one another
 MORE_ACTIVE = 2.0
 """How much more active than during any repeat of the fit the machine must be."""
 
@@ -61,6 +67,8 @@ class Repeats:
         The largest sum of its one-step movements, likewise.
     active_beyond : array (n,), optional
         Activity beyond which the state always changed, in half-widths; default unknown, infinite.
+    noisy_steps : array (n,), optional
+        Steps that show noise; default 0, as for a state of which some value came twice.
 
     Raises
     ------
@@ -74,6 +82,7 @@ class Repeats:
         largest_run: ArrayLike | None = None,
         largest_sum: ArrayLike | None = None,
         active_beyond: ArrayLike | None = None,
+        noisy_steps: ArrayLike | None = None,
     ) -> None:
         self.longest_repeat_s = checked(longest_repeat_s, "frozen.longest_repeat_s", None)
         if self.longest_repeat_s.ndim != 1:
@@ -83,6 +92,7 @@ class Repeats:
         self.largest_run = unknown if largest_run is None else checked(largest_run, "frozen.largest_run", shape)
         self.largest_sum = unknown if largest_sum is None else checked(largest_sum, "frozen.largest_sum", shape)
         self.active_beyond = unknown if active_beyond is None else checked(active_beyond, "frozen.active_beyond", shape)
+        self.noisy_steps = np.zeros(shape) if noisy_steps is None else checked(noisy_steps, "frozen.noisy_steps", shape)
         for name in _KEYS:
             array = getattr(self, name)
             array.flags.writeable = False
@@ -101,6 +111,8 @@ class Repeats:
             Plain data.
         """
         found = {name: getattr(self, name).tolist() for name in _KEYS}
+        if not self.noisy_steps.any():
+            del found["noisy_steps"]
         return {name: values for name, values in found.items() if np.isfinite(values).all()}
 
     @classmethod
@@ -256,7 +268,25 @@ def repeats_of(model: Any, transients: Iterable[Any]) -> Repeats:
     return together(model.n, [repeats_in(model, transient) for transient in transients])
 
 
-def repeats_in(model: Any, transient: Any) -> tuple[Array, Array]:
+class Found(NamedTuple):
+    """What one recording has of exact repeats.
+
+    Parameters
+    ----------
+    most : array (4, n)
+        Of each state the longest repeat, the farthest run, the largest sum and the greatest activity of a repeat.
+    windows : array (windows, n)
+        Activity in each window of WINDOW_S; NaN for a state that repeats in half of it or more.
+    noisy : array (n,)
+        Steps that show noise; -1 for a state of which some value came twice.
+    """
+
+    most: Array
+    windows: Array
+    noisy: Array
+
+
+def repeats_in(model: Any, transient: Any) -> Found:
     """What one recording has of them.
 
     Parameters
@@ -268,17 +298,15 @@ def repeats_in(model: Any, transient: Any) -> tuple[Array, Array]:
 
     Returns
     -------
-    array (4, n)
-        Of each state the longest repeat, the farthest run, the largest sum and the greatest activity of a repeat.
-    array (windows, n)
-        Activity in each window of WINDOW_S; NaN for a state that repeats in half of it or more.
+    Found
+        In it.
     """
     longest, run, total, active = most = np.zeros((4, model.n))
     point, steps = model.operating_point, transient.transitions()
-    windows = _activity(model, transient, steps)
+    windows, noisy = _activity(model, transient, steps)
     rows = np.flatnonzero((steps.x == steps.x_next).any(axis=1))
     if not len(rows):
-        return most, windows
+        return Found(most, windows, noisy)
     chosen = np.zeros(len(steps.k), dtype=bool)
     chosen[rows] = True
     some = steps.take(chosen)
@@ -300,17 +328,17 @@ def repeats_in(model: Any, transient: Any) -> tuple[Array, Array]:
             longest[i] = max(longest[i], moved.seconds)
             run[i], total[i] = max(run[i], moved.run), max(total[i], moved.sum)
             active[i] = max(active[i], moved.activity)
-    return most, windows
+    return Found(most, windows, noisy)
 
 
-def together(n: int, found: Sequence[tuple[Array, Array]]) -> Repeats:
+def together(n: int, found: Sequence[Found]) -> Repeats:
     """What recordings have of exact repeats, from what each of them has.
 
     Parameters
     ----------
     n : int
         Number of states.
-    found : sequence of (array, array)
+    found : sequence of Found
         Of `repeats_in`.
 
     Returns
@@ -318,15 +346,18 @@ def together(n: int, found: Sequence[tuple[Array, Array]]) -> Repeats:
     Repeats
         Over all of them.
     """
-    longest, run, total, active = np.max([np.zeros((4, n)), *(most for most, _ in found)], axis=0)
-    median = _median(np.concatenate([np.zeros((0, n)), *(windows for _, windows in found)]))
-    beyond = np.maximum(median, MORE_ACTIVE * active)
-    return Repeats(longest, *(np.minimum(values, LARGEST) for values in (run, total, beyond)))
+    longest, run, total, active = np.max([np.zeros((4, n)), *(one.most for one in found)], axis=0)
+    windows = np.concatenate([np.zeros((0, n)), *(one.windows for one in found)])
+    usual = _usual(windows, np.where(longest < WINDOW_S, ACTIVE, ACTIVE / 2))
+    noisy = np.array([np.zeros(n), *(one.noisy for one in found)])
+    beyond = np.maximum(usual, MORE_ACTIVE * active)
+    run, total, beyond = (np.minimum(values, LARGEST) for values in (run, total, beyond))
+    return Repeats(longest, run, total, beyond, np.where((noisy >= 0).all(axis=0), noisy.sum(axis=0), 0.0))
 
 
-def _activity(model: Any, transient: Any, steps: Any) -> Array:
-    """Activity in each unbroken window (windows, n); NaN for a state that repeats in half of it or more."""
-    found: list[Array] = []
+def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
+    """Activity in each unbroken window, and the steps that show noise: `windows` and `noisy` of `Found`."""
+    found, noisy = list[Array](), np.zeros(model.n)
     t = transient.t_ns[steps.k]
     for a in range(0, len(t), _BLOCK):
         chosen = np.zeros(len(t), dtype=bool)
@@ -337,26 +368,30 @@ def _activity(model: Any, transient: Any, steps: Any) -> Array:
             z = model.normalised_columns(part)
             model.columns_centre_and_half(z, part.dt, centre, half)
             own = model.own_rates(z).T * part.x  # does not change in a repeat, and must not count here
-            rate = (model.operating_point.recorded_x(centre.T) - part.x) / part.dt[:, None] - own
+            movement = model.operating_point.recorded_x(centre.T) - part.x
+            rate = movement / part.dt[:, None] - own
             width = half.T * model.operating_point.X / part.dt[:, None]
             number = (at - at[0]) // round(WINDOW_S * 1e9)
             begins = np.flatnonzero(np.diff(number, prepend=-1))
             ends = np.append(begins[1:], len(at))
             spread = np.maximum.reduceat(rate, begins) - np.minimum.reduceat(rate, begins)
             activity = spread / np.maximum.reduceat(width, begins)
+        change = part.x_next - part.x
+        held = np.all(part.u[1:] == part.u[:-1], axis=1) & (np.diff(part.k) == 1)
+        noisy += (np.abs(change - movement) > np.abs(movement))[1:][held].sum(axis=0)
+        noisy[[len(np.unique(column)) < len(column) for column in part.x[:_DISTINCT].T]] = -np.inf
         repeats = np.add.reduceat((part.x == part.x_next).astype(np.float64), begins)
         counts = ends - begins
         whole = (counts >= 3) & (part.k[ends - 1] - part.k[begins] == counts - 1)
         activity[(2 * repeats >= counts[:, None]) | ~np.isfinite(activity)] = np.nan
         found.append(activity[whole])
-    return np.concatenate([np.zeros((0, model.n)), *found])
+    return np.concatenate([np.zeros((0, model.n)), *found]), np.maximum(noisy, -1.0)
 
 
-def _median(windows: Array) -> Array:
-    """Of each column the median of its numbers; infinite where these are few."""
+def _usual(windows: Array, shares: Array) -> Array:
+    """Of each column what this share of its numbers is below; a half-width at least where they are few."""
     found = np.full(windows.shape[1], np.inf)
-    for i, column in enumerate(windows.T):
+    for i, (column, share) in enumerate(zip(windows.T, shares, strict=True)):
         known = column[~np.isnan(column)]
-        if len(known) >= WINDOWS:
-            found[i] = np.median(known)
+        found[i] = np.quantile(known, share) if len(known) >= WINDOWS else 1.0
     return found

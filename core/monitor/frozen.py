@@ -13,7 +13,9 @@ A parked machine repeats too, so a repeat alone is a warning. A state is frozen 
 repeat, moves it by more than its half-width, and farther than over any repeat of the fit; twice as far if the fit has
 repeats as long. Where another state has left the place that it had when the repeat began, the machine is not
 parked: there the sum of the model's one-step movements counts like its run. Nor is it parked while it is as active
-as in the recordings, and twice as active as over any repeat of theirs: then three repeats are enough.
+as in the recordings, and twice as active as over any repeat of theirs: then three repeats are enough. So they are of a
+state that noise changes at every step, also when the machine is at rest; unless the value is 0, as of what is switched
+off. A short repeat is usual up to twice the longest of the fit, as a coarse sensor repeats by chance.
 """
 
 from __future__ import annotations
@@ -27,10 +29,20 @@ import numpy as np
 from uncertain_lti.model.repeats import Moved, Repeating, Repeats
 
 FARTHER = 2.0
-"""How much farther than over any repeat of the fit the model must move a state whose repeat is no longer than those."""
+"""How much farther than over any repeat of the fit the model must move a state whose repeat is no longer than those,
+and how much longer a short one must be."""
+
+USUAL_S = 0.25
+"""Seconds up to which a repeat is usual, s, if the fit has repeats half as long: those of a coarse sensor in motion."""
 
 LEAST = 3
-"""Steps that a repeat must have while the machine is active."""
+"""Steps that a repeat must have while the machine is active, or of a state that noise changes."""
+
+LEAST_S = 0.5
+"""Seconds that are enough in place of these steps of a state that noise changes: that of a slow sensor."""
+
+NOISY = 1000
+"""Steps that must have shown the noise."""
 
 Bounds = tuple[Sequence[float], Sequence[float], Sequence[float]]
 """Of one transition: lower and upper bound (n,) each, recorded units, and the elements a_ii of the nominal model."""
@@ -86,6 +98,8 @@ class FrozenWatch:
         "_run_within",
         "_sum",
         "_active",
+        "_noisy",
+        "_usual",
     )
 
     def __init__(self, repeats: Repeats, margin: float, counted: Sequence[bool]) -> None:
@@ -96,7 +110,9 @@ class FrozenWatch:
         self._run_within: list[float] = np.maximum(1.0, FARTHER * run).tolist()
         self._run: list[float] = np.maximum(1.0, np.where(np.isfinite(run), run, 0.0)).tolist()
         self._sum: list[float] = np.maximum(1.0, np.where(np.isfinite(total), total, 0.0)).tolist()
+        self._usual = [min(FARTHER * seconds, USUAL_S) for seconds in self._longest]
         self._active: list[float] = repeats.active_beyond.tolist()
+        self._noisy: list[bool] = ((repeats.noisy_steps >= NOISY) & (repeats.longest_repeat_s == 0.0)).tolist()
         self._counted, self._margin = list(counted), margin
         self._follow = Repeating(len(self._longest), margin)
         self.forget()
@@ -153,7 +169,11 @@ class FrozenWatch:
 
     def _is_frozen(self, moved: Moved, after: Sequence[float], lower: Sequence[float], upper: Sequence[float]) -> bool:
         i = moved.state
+        if moved.seconds <= self._usual[i]:
+            return False
         if moved.steps >= LEAST and moved.activity > self._active[i]:
+            return True
+        if self._noisy[i] and after[i] != 0.0 and (moved.steps >= LEAST or moved.seconds >= LEAST_S):
             return True
         if moved.seconds <= self._longest[i]:
             return moved.run > self._run_within[i]
@@ -183,12 +203,14 @@ def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
         Without a full stop.
     """
     what = repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])
-    size = max(moved.run, moved.sum)
+    size, noisy = max(moved.run, moved.sum), repeats.noisy_steps[moved.state]
     if size <= 1.0 and moved.activity > repeats.active_beyond[moved.state]:
         return (
             f"{name} {what}, while the machine is active: its rate by the model changes by {moved.activity:.3g} "
             f"half-widths, and beyond {repeats.active_beyond[moved.state]:.3g} it always changed"
         )
+    if size <= 1.0 and noisy >= NOISY:
+        return f"{name} {what}; at constant controls noise changed it {noisy:.0f} times in the fit"
     return f"{name} {what}, while the model moves it by {size:.3g} half-widths"
 
 
