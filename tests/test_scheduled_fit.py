@@ -23,6 +23,7 @@ from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.regimes import Modes
+from uncertain_lti.identification.row import Row
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import SUBSAMPLE
 from uncertain_lti.model.schedule import Axis, Schedule
@@ -226,6 +227,39 @@ def test_five_knots_reach_the_least_largest_width_and_its_ties():
         squares = cp.Problem(cp.Minimize(cp.sum_squares(psi @ d) / len(step)), room)
         squares.solve(cp.CLARABEL)
         assert np.mean(half**2) / unit**2 < 1.001 * squares.value
+
+
+LIMITED = Structure(2, 2, upper={"v": np.array([1.0, np.inf])})
+LEAST = Structure(2, 2, lower={"dA": np.array([[1e-3, 0.0], [0.0, 0.0]])})
+
+
+@pytest.mark.parametrize(
+    ("additive", "structure", "short"),
+    [
+        ("noise", None, True),
+        ("both", None, True),
+        ("none", None, False),
+        ("noise", LIMITED, False),
+        ("noise", LEAST, False),
+    ],
+)
+def test_the_least_largest_width_by_the_nominal_elements_alone(monkeypatch, additive, structure, short):
+    """Half-widths of one size reach it where the structure lets them: the same as with all half-widths unknown."""
+    transient = drawn(THREE, 3000, 8, noise=1e-4)
+    taken = []
+    nearest = Row._nearest
+    monkeypatch.setattr(Row, "_nearest", lambda row: taken.append(row.i) or nearest(row))
+    model = fit(transient, "lp", additive=additive, structure=structure, schedule=THREE)
+    assert (0 in taken) == short
+    monkeypatch.setattr(Row, "box", None)
+    other = fit(transient, "lp", additive=additive, structure=structure, schedule=THREE)
+    assert model.fit_summary["objective"] == pytest.approx(other.fit_summary["objective"], rel=2e-8)
+    steps = transient.transitions()
+    squares = [
+        np.square(np.diff(m.bounds(steps.x, steps.u, steps.dt, s=steps.s), axis=0)).sum() for m in (model, other)
+    ]
+    assert squares[0] == pytest.approx(squares[1], rel=1e-3)
+    assert outside_normalised(model, transient) == 0
 
 
 def test_a_piecewise_linear_plant_is_recovered():

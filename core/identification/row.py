@@ -56,8 +56,15 @@ _HELD = 12
 """Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
 _RIDGE = 1e-9
 """Share of the largest weight with which the ties of (11) hold on to the vertex where nothing else decides."""
-_ROOM = (1e-10, 3e-9, 3e-8)
-"""Violation, in scaled units, that the ties of (11) may leave, by attempt: the set of optima can be as thin as that."""
+_TIES = (
+    (_ATTEMPTS[0], 1e-10),
+    (_ATTEMPTS[0], 4e-10),
+    (_ATTEMPTS[0], 1e-9),
+    (_ATTEMPTS[1], 3e-9),
+    (_ATTEMPTS[2], 3e-8),
+)
+"""Attempts at the ties of (11), and the violation, in scaled units, that each may leave: the set of optima can be as
+thin as that. Half-widths below 0 become 0, so what is left makes the others wider than δ allows."""
 JOIN = 48  # samples that join a working set per round, at least; more if there are many unknowns
 
 
@@ -212,6 +219,7 @@ class Row:
         self.samples = Samples.join([], len(sums.low))
         self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
         self.limit: float | None = None  # δ of (11) in units of scale x width_unit
+        self.allowed = 0.0  # δ that the ties may have, in the same units
         self.exact = sums.visits.size > 1  # (11) by the simplex method
         self.least = 0.0  # δ of (11) that it found, in the same units as the limit
         self._forget()
@@ -666,18 +674,21 @@ class Row:
         FitError
             There is no optimum.
         """
-        G, h = self._rows(self.pool)
-        number = 3 * np.tile(self.samples.index[self.pool], 3) + np.repeat(np.arange(3), len(self.pool))
+        box = self.box
+        G, h = self._rows(self.pool) if box is None else self._distances(self.pool)
+        kinds = 3 if box is None else 2
+        number = kinds * np.tile(self.samples.index[self.pool], kinds) + np.repeat(np.arange(kinds), len(self.pool))
         if self._simplex is None:  # of each sample the side that it is on, and its width
-            self._simplex = self._minimax()
+            self._simplex = self._minimax() if box is None else self._nearest()
             theta, d = self.scaled()
             away = self.plain_phi[self.pool] @ theta - self.y[self.pool]
             half = self.psi[self.pool] @ d + self.half[self.pool]
             outside = np.concatenate([away + half, half - away]) < 0.0
-            wanted = np.concatenate([outside, outside.reshape(2, -1).any(axis=0)])
+            width = outside.reshape(2, -1).any(axis=0)
+            wanted = np.concatenate([outside, width]) if box is None else outside
         else:
             wanted = G @ self._simplex.solution() - h < -TOLERANCE
-            idle = self._simplex.idle(_HELD * (self.r + self.q))
+            idle = self._simplex.idle(_HELD * (G.shape[1] - 1))
             idle = idle[idle >= len(self.asked)]  # those come first, and stay
             if len(idle):
                 self._simplex.drop(idle)
@@ -691,9 +702,52 @@ class Row:
             wanted = G @ answer - h < -TOLERANCE
             if not (wanted & ~np.isin(number, self._known)).any():
                 break
+        if box is not None:
+            answer = np.concatenate([answer[:-1], box * answer[-1], answer[-1:]])
         self.least = float(answer[-1])
         self._store_limited(answer)
         return "HiGHS simplex"
+
+    @property
+    def box(self) -> Array | None:
+        """Scaled half-widths with which every sample is as wide as any other, by 1 in units of the limit.
+
+        With them the largest distance of a recorded next sample from the centre is all that (11) has to make small:
+        where half-widths exceed it nowhere, those of one size do so nowhere either. So the nominal elements are the
+        only unknowns of δ, and what other half-widths are among its optima is left to the ties. None where the
+        structure or the recordings have no such half-widths.
+        """
+        sums, columns = self.sums, self._columns
+        least_known = self.fixed_d.any() or (self.lower[self.r :] > 0.0).any()
+        if least_known or sums.gram is not None or sums.coupled is not None or not len(self.samples):
+            return None
+        for k, term in enumerate(columns.half, start=len(sums.low)):
+            wanted, found = np.zeros((columns.count, len(self.d) // columns.count)), np.zeros(len(self.d))
+            wanted[:, k] = 1.0
+            unknown = wanted.ravel()[self.free_psi]
+            self.psi_columns.put(found, unknown)
+            there = self.size_unit > 0.0  # the others are 0 in every sample
+            constant = not term.times_dt or sums.dt_min == sums.dt_max
+            all_of_it = np.array_equal(found[there], wanted.ravel()[there])
+            if constant and all_of_it and np.isinf(self.upper[self.r :][unknown > 0.0]).all():
+                box = unknown / (self.unit_psi * self.scale)
+                return np.asarray(box / (self.width[0] * float(self.psi[0] @ box)))
+        return None
+
+    def _distances(self, pool: Index) -> tuple[Array, Array]:
+        """G [θ δ] >= h: the centre of samples of the pool is no further from the next sample than δ allows."""
+        width = self.width[pool]
+        unit = np.minimum(1.0, 1.0 / width)
+        phi, y = self.phi[pool] * (width * unit)[:, None], self.y[pool] * width * unit
+        sides = np.hstack([phi, unit[:, None]]), np.hstack([-phi, unit[:, None]])
+        return np.vstack(sides), np.concatenate([y, -y])
+
+    def _nearest(self) -> Simplex:
+        """As `_minimax`, of the nominal elements alone."""
+        cost = np.append(np.zeros(self.r), 1.0)
+        simplex = Simplex(cost, np.append(self.lower[: self.r], 0.0), np.append(self.upper[: self.r], np.inf))
+        simplex.add(*self._asked(np.empty((0, len(cost))), np.empty(0)))
+        return simplex
 
     def least_width(self) -> float:
         """A lower bound of δ, in units of scale: the optimum of (11) on the samples that decide it, then on more.
@@ -994,7 +1048,7 @@ class Row:
         width = self.width[pool]
         unit = np.minimum(1.0, 1.0 / width)
         rows = np.hstack([np.zeros((len(pool), self.r)), -(width * unit)[:, None] * self.psi[pool]])
-        limits = (width * self.half[pool] - self.limit) * unit
+        limits = (width * self.half[pool] - self.allowed) * unit
         low, high = np.isfinite(self.lower), np.isfinite(self.upper)
         every = np.eye(len(point))
         h = np.concatenate([h, limits, self.lower[low], -self.upper[high]])
@@ -1007,7 +1061,7 @@ class Row:
         G, size = G @ along, np.linalg.norm(G, axis=1)
         moved = np.linalg.norm(G, axis=1) > 1e-9 * size  # the others are as they are in every optimum
         G, h, some = G[moved], h[moved], some[moved]
-        for (factor, ridge), room in zip(_ATTEMPTS, _ROOM, strict=True) if len(anywhere) else ():
+        for (factor, ridge), room in _TIES if len(anywhere) else ():
             h = np.minimum(h, -room * some)
             H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
             f, H = along.T @ (f + H @ point), along.T @ H @ along
@@ -1017,7 +1071,7 @@ class Row:
             except FitError:
                 continue
             self.attempt = factor, ridge
-            self._store_limited(np.append(point + along @ answer.xi, self.limit))
+            self._store_limited(np.append(point + along @ answer.xi, self.allowed))
             return answer.solver
         self.store(point)  # one optimum, or rounding leaves no room to choose
         return "HiGHS simplex"
@@ -1029,11 +1083,34 @@ class Row:
         What carries the optimum keeps its value, so the directions leave it as it is.
         """
         assert self._simplex is not None
-        point = self._simplex.solution()[:-1]
-        carrying = self._simplex.carrying()[:, :-1]
+        point, box = self._simplex.solution(), self.box
+        if box is None:
+            point, carrying = point[:-1], self._simplex.carrying()[:, :-1]
+        else:
+            point = np.concatenate([point[:-1], box * point[-1]])
+            carrying = self._carrying_box()
         norm = np.linalg.norm(carrying, axis=1)
         _, values, right = np.linalg.svd(carrying[norm > 0.0] / norm[norm > 0.0, None])
         return point, right[np.count_nonzero(values > 1e-10) :].T
+
+    def _carrying_box(self) -> Array:
+        """As `Simplex.carrying`: the samples that keep δ from being less keep their centre and their width."""
+        assert self._simplex is not None
+        rows, unknowns = self._simplex.priced()
+        fixed = np.zeros((len(unknowns), self.r + self.q))
+        fixed[np.arange(len(unknowns)), unknowns] = 1.0
+        before = rows < len(self.asked)
+        asked = self.asked[rows[before]]
+        samples = np.searchsorted(self.samples.index, self._known[rows[~before] - len(self.asked)] // 2)
+        phi, psi = self.phi[samples], self.psi[samples]
+        return np.vstack(
+            [
+                np.hstack([asked, np.zeros((len(asked), self.q))]),
+                np.hstack([phi, np.zeros_like(psi)]),
+                np.hstack([np.zeros_like(phi), psi]),
+                fixed[unknowns < self.r],
+            ]
+        )
 
     def polish(self) -> None:
         """Solve for the centre again, with the half-widths as they are: the tie-break on its own.

@@ -344,21 +344,33 @@ class Simplex:
         """
         return np.asarray(self._highs.getSolution().col_value, dtype=np.float64)
 
-    def carrying(self) -> Array:
+    def priced(self) -> tuple[Index, Index]:
         """What the optimum found last rests on: rows and unknowns that keep their value in every optimum.
 
         A row with a price, or an unknown with one, is at its limit in all of them.
 
         Returns
         -------
+        array (k,) of int
+            Numbers of rows.
+        array (l,) of int
+            Numbers of unknowns.
+        """
+        prices = np.abs(self.duals())
+        reduced = np.abs(np.asarray(self._highs.getSolution().col_dual, dtype=np.float64))
+        least = _PRICE * max(prices.max(initial=0.0), reduced.max(initial=0.0))
+        return np.flatnonzero(prices > least), np.flatnonzero(reduced > least)
+
+    def carrying(self) -> Array:
+        """What the optimum found last rests on, as rows.
+
+        Returns
+        -------
         array (k, variables)
             Rows as they were added, and unit vectors of unknowns.
         """
-        found = self._highs.getSolution()
-        prices, reduced = np.abs(self.duals()), np.abs(np.asarray(found.col_dual, dtype=np.float64))
-        largest = max(prices.max(initial=0.0), reduced.max(initial=0.0))
-        rows = self._rows[prices > _PRICE * largest]
-        return np.vstack([rows, np.eye(self._size)[reduced > _PRICE * largest]])
+        rows, unknowns = self.priced()
+        return np.vstack([self._rows[rows], np.eye(self._size)[unknowns]])
 
     def solve(self) -> Array:
         """Minimise.

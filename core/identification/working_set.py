@@ -279,6 +279,7 @@ class WorkingSet:
                     row.limit = float((row.width * row.half).max(initial=0.0))
                 deltas[row.i] = row.limit * row.limit_unit
                 row.limit *= 1.0 + WIDTH_SLACK
+                row.allowed = row.limit
                 if row.exact:
                     self._settle([row], Row.solve_bounded, polish=True)
 
