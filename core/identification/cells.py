@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -316,14 +317,22 @@ class Cells:
             total[blocks] += weighted.sum(axis=1).reshape(len(blocks), r)
         return total.reshape(-1)
 
-    @property
-    def main_blocks(self) -> NDArray[np.intp]:
-        """The block of the largest weight at each transition, of two alike the first, (K,), sorted."""
-        largest = np.argmax(self.weights, axis=0)
-        found = np.empty(len(self), dtype=np.intp)
+    def main_parts(self) -> Iterator[tuple[int, slice, NDArray[np.bool_]]]:
+        """Where each block has the largest weight, of two alike the first.
+
+        Yields
+        ------
+        int
+            The block.
+        slice
+            Transitions at which it holds, sorted.
+        array (k,) of bool
+            Whether its weight is the largest there.
+        """
         for part, blocks in self.parts:
-            found[part] = blocks[largest[part]]
-        return found
+            largest = np.argmax(self.weights[:, part], axis=0)
+            for corner, block in enumerate(blocks.tolist()):
+                yield block, part, largest == corner
 
     def visits(self, count: int) -> NDArray[np.intp]:
         """Of how many transitions each block has the largest weight.
@@ -338,4 +347,7 @@ class Cells:
         array (R,) of int
             They add up to that number.
         """
-        return np.bincount(self.main_blocks, minlength=self.count)
+        found = np.zeros(self.count, dtype=np.intp)
+        for block, _, there in self.main_parts():
+            found[block] += np.count_nonzero(there)
+        return found

@@ -335,8 +335,9 @@ def fit_fleet(
         },
         "versions": dict(_versions()),
     }
+    residuals, widths, largest = fleet.envelope(model)
     if fleet.columns.regimes is not None:
-        facts["blocks"] = _block_facts(model, fleet, sums, d, dt_median)
+        facts["blocks"] = _block_facts(model, sums, widths, largest, dt_median)
     if describe_on is not None:
         whole = describe_on.N == sums.count and method == "working-set"
         few = carriers(describe_on, structure) if seek_carriers and whole else None
@@ -344,14 +345,13 @@ def fit_fleet(
             model, describe_on, sums, mean_width, max_width, transients, few, discarded if criterion == "qp" else None
         )
         facts["messages"] += _distance(gap)
-    return model.replace(fit_summary=facts, residuals=fleet.residuals(model))
+    return model.replace(fit_summary=facts, residuals=residuals)
 
 
 def _block_facts(
-    model: UncertainLTI, fleet: Fleet, sums: Moments, d: Array, dt_median: float | None
+    model: UncertainLTI, sums: Moments, total: Array, largest: Array, dt_median: float | None
 ) -> list[dict[str, Any]]:
     """Of each block its transitions, those of which it has the largest weight, and the widths there."""
-    total, largest = fleet.block_widths(d)
     mean = np.divide(total, sums.visits[:, None], out=np.full(total.shape, np.nan), where=sums.visits[:, None] > 0)
     return [
         {

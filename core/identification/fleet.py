@@ -184,45 +184,32 @@ class Fleet:
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
 
-    def residuals(self, model: Envelope) -> Residuals:
-        """Mean and covariance of the utilisation.
+    def envelope(self, model: Envelope) -> tuple[Residuals, Array, Array]:
+        """Mean and covariance of the utilisation, and widths at the transitions of each block.
 
         Parameters
         ----------
         model : Envelope
-            Gives the centre.
+            Gives the centre and the half-width.
 
         Returns
         -------
         Residuals
             Over all partitions.
+        array (R, n)
+            Of each block the sum of the widths.
+        array (R, n)
+            Of each block the largest width.
         """
-        results = self.map(passes.residual_sums, self._same(model))
+        results = self.map(passes.envelope_sums, self._same(model))
         mean = np.sum([r[0] for r in results], axis=0) / self.N
         products = np.sum([r[1] for r in results], axis=0) / self.N
         covariance = products - np.outer(mean, mean)
         values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
         if values[0] < 0.0:  # by rounding
             covariance = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        return Residuals(mean, 0.5 * (covariance + covariance.T))
-
-    def block_widths(self, d: Array) -> tuple[Array, Array]:
-        """Widths at the transitions of each block; see `passes.block_widths`.
-
-        Parameters
-        ----------
-        d : array (q, n)
-            Half-widths.
-
-        Returns
-        -------
-        array (R, n)
-            Sum of the widths.
-        array (R, n)
-            Largest width.
-        """
-        results = self.map(passes.block_widths, self._same(d))
-        return np.sum([r[0] for r in results], axis=0), np.max([r[1] for r in results], axis=0)
+        residuals = Residuals(mean, 0.5 * (covariance + covariance.T))
+        return residuals, np.sum([r[2] for r in results], axis=0), np.max([r[3] for r in results], axis=0)
 
     def moving_from_rest(self) -> tuple[int, int, float]:
         """Samples with x = u = 0 and a successor that is not 0.

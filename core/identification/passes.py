@@ -155,6 +155,8 @@ _FEW = 256
 """Transitions of a piece that are worth judging one by one."""
 _FEW_ALL = 20_000
 """Transitions up to which a scan spends its time elsewhere."""
+_NARROW = 1e8
+"""Half-widths are so many times as large as rounding where the order of the sums does not show in a utilisation."""
 _EPS, _TINY = float(np.finfo(np.float64).eps), 1e-290
 """Relative rounding of one operation, twice; and more than underflow can add up to."""
 
@@ -670,6 +672,113 @@ def _centre_and_half(model: Envelope, block: Block) -> tuple[Array, Array]:
     return centre, half
 
 
+@dataclass(frozen=True)
+class _Quick:
+    """Bounds of some transitions by sums in another order than the verdict's, and how far they can be off.
+
+    Parameters
+    ----------
+    block : Block
+        The transitions, sorted where there is a schedule.
+    distance : array (n, K)
+        Centre less x_next.
+    half : array (n, K)
+        Half-width less the floor.
+    floor : array (n,)
+        Part of every half-width.
+    widest : array (n,)
+        No half-width less the floor is larger.
+    error : array (n,)
+        No distance is off by more.
+    relative : float
+        Rounding of the sums, relative to what they add.
+    cells : Cells or None
+        How the transitions are sorted.
+    """
+
+    block: Block
+    distance: Array
+    half: Array
+    floor: Array
+    widest: Array
+    error: Array
+    relative: float
+    cells: Cells | None
+
+    @classmethod
+    def of(cls, block: Block, model: Envelope, regimes: Regimes | None) -> _Quick:
+        """Of some transitions in any order; `regimes` is the schedule of the model."""
+        with np.errstate(over="ignore", invalid="ignore"):  # values that it cannot carry: no error is finite
+            return cls._of(block, model.tables, regimes)
+
+    @classmethod
+    def _of(cls, block: Block, tables: tuple[Array, Array, Array], regimes: Regimes | None) -> _Quick:
+        cells = None if regimes is None else Cells.of(regimes, block)
+        block = block if cells is None else cells.sort(block)
+        # blended elements are no larger than those of the blocks
+        nominal, spread, v = tables if cells is None else (np.abs(table).max(axis=0) for table in tables)
+        n, p = block.n, len(block.z)
+        drift, steady = nominal[:, p:].sum(axis=1), spread[:, p:].sum(axis=1)  # beyond z the regressors are 1
+        longest = float(block.dt.max())
+        psi = np.abs(block.z)
+        most = psi.max(axis=1)
+        constant = cells is None and float(block.dt.min()) == longest
+        widest, floor = longest * (spread[:, :p] @ most), v
+        if constant:
+            floor = longest * steady + v
+        else:
+            widest = widest + longest * steady
+        if cells is not None:
+            widest, floor = widest + v, np.zeros(n)
+        size = longest * (np.abs(nominal[:, :p]) @ most + np.abs(nominal[:, p:]).sum(axis=1)) + widest + floor
+        size += most[:n] if block.base is None else np.abs(block.base).max(axis=1)
+        relative = 8.0 * (p + 8) * _EPS
+        error = relative * size + _TINY
+        if constant:  # the step goes into the elements
+            own = np.eye(n, p) if block.base is None else 0.0
+            distance = product(nominal[:, :p] * longest + own, block.z)
+            half = product(spread[:, :p] * longest, psi)
+            if drift.any():
+                distance += (drift * longest)[:, None]
+        elif cells is None:
+            distance, half = product(nominal[:, :p], block.z), product(spread[:, :p], psi)
+            distance += drift[:, None]
+            half += steady[:, None]
+            distance *= block.dt
+            half *= block.dt
+        else:
+            distance, half = _blended(cells, block, psi, tables)
+        if block.base is not None:
+            distance += block.base
+        elif not constant:
+            distance += block.z[:n]
+        distance -= block.x_next
+        return cls(block, distance, half, floor, widest, error, relative, cells)
+
+
+def _blended(cells: Cells, block: Block, psi: Array, tables: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Centre less the states, and half-width, of sorted transitions; psi: |z|."""
+    nominal, spread, v = tables
+    n, p = block.n, len(psi)
+    step = float(block.dt[0])
+    constant = bool((block.dt == step).all())
+
+    def rates(table: Array, regressors: Array, always: Array) -> Array:
+        """Of elements of all blocks (R, n, q), and of (R, n) for a regressor of 1 that no step multiplies."""
+        one = table[:, :, p:].sum(axis=2)  # beyond z the regressors are 1
+        table = table[:, :, :p]
+        if constant:  # the step goes into the elements
+            table, one = table * step, one * step + always
+        elements = np.concatenate([table, one[:, :, None]], axis=2).transpose(1, 0, 2).reshape(n, -1)
+        found = cells.product(elements, np.vstack([regressors, np.ones((1, len(block)))]))
+        if not constant:
+            found *= block.dt
+            found += cells.product(always.T, np.ones((1, len(block))))
+        return found
+
+    return rates(nominal, block.z, np.zeros_like(v)), rates(spread, psi, v)
+
+
 def _judged_in_doubt(block: Block, model: Envelope, known: Array, regimes: Regimes | None) -> Judged | None:
     """`_judged` to the bit, from the transitions alone that the rounding of a faster arithmetic leaves in doubt.
 
@@ -693,55 +802,11 @@ def _judged_in_doubt(block: Block, model: Envelope, known: Array, regimes: Regim
     Judged or None
         None where the doubt is not worth the trouble; widths are 0 where none is larger than what was known.
     """
-    tables = model.tables
-    cells = None if regimes is None else Cells.of(regimes, block)
-    block = block if cells is None else cells.sort(block)
-    # blended elements are no larger than those of the blocks
-    nominal, spread, v = tables if cells is None else (np.abs(table).max(axis=0) for table in tables)
-    n, p = block.n, len(block.z)
-    drift, steady = nominal[:, p:].sum(axis=1), spread[:, p:].sum(axis=1)  # beyond z the regressors are 1
-    longest = float(block.dt.max())
-    psi = np.abs(block.z)
-    most = psi.max(axis=1)
-    constant = cells is None and float(block.dt.min()) == longest
-    widest, floor = longest * (spread[:, :p] @ most), v
-    if constant:
-        floor = longest * steady + v
-    else:
-        widest = widest + longest * steady
-    if cells is not None:
-        widest, floor = widest + v, np.zeros(n)
-    size = longest * (np.abs(nominal[:, :p]) @ most + np.abs(nominal[:, p:]).sum(axis=1)) + widest + floor
-    size += most[:n] if block.base is None else np.abs(block.base).max(axis=1)
-    relative = 8.0 * (p + 8) * _EPS
-    error = relative * size + _TINY
+    quick = _Quick.of(block, model, regimes)
+    block, error, half, widest, floor = quick.block, quick.error, quick.half, quick.widest, quick.floor
     if not np.isfinite(error).all():
         return None
-    if constant:  # the step goes into the elements
-        own = np.eye(n, p) if block.base is None else 0.0
-        distance = product(nominal[:, :p] * longest + own, block.z)
-        half = product(spread[:, :p] * longest, psi)
-        if drift.any():
-            distance += (drift * longest)[:, None]
-    else:
-        if cells is None:
-            distance, half = product(nominal[:, :p], block.z), product(spread[:, :p], psi)
-            distance += drift[:, None]
-            half += steady[:, None]
-        else:
-            nominal, spread = (table.transpose(1, 0, 2).reshape(n, -1) for table in tables[:2])
-            ones = np.ones((tables[0].shape[2] - p, len(block)))
-            distance = cells.product(nominal, np.vstack([block.z, ones]))
-            half = cells.product(spread, np.vstack([psi, ones]))
-        distance *= block.dt
-        half *= block.dt
-        if block.base is None:
-            distance += block.z[:n]
-        if cells is not None:
-            half += cells.product(tables[2].T, np.ones((1, len(block))))
-    if block.base is not None:
-        distance += block.base
-    distance -= block.x_next
+    n, distance, relative = block.n, quick.distance, quick.relative
     np.abs(distance, out=distance)
     distance += (error - floor)[:, None]
     doubtful: NDArray[np.bool_] = np.any(distance > half, axis=0)
@@ -766,8 +831,11 @@ def _judged_in_doubt(block: Block, model: Envelope, known: Array, regimes: Regim
     return Judged(outside, largest, largest * np.sqrt(block.weights))
 
 
-def residual_sums(part: Partition, model: Envelope) -> tuple[Array, Array]:
-    """Sums of the utilisation of every transition, r = (x_next - centre) / half, and of its products.
+def envelope_sums(part: Partition, model: Envelope) -> tuple[Array, Array, Array, Array]:
+    """Sums over all transitions of what the envelope is there.
+
+    That is the utilisation r = (x_next - centre) / half of every transition, its products, and the widths per step at
+    the transitions of each block, those of which it has the largest weight.
 
     Parameters
     ----------
@@ -782,46 +850,29 @@ def residual_sums(part: Partition, model: Envelope) -> tuple[Array, Array]:
         Σ r.
     array (n, n)
         Σ r rᵀ.
+    array (R, n)
+        Of each block of a schedule the sum of the widths, normalised.
+    array (R, n)
+        Of each block of a schedule the largest width.
     """
-    total, products = np.zeros(part.n), np.zeros((part.n, part.n))
+    columns, n = part.columns, part.n
+    total, products = np.zeros(n), np.zeros((n, n))
+    widths, largest = np.zeros((columns.count, n)), np.zeros((columns.count, n))
     for block in _pieces(part):
-        centre, half = _centre_and_half(model, block)
-        r = np.asarray(utilisation_of(block.x_next - centre, half))
+        quick = _Quick.of(block, model, columns.regimes)
+        half = quick.half + quick.floor[:, None]
+        for k, where, there in () if quick.cells is None else quick.cells.main_parts():
+            own = 2.0 * half[:, where] * there
+            widths[k] += own.sum(axis=1)
+            largest[k] = np.maximum(largest[k], own.max(axis=1))
+        if (half.min(axis=1) > _NARROW * quick.error).all():
+            r = quick.distance / -half
+        else:
+            centre, half = _centre_and_half(model, block)
+            r = np.asarray(utilisation_of(block.x_next - centre, half))
         total += r.sum(axis=1)
         products += gram_of(r, r)
-    return total, products
-
-
-def block_widths(part: Partition, d: Array) -> tuple[Array, Array]:
-    """Widths per step at the transitions of each block, those of which it has the largest weight.
-
-    Parameters
-    ----------
-    part : Partition
-        The transitions, with a schedule.
-    d : array (q, n)
-        Half-widths.
-
-    Returns
-    -------
-    array (R, n)
-        Sum of the widths, normalised.
-    array (R, n)
-        Largest width.
-    """
-    columns = part.columns
-    assert columns.regimes is not None
-    total, largest = np.zeros((columns.count, part.n)), np.zeros((columns.count, part.n))
-    for block in _pieces(part):
-        cells = Cells.of(columns.regimes, block)
-        block = cells.sort(block)
-        width = cells.product(np.ascontiguousarray(2.0 * d.T), columns.plain_psi(block.z, block.dt)) * block.dt
-        which = cells.main_blocks
-        for r in np.unique(which):
-            own = width[:, which == r]
-            total[r] += own.sum(axis=1)
-            largest[r] = np.maximum(largest[r], own.max(axis=1))
-    return total, largest
+    return total, products, widths, largest
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:

@@ -20,6 +20,8 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.limits import LARGEST
 
+_BLOCK = 1 << 14  # transitions that are looked at together: they stay in the cache
+
 
 def largest_steps(model: Any, transients: Iterable[Any]) -> Array:
     """The largest change of each state in one transition of recordings.
@@ -39,8 +41,12 @@ def largest_steps(model: Any, transients: Iterable[Any]) -> Array:
     largest = np.zeros(model.n)
     for transient in transients:
         steps = transient.transitions()
-        with np.errstate(over="ignore", invalid="ignore"):
-            largest = np.maximum(largest, np.abs(steps.x_next - steps.x).max(axis=0, initial=0.0))
+        for a in range(0, len(steps.k), _BLOCK):
+            part = slice(a, a + _BLOCK)
+            with np.errstate(over="ignore", invalid="ignore"):
+                change = steps.x_next[part] - steps.x[part]
+            np.abs(change, out=change)
+            largest = np.maximum(largest, change.max(axis=0, initial=0.0))
     return np.asarray(np.minimum(largest / model.operating_point.X, LARGEST))
 
 

@@ -48,7 +48,8 @@ WINDOWS = 20
 """Windows that a share of them needs."""
 ACTIVE = 0.5
 """Share of the windows that may be less active than a machine that is called active; half of it where it was parked."""
-_BLOCK = 1 << 16  # transitions that are looked at together
+_BLOCK, _MOST = 1 << 16, 1 << 17  # transitions that are looked at together, and of one recording for its activity
+_SPREAD = 1 << 14  # transitions of each part that is looked at where a recording has more than that
 _DISTINCT = 4096  # values of a block that are compared with one another
 MORE_ACTIVE = 2.0
 """How much more active than during any repeat of the fit the machine must be."""
@@ -356,13 +357,20 @@ def together(n: int, found: Sequence[Found]) -> Repeats:
 
 
 def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
-    """Activity in each unbroken window, and the steps that show noise: `windows` and `noisy` of `Found`."""
+    """Activity in each unbroken window, and the steps that show noise: `windows` and `noisy` of `Found`.
+
+    A long recording is looked at in parts that are spread over it: a share of its windows is asked for, and whether
+    many steps show noise.
+    """
     found, noisy = list[Array](), np.zeros(model.n)
     t = transient.t_ns[steps.k]
-    for a in range(0, len(t), _BLOCK):
+    begin, length = range(0, len(t), _BLOCK), _BLOCK
+    if len(t) > _MOST:
+        begin, length = range(0, len(t) - _SPREAD + 1, (len(t) - _SPREAD) // (_MOST // _SPREAD - 1)), _SPREAD
+    for a in begin:
         chosen = np.zeros(len(t), dtype=bool)
-        chosen[a : a + _BLOCK] = True
-        part, at = steps.take(chosen), t[a : a + _BLOCK]
+        chosen[a : a + length] = True
+        part, at = steps.take(chosen), t[a : a + length]
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             centre, half = np.empty((model.n, len(at))), np.empty((model.n, len(at)))
             z = model.normalised_columns(part)
