@@ -294,8 +294,8 @@ def noisy(seed: int, steps: int = 1500) -> Transient:
 
 def test_what_noise_changes_at_every_step_is_frozen_at_its_first_slow_repeat() -> None:
     """The model never moves it by its half-width, so only the noise tells; of a sensor at 0 nothing is known."""
-    model = fit([noisy(1, 3000)], additive="noise")
-    assert model.repeats is not None and model.repeats.noisy_steps[0] > 1000
+    model = fit([noisy(1, 12000)], additive="noise")
+    assert model.repeats is not None and model.repeats.noisy_steps[0] > 5000
     for seed in (2, 3):
         assert not EnvelopeMonitor(model).check(noisy(seed)).frozen.any()
         frozen = held(noisy(seed, 60), 0, 22, 50)
@@ -304,6 +304,8 @@ def test_what_noise_changes_at_every_step_is_frozen_at_its_first_slow_repeat() -
         said = "FROZEN: x1 repeats exactly for 27 s (never in the fit)"
         assert said in check_text(check_data(model, verdicts))
         same_as_live(model, frozen)
+        few = model.replace(repeats=Repeats([0.0], [0.0], [0.0], [LARGEST], [4999.0]))
+        assert np.flatnonzero(EnvelopeMonitor(few).check(frozen).frozen)[0] == 25
     off = noisy(4, 60)
     off = changed(off, x=np.where(np.arange(61)[:, None] > 30, 0.0, off.x), u=np.where(off.t[:, None] > 20, 0.0, off.u))
     verdicts = EnvelopeMonitor(model).check(off)

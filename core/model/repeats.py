@@ -22,7 +22,7 @@ half-widths: as r stays, it changes with the controls and the other states alone
 is in the seconds in which the state changes, and while it repeated.
 
 Noise is told by the steps in which the controls kept their values and the state changed by more than the model moves
-it, if no value of the state came twice in a recording.
+it, if hardly a value of the state came twice in a recording.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ ACTIVE = 0.5
 _BLOCK, _MOST = 1 << 16, 1 << 17  # transitions that are looked at together, and of one recording for its activity
 _SPREAD = 1 << 14  # transitions of each part that is looked at where a recording has more than that
 _DISTINCT = 4096  # values of a block that are compared with one another
+_TWICE = 1e-3  # share of them that may come twice: more do so by chance in a coarse sensor
 MORE_ACTIVE = 2.0
 """How much more active than during any repeat of the fit the machine must be."""
 
@@ -69,7 +70,7 @@ class Repeats:
     active_beyond : array (n,), optional
         Activity beyond which the state always changed, in half-widths; default unknown, infinite.
     noisy_steps : array (n,), optional
-        Steps that show noise; default 0, as for a state of which some value came twice.
+        Steps that show noise; default 0, as for a state of which values came twice.
 
     Raises
     ------
@@ -279,7 +280,7 @@ class Found(NamedTuple):
     windows : array (windows, n)
         Activity in each window of WINDOW_S; NaN for a state that repeats in half of it or more.
     noisy : array (n,)
-        Steps that show noise; -1 for a state of which some value came twice.
+        Steps that show noise; -1 for a state of which values came twice.
     """
 
     most: Array
@@ -387,7 +388,8 @@ def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
         change = part.x_next - part.x
         held = np.all(part.u[1:] == part.u[:-1], axis=1) & (np.diff(part.k) == 1)
         noisy += (np.abs(change - movement) > np.abs(movement))[1:][held].sum(axis=0)
-        noisy[[len(np.unique(column)) < len(column) for column in part.x[:_DISTINCT].T]] = -np.inf
+        some = part.x[:_DISTINCT]
+        noisy[[len(np.unique(column)) < (1 - _TWICE) * len(column) for column in some.T]] = -np.inf
         repeats = np.add.reduceat((part.x == part.x_next).astype(np.float64), begins)
         counts = ends - begins
         whole = (counts >= 3) & (part.k[ends - 1] - part.k[begins] == counts - 1)

@@ -38,11 +38,11 @@ USUAL_S = 0.25
 LEAST = 3
 """Steps that a repeat must have while the machine is active, or of a state that noise changes."""
 
-LEAST_S = 0.5
-"""Seconds that are enough in place of these steps of a state that noise changes: that of a slow sensor."""
-
 NOISY = 1000
 """Steps that must have shown the noise."""
+
+SLOW_S, SLOW_NOISY = 0.5, 5000
+"""Seconds that are enough in place of these steps if so many have shown the noise: of a slow sensor."""
 
 Bounds = tuple[Sequence[float], Sequence[float], Sequence[float]]
 """Of one transition: lower and upper bound (n,) each, recorded units, and the elements a_ii of the nominal model."""
@@ -112,7 +112,7 @@ class FrozenWatch:
         self._sum: list[float] = np.maximum(1.0, np.where(np.isfinite(total), total, 0.0)).tolist()
         self._usual = [min(FARTHER * seconds, USUAL_S) for seconds in self._longest]
         self._active: list[float] = repeats.active_beyond.tolist()
-        self._noisy: list[bool] = ((repeats.noisy_steps >= NOISY) & (repeats.longest_repeat_s == 0.0)).tolist()
+        self._noisy: list[float] = np.where(repeats.longest_repeat_s == 0.0, repeats.noisy_steps, 0.0).tolist()
         self._counted, self._margin = list(counted), margin
         self._follow = Repeating(len(self._longest), margin)
         self.forget()
@@ -173,8 +173,9 @@ class FrozenWatch:
             return False
         if moved.steps >= LEAST and moved.activity > self._active[i]:
             return True
-        if self._noisy[i] and after[i] != 0.0 and (moved.steps >= LEAST or moved.seconds >= LEAST_S):
-            return True
+        if self._noisy[i] >= NOISY and after[i] != 0.0:
+            if moved.steps >= LEAST or (moved.seconds >= SLOW_S and self._noisy[i] >= SLOW_NOISY):
+                return True
         if moved.seconds <= self._longest[i]:
             return moved.run > self._run_within[i]
         if moved.run > self._run[i]:
