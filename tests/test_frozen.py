@@ -421,6 +421,10 @@ def test_a_session_names_what_is_frozen() -> None:
     assert "frozen" not in monitor.message.split(";")[0], "nothing arrives, so nothing is known to be frozen"
     rig.send(5)
     assert not rig.session.alarm and "the alarm is over" in " ".join(rig.lines)
+    rig.hold(30, 1)
+    rig.send(5)
+    monitor, *_ = rig.session.report(rig.now, 10.0)
+    assert monitor.level == ERROR and monitor.message.startswith("alarm: frozen: b"), "not a rule that raised nothing"
 
 
 def test_a_session_warns_of_a_long_repeat() -> None:

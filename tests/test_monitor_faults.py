@@ -466,6 +466,8 @@ def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Pat
     until(lambda: world.status()["armed"], "the mode")
     plant.send(3, off=2.0)
     until(lambda: violation.messages[-1].data, "the alarm")
+    said = world.status()
+    assert said["why"].startswith("alarm: at least 1 of 1 verdicts violated: a") and said["looks_like"] == ""
     mode.publish(UInt8(data=0))
     until(lambda: not world.status()["alarm"], "the alarm to end with the machine off")
     plant.send(3, off=2.0)

@@ -90,6 +90,8 @@ class Reasons:
     ----------
     text : str
         On the last sample.
+    by : str
+        What holds the alarm, or held it last: rules, horizons and states; empty before any.
     """
 
     def __init__(self, model: UncertainLTI, rules: Sequence[Rule]) -> None:
@@ -102,7 +104,7 @@ class Reasons:
         self.text = "no verdict yet"
         self._blamed: dict[str, list[str]] = {}
         self._jumps: list[str] = []
-        self._by = ""  # what holds the alarm, or held it last
+        self._held = self.by = ""
 
     def fresh(self) -> Reasons:
         """The same without any sample.
@@ -167,14 +169,15 @@ class Reasons:
         """
         judged = facts.status is Status.OK
         if not facts.alarm:
-            self._blamed, self._jumps, self._by = {}, [], ""
+            self._blamed, self._jumps, self._held = {}, [], ""
         elif facts.frozen:
-            self._by = f"frozen: {', '.join(facts.frozen)}"
+            self._held = f"frozen: {', '.join(facts.frozen)}"
         elif judged and facts.raised:
-            self._by = self._rules_that(facts.raised, facts.jumps)
-        elif judged and not self._by.startswith("latched"):
-            self._by = "latched until ~/reset" + (f", raised by {self._by}" if self._by else "")
-        said = [f"alarm: {self._by}" if self._by else "alarm"] if facts.alarm else []
+            self._held = self._rules_that(facts.raised, facts.jumps)
+        elif judged and not self._held.startswith("latched"):
+            self._held = "latched until ~/reset" + (f", raised by {self._held}" if self._held else "")
+        self.by = self._held or self.by
+        said = [f"alarm: {self._held}" if self._held else "alarm"] if facts.alarm else []
         if not judged:
             said.append(f"no verdict: {self._why(facts)}")
         elif not facts.alarm:

@@ -114,7 +114,7 @@ class Session(Stream):
             complaints.append(f"{self.future.total() - period.future} stamps lie over {FUTURE:g} s in the future")
         if off := self.arming.why_off():
             (complaints if self.arming.on is None else calm).append(off)
-        complaints += period.jumps[:SHOWN]
+        complaints += [jump for jump in period.jumps[:SHOWN] if jump not in self.reasons.by]
         if self.monitor.masked:
             calm.append(f"masked: {', '.join(self.monitor.masked)}")
         if self.latched and not self.monitor.alarm:
@@ -137,7 +137,7 @@ class Session(Stream):
         elif period.alarm:
             level = ERROR
             if self.monitor.alarm or not self.latched:
-                complaints.insert(0, f"alarm: {self.rule_text()}")
+                complaints.insert(0, f"alarm: {self.reasons.by or self.rule_text()}")
             if (like := self.likeness()) is not None and like.words:
                 complaints.insert(1, like.words)
         else:
