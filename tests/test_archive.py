@@ -83,6 +83,23 @@ def random_problem(seed, N, n=3, m=2, noise=1e-3):
     return transient, assemble([transient], OperatingPoint.identity(n, m), None, "noise")
 
 
+def test_scheduled_from_disk_as_in_memory(bags, tmp_path):
+    """A further signal that schedules nothing is left out with a note, as in memory."""
+    signals, paths = bags
+    further = "scheduling:\n" + "".join(
+        f"  - {{name: {name}, topic: /engine/control, field: 'position[{of}]'}}\n"
+        for name, of in (("level", "main_fuel_flow"), ("weather", "nozzle_throat_area"))
+    )
+    (tmp_path / "signals.yaml").write_text(signals.read_text() + further)
+    schedule = {"level": (-0.05, 0.0, 0.05)}
+    model = fit(read_transients(paths, tmp_path / "signals.yaml"), schedule=schedule)
+    same = fit_archive(paths, tmp_path / "signals.yaml", schedule=schedule, cache=tmp_path / "cache")
+    equal(same, model)
+    assert same.schedule == model.schedule and same.block_data == model.block_data
+    noted = [[m for m in one.fit_summary["messages"] if "schedules nothing" in m] for one in (same, model)]
+    assert noted[0] == noted[1] and len(noted[0]) == 1 and "'weather'" in noted[0][0]
+
+
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
 def test_many_blocks_and_passes_from_disk(tmp_path, criterion):
     """More samples than are held: screening and passes over blocks that do not end where recordings do."""

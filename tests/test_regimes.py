@@ -344,6 +344,21 @@ def test_panels_show_the_elements_with_their_half_widths() -> None:
         assert math.isclose(there.min(), model.A[r, 0, 0] - model.dA[r, 0, 0])
 
 
+def test_a_regime_that_no_recording_visited_has_the_colour_of_its_line() -> None:
+    """Of two signals; the legend says what lines, bands and circles are."""
+    model = sized((3, 2))
+    assert model.schedule is not None
+    unknown = [index[1] for index, data in zip(model.schedule.indices, model.block_data, strict=True) if not data.known]
+    assert unknown == [0, 1]
+    figure = elements_figure(model)
+    first = figure.axes[0]
+    lines = [line.get_color() for line in first.lines if len(line.get_xdata()) == 3]
+    circles = [line.get_markeredgecolor() for line in first.lines if line.get_markerfacecolor() == "w"]
+    assert [tuple(colour) for colour in circles] == [tuple(lines[which]) for which in unknown]
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert said[-2:] == ["± half-width", "no recording visited it"] and len(said) == 4
+
+
 def test_the_figures_of_other_models_take_these_too(tmp_path: Path) -> None:
     model = model_of("two axes")
     assert len(matrices_figure(model).axes) == len(elements_figure(model).axes)

@@ -145,6 +145,17 @@ def test_at_a_knot_the_model_is_that_block_and_between_two_their_mean() -> None:
     np.testing.assert_allclose([lower, upper], theirs, atol=1e-14)
 
 
+def test_a_point_that_no_block_holds_at_is_refused_by_its_signal() -> None:
+    model = scheduled(np.random.default_rng(3), Schedule((SPEED, GEAR)), ("gear",))
+    assert model.at(speed=3.0, gear=2.0).schedule is None
+    for speed, gear, words in (
+        (3.0, 3.0, "gear = 3 is not among the modes of the model, 1, 2, 4; give one of them"),
+        (np.nan, 2.0, "speed is nan; give a finite number"),
+    ):
+        with pytest.raises(ModelError, match=words):
+            model.at(speed=speed, gear=gear)
+
+
 def test_the_same_block_at_every_knot_is_the_model_without_a_schedule() -> None:
     model = scheduled(np.random.default_rng(4), Schedule((SPEED,)))
     one = model.blocks[1]

@@ -324,6 +324,20 @@ def test_blocks_without_data_share_those_of_their_neighbour_and_it_is_said():
     assert model.fit_summary["objective"] == pytest.approx(fewer.fit_summary["objective"], rel=1e-9)
 
 
+def test_recordings_beyond_the_end_knots_are_noted_with_their_range():
+    transient = drawn(THREE, 500, 7, noise=1e-3)
+    inside = transient.u[:-1, 0]
+    given = fit(transient, additive="both", schedule={"u1": (-0.5, 0.5)})
+    (said,) = [m for m in given.fit_summary["messages"] if "beyond its knots" in m]
+    share = np.mean(np.abs(inside) > 0.5)
+    assert said.startswith(
+        f"u1 goes from {inside.min():.5g} to {inside.max():.5g} in the recordings, and {share:.2%} of"
+    )
+    for knots in (3, (-1, 0, 1)):
+        said = fit(transient, additive="both", schedule={"u1": knots}).fit_summary["messages"]
+        assert not any("beyond its knots" in m for m in said)
+
+
 def test_a_mode_with_few_transitions_is_tied_and_contained():
     schedule = SCHEDULES["modes"]
     transient = drawn(schedule, 500, 8, noise=1e-3)

@@ -214,6 +214,18 @@ def test_what_is_no_choice_is_refused_by_name():
         fit(RUNS, schedule={"x1": "most"})
 
 
+def test_a_rule_for_one_knot_needs_knots_that_are_given():
+    runs = with_further(RUNS)
+    rules = [{"state": "x1", "from": "u2", "nominal": 0, "knot": 1}]
+    runs = [
+        t.replace(signals=replace(t.signals, structure=rules, schedule=(ScheduleRule("level", "auto"),))) for t in runs
+    ]
+    with pytest.raises(FitError, match=r"structure\[0\]: knot is 1, and the knots of 'level' are auto"):
+        fit(runs, **options())
+    model = fit(runs, schedule={"level": 2}, **options())
+    assert model.B[0, 0, 1] == 0.0 != model.B[1, 0, 1]
+
+
 def test_the_identification_itself_chooses_no_knots():
     with pytest.raises(FitError, match="chooses none"):
         fitting.fit(RUNS, schedule={"x1": "auto"})

@@ -30,7 +30,7 @@ from uncertain_lti.identification.diagnosis import too_few
 from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.identification.regimes import Knots, scheduled_by
+from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of, unused
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
@@ -127,6 +127,9 @@ def fit_archive(
     if not isinstance(signals, SignalMap):
         paths = list(paths)
         signals = load_signals(signals, paths)
+    on = signals_of(asked_by(signals) if schedule is None else schedule, [s.name for s in signals.signals])
+    messages = unused([s.name for s in signals.scheduling], on)
+    signals = signals.scheduled_on(on)
     for signal in signals.signals:
         if "auto" in (signal.steady, signal.scale):
             raise SignalError(
@@ -202,6 +205,7 @@ def fit_archive(
         raise contradiction_in(error, name, signals) from None
     facts = {
         **model.fit_summary,
+        "messages": [*model.fit_summary.get("messages", []), *messages],
         "additive": additive,
         "weights": "ones",
         "transients": len(recordings),

@@ -25,6 +25,7 @@ from uncertain_lti.identification.excitation import quoted as _list
 from uncertain_lti.identification.noise import Memory, memory
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.model.bounds import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 
@@ -188,7 +189,7 @@ def describe(
     all_sums, sums = sums, sums.one_block()
     found, messages = _rank(problem, sums, names)
     apart = not messages
-    messages += _tied(model, scheduled, all_sums)
+    messages += _tied(model, scheduled, all_sums) + _beyond_knots(model, scheduled)
     part = _stretches(problem)
     signals = (*model.signals.states, *model.signals.controls)
     lagged = residuals.lagged_states(signals, model.n)
@@ -230,6 +231,27 @@ def _tied(model: UncertainLTI, problem: Problem, sums: Moments) -> list[str]:
             f"{more} more blocks have too little data and share the elements of others; the table of regimes, of "
             f"`uncertain-lti info` as well, says which"
         ]
+    return messages
+
+
+def _beyond_knots(model: UncertainLTI, problem: Problem) -> list[str]:
+    """Scheduling signals that go farther in the recordings than their end knots."""
+    if model.schedule is None:
+        return []
+    messages = []
+    knots = model.schedule.recorded_values(model.signals.signals)
+    for axis, at, row in zip(model.schedule.axes, knots, model.scheduling_positions, strict=True):
+        values = regimes.values_of(problem, row)
+        beyond = (values < axis.knots[0]) | (values > axis.knots[-1]) if axis.knots else np.zeros(1, dtype=bool)
+        if beyond.any():
+            signal = model.signals.signals[row]
+            low, high = (recorded(v, float(signal.steady), float(signal.scale)) for v in (values.min(), values.max()))
+            messages.append(
+                f"{axis.signal} goes from {low:.5g} to {high:.5g}{f' {signal.unit}' if signal.unit else ''} in the "
+                f"recordings, and {beyond.mean():.2%} of the transitions are beyond its knots, {at[0]:.5g} to "
+                f"{at[-1]:.5g}: every verdict there counts as one on an unknown regime; give end knots that enclose "
+                f"what was recorded"
+            )
     return messages
 
 

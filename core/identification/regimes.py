@@ -251,6 +251,28 @@ def signals_of(schedule: Schedule | Mapping[str, Knots] | None, names: Sequence[
     ]
 
 
+def unused(further: Sequence[str], on: Sequence[str]) -> list[str]:
+    """What is noted of further scheduling signals that schedule nothing.
+
+    Parameters
+    ----------
+    further : sequence of str
+        Their names.
+    on : sequence of str
+        Signals that the fit is scheduled on, or that it was to choose knots for.
+
+    Returns
+    -------
+    list of str
+        A message for each.
+    """
+    return [
+        f"scheduling signal '{name}' schedules nothing, and the model leaves it out; use it with --schedule {name}=auto"
+        for name in further
+        if name not in on
+    ]
+
+
 def check_names(schedule: Iterable[str], names: Sequence[str]) -> None:
     """Check that there are one or two scheduling signals at most, and that they exist.
 
@@ -376,8 +398,7 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
     """
     stride = max(1, -(-problem.N // LOOKED_AT))
     some = problem.subset(slice(None, None, stride)) if stride > 1 else problem
-    p = problem.p
-    values = some.z_columns[row] if row < p or some.s_columns is None else some.s_columns[row - p]
+    values = values_of(some, row)
     least, most = _range(problem, row)
     if not least < most:
         raise FitError(
@@ -402,10 +423,29 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
     return tuple(knots)
 
 
+def values_of(problem: Problem, row: int) -> Array:
+    """A row of [x; u; s].
+
+    Parameters
+    ----------
+    problem : Problem
+        The data.
+    row : int
+        Its position.
+
+    Returns
+    -------
+    array (N,)
+        Normalised.
+    """
+    p = problem.p
+    values: Array = problem.z_columns[row] if row < p or problem.s_columns is None else problem.s_columns[row - p]
+    return values
+
+
 def _range(problem: Problem, row: int) -> tuple[float, float]:
     """Least and greatest value of a row of [x; u; s]."""
-    p = problem.p
-    values = problem.z_columns[row] if row < p or problem.s_columns is None else problem.s_columns[row - p]
+    values = values_of(problem, row)
     return float(values.min()), float(values.max())
 
 

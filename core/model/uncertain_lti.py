@@ -354,14 +354,15 @@ class UncertainLTI:
         names = [axis.signal for axis in self.schedule.axes]
         if set(values) != set(names):
             raise ModelError(f"give a value of {' and of '.join(names)}, and nothing else")
+        if odd := [name for name in names if not math.isfinite(values[name])]:
+            raise ModelError(f"{odd[0]} is {values[odd[0]]}; give a finite number")
         point = self.operating_point
-        s = [
-            float(normalised(float(values[name]), float(point.steady[i]), float(point.scale[i])))
-            for name, i in zip(names, self._positions, strict=True)
-        ]
-        places, weights = self.schedule.corners(np.array(s)[:, None])
-        if places[0, 0] < 0:
-            raise ModelError(f"{names[0]}: no block for {values}; modes are listed in the model")
+        recorded_values = np.zeros(len(point.steady))
+        recorded_values[self._positions] = [values[name] for name in names]
+        if unlisted := self.why_unlisted(recorded_values.tolist()):
+            raise ModelError(f"{unlisted}; give one of them")
+        s = normalised(recorded_values, point.steady, point.scale)[self._positions]
+        places, weights = self.schedule.corners(s[:, None])
         return self._unscheduled({name: blended(getattr(self, name), places, weights)[..., 0] for name in ARRAYS})
 
     def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.identification import fitting
-from uncertain_lti.identification.regimes import Knots, asked_by, check_names, signals_of
+from uncertain_lti.identification.regimes import Knots, asked_by, check_names, signals_of, unused
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.horizon import Widths
@@ -35,6 +35,7 @@ from uncertain_lti.proposal.suggestion import suggest_schedule
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.horizon_rule import HorizonRule, WidthChoice
+from uncertain_lti.signals.signal_map import SignalMap
 
 
 def fit(
@@ -157,6 +158,8 @@ def fit(
             f"the knots of '{automatic[0]}' are auto, which leaves recordings out, and transient_weights are for all "
             f"of them; give the knots, or count='transient'"
         )
+    if automatic and structure is None:
+        _no_knots_named(transients[0].signals, automatic[0])
     resolved: Schedule | None = None
     facts: list[dict[str, Any]] = []
     messages: list[str] = []
@@ -174,11 +177,7 @@ def fit(
     asked = (resolved or {}) if automatic else asked  # to the bit as it was judged
     further = transients[0].scheduling_names if transients else ()  # none at all is refused below
     on = signals_of(asked, [*transients[0].state_names, *transients[0].control_names, *further] if transients else [])
-    messages += [
-        f"scheduling signal '{name}' schedules nothing, and the model leaves it out; use it with --schedule {name}=auto"
-        for name in further
-        if name not in on and name not in automatic
-    ]
+    messages += unused(further, [*on, *automatic])
     lengths: dict[int, Widths] = {}
     choice_of_horizons: dict[str, Any] = {}
     if rule is not None:
@@ -326,6 +325,18 @@ def is_auto(schedule: Schedule | Mapping[str, Knots]) -> bool:
         True if the knots of a signal are "auto".
     """
     return isinstance(schedule, Mapping) and any(_is_auto(knots) for knots in schedule.values())
+
+
+def _no_knots_named(signals: SignalMap | None, name: str) -> None:
+    """Refuse a structure that names knots which are not chosen yet."""
+    if signals is None or not isinstance(signals.structure, list):
+        return
+    for k, rule in enumerate(signals.structure):
+        if isinstance(rule, Mapping) and rule.get("knot", "all") != "all":
+            raise FitError(
+                f"{signals.source}: structure[{k}]: knot is {rule['knot']!r}, and the knots of '{name}' are auto, so "
+                f"it is not known which there will be; give the knots, or leave knot out"
+            )
 
 
 def _is_auto(knots: Knots) -> bool:

@@ -122,15 +122,13 @@ def _stability_reasons(model: UncertainLTI) -> list[dict[str, str]]:
 
 
 def _regime_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Regimes with little data, and verdicts in regimes that no recording of the fit visited."""
+    """Regimes with little data, and verdicts in regimes that the model does not know."""
     reasons = [_reason(CARE, "regimes", text) for text in blocks_in_words(model)]
     judged = sum(r["verdicts"] for r in recordings)
     unknown = sum(r["unknown_regime"] for r in recordings)
     if judged and unknown:
         why = "; ".join(dict.fromkeys(text for r in recordings for text in r["unknown"]))
-        text = (
-            f"{_percent(unknown / judged)} of the verdicts are in regimes that no recording of the fit visited: {why}"
-        )
+        text = f"{_percent(unknown / judged)} of the verdicts are in regimes that the model does not know: {why}"
         reasons.append(_reason(UNKNOWN if unknown > UNVOUCHED * judged else CARE, "regimes", text))
     elif strange := list(dict.fromkeys(text for r in recordings for text in r["unknown"])):
         reasons.append(_reason(CARE, "regimes", "; ".join(strange)))

@@ -160,7 +160,7 @@ def _elements_panels(
             for at, colour in zip(blocks, colours, strict=True):
                 _draw(axis, axis_of, places, nominal[at, i, j], half[at, i, j], colour, other is not None)
                 hollow = [k for k, r in enumerate(at) if not model.block_data[r].known]
-                _mark_unknown(axis, axis_of, places, hollow)
+                _mark_unknown(axis, axis_of, places, hollow, VIOLATED if other is None else colour)
             low, high = (nominal - half)[:, i, j].min(), (nominal + half)[:, i, j].max()
             low, high = min(float(low), 0.0), max(float(high), 0.0)
             room = 0.08 * (high - low) or 1.0
@@ -177,7 +177,7 @@ def _elements_panels(
                 axis.set_ylabel(_wrapped(name, height), fontsize=7)
             if i == len(rows) - 1 and j == 0:
                 axis.set_xlabel(_axis_name(model, across), fontsize=7, loc="left")
-    figure.text(0.1 / total_w, 1 - 0.22 / total_h, _heading(model), fontsize=9)
+    figure.text(0.1 / total_w, 1 - 0.22 / total_h, f"normalised elements [1/s] {_heading(model)}", fontsize=9)
     if other is None:
         handles = [line(RECORDED, "nominal element"), patch(ENVELOPE, 0.55, "± half-width")]
     else:
@@ -186,10 +186,13 @@ def _elements_panels(
             line(colour, f"{name} = {_value(value)}")
             for colour, value in zip(colours, _values(model, other).tolist(), strict=True)
         ]
+        handles.append(patch(NO_VERDICT, 0.4, "± half-width"))
     if not all(data.known for data in model.block_data):
-        handles.append(line("#FFFFFF", "no recording visited it", "o", edge=VIOLATED))
+        edge = VIOLATED if other is None else RECORDED
+        handles.append(line("#FFFFFF", "no recording visited it", "o", edge=edge))
+    abreast = min(len(handles), max(4, int(total_w / 1.3)))
     figure.legend(
-        handles=handles, loc="upper left", ncols=min(len(handles), 4), fontsize=7, frameon=False,
+        handles=handles, loc="upper left", ncols=abreast, fontsize=7, frameon=False,
         bbox_to_anchor=(0.0, 1 - 0.26 / total_h), borderaxespad=0.1,
     )  # fmt: skip
     return figure
@@ -207,12 +210,12 @@ def _draw(axis: Any, over: Axis, places: Array, nominal: Array, half: Array, col
     axis.hlines(nominal, k - 0.35, k + 0.35, color=RECORDED, linewidth=1.0)
 
 
-def _mark_unknown(axis: Any, over: Axis, places: Array, which: Sequence[int]) -> None:
-    """At the foot of a panel: knots or modes that no recording visited."""
+def _mark_unknown(axis: Any, over: Axis, places: Array, which: Sequence[int], colour: Any) -> None:
+    """At the foot of a panel: knots or modes that no recording visited, in the colour of their line."""
     if which:
         x = places[list(which)] if over.knots else np.array(which, dtype=np.float64)
         axis.plot(
-            x, np.zeros(len(x)), "o", markersize=2.5, markerfacecolor="w", markeredgecolor=VIOLATED,
+            x, np.zeros(len(x)), "o", markersize=2.5, markerfacecolor="w", markeredgecolor=colour,
             markeredgewidth=0.7, transform=axis.get_xaxis_transform(), clip_on=False, zorder=4,
         )  # fmt: skip
 
