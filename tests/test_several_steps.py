@@ -23,7 +23,7 @@ from uncertain_lti.identification.columns import Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizons import better_run, run_of
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.identification.several_steps import _Elements, _jacobian, _run, _windows, runs_over_steps
+from uncertain_lti.identification.several_steps import Elements, _jacobian, _windows, runs_over_steps
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.operating_point import OperatingPoint
@@ -76,14 +76,14 @@ def test_the_derivative_is_that_of_the_run(knots: tuple[float, ...]) -> None:
     problem = assembled(recordings(0.01, count=1, length=60, bend=2.0), knots)
     windows = _windows(problem, problem.k, 6)
     assert windows is not None
-    elements = _Elements(started(problem), problem.columns.count)
+    elements = Elements(started(problem), problem.columns.count)
     theta = elements.theta(elements.first)
-    found = elements.chosen(_jacobian(windows, theta, _run(windows, theta)[1]))
+    found = elements.chosen(_jacobian(windows, theta, windows.steps.run(windows.begin, theta)[1]))
     for j in range(elements.size):
         moved = [elements.first.copy(), elements.first.copy()]
         moved[0][j] -= 1e-6
         moved[1][j] += 1e-6
-        low, high = (_run(windows, elements.theta(v))[0] for v in moved)
+        low, high = (windows.steps.run(windows.begin, elements.theta(v))[0][-1] for v in moved)
         np.testing.assert_allclose(found[:, j], ((high - low) / 2e-6).ravel(), atol=1e-6)
 
 

@@ -16,7 +16,7 @@ unknown is linear again, so working set, proof and repair are those of one step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,9 +30,10 @@ from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.optimum import optimum
+from uncertain_lti.identification.output_error import nearest_to_all
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.row import Row
-from uncertain_lti.identification.several_steps import runs_over_steps
+from uncertain_lti.identification.several_steps import Elements, runs_over_steps
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.horizon import Horizon, Run, Widths
@@ -110,7 +111,7 @@ def _as_run(problem: Problem, theta: Array) -> Run:
 def better_run(
     model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None
 ) -> tuple[Run | None, bool]:
-    """What is to be run over the windows: least squares, one step or several ahead, where it stays nearer.
+    """What is to be run over the windows: least squares of one step, of several, or of segments, where nearer.
 
     Compared is the largest distance of a window's end from the run with a linear correction, which is what widths are
     made of: its geometric mean over horizons and states. Of many transitions, pieces of the recordings are looked at.
@@ -158,7 +159,7 @@ def better_run(
     rows, order = _started(problem, structure), _in_order(problem)[0]
     one = np.column_stack([row.theta for row in rows]).reshape(problem.columns.count, -1, problem.n)
     found, corrected, nearest = None, True, distance(model)
-    for several, theta in enumerate([one, *runs_over_steps(problem, order, rows, lengths[-1])]):
+    for several, theta in enumerate(_tried(problem, order, rows, one, lengths[-1])):
         if not np.isfinite(theta).all():
             continue
         run = _as_run(problem, theta)
@@ -166,6 +167,19 @@ def better_run(
         if far < nearest - (PAYS if several and corrected else 0.0):
             found, corrected, nearest = run, not several, far
     return found, corrected
+
+
+def _tried(problem: Problem, order: NDArray[np.intp], rows: Sequence[Row], one: Array, longest: int) -> Iterator[Array]:
+    """Elements (blocks, q, n) by least squares of one step, of several, and of whole segments."""
+    tried = [one]
+    yield one
+    for theta in runs_over_steps(problem, order, rows, longest):
+        tried.append(theta)
+        yield theta
+    if len(tried) > 1:
+        found = nearest_to_all(problem, order, Elements(rows, problem.columns.count), tried, longest)
+        if found is not None:
+            yield found
 
 
 def _in_order(problem: Problem) -> tuple[NDArray[np.intp], Array]:

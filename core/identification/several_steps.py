@@ -38,40 +38,167 @@ _DONE = 1e-3  # a smaller share of the squared error gained ends the rounds
 
 
 @dataclass(frozen=True)
-class _Windows:
-    """Windows of one length: states at both ends (K, n), and of each step controls, weights of blocks, and Δt."""
+class Steps:
+    """Transitions in a row, of K windows of one length at once: controls, weights of blocks, and Δt of each step.
 
-    begin: Array
-    end: Array
+    Parameters
+    ----------
+    u : array (steps, K, m)
+        Normalised.
+    weights : array (steps, K, blocks)
+        Of the schedule; 1 without one.
+    dt : array (steps, K)
+        s.
+    """
+
     u: Array
     weights: Array
     dt: Array
 
+    @classmethod
+    def of(cls, problem: Problem, at: NDArray[np.intp]) -> Steps:
+        """Of the transitions `at` (steps, K).
 
-def _windows(problem: Problem, k: NDArray[np.intp], steps: int) -> _Windows | None:
-    regimes, z, s, n = problem.columns.regimes, problem.z_columns, problem.s_columns, problem.n
+        Parameters
+        ----------
+        problem : Problem
+            The transitions.
+        at : array (steps, K) of int
+            Their positions.
+
+        Returns
+        -------
+        Steps
+            What a run over them needs besides the elements.
+        """
+        regimes, z, s = problem.columns.regimes, problem.z_columns, problem.s_columns
+        weights = np.ones((*at.shape, 1))
+        if regimes is not None:
+            flat = at.ravel()
+            found = regimes.weights(z[:, flat], None if s is None else s[:, flat])
+            weights = np.moveaxis(found.reshape(-1, *at.shape), 0, -1)
+        return cls(np.moveaxis(z[problem.n :, at], 0, -1), weights, problem.dt[at])
+
+    def run(self, begin: Array, theta: Array) -> tuple[Array, list[Array]]:
+        """States x̂ from `begin` on, and the regressors of each step, weighted.
+
+        Parameters
+        ----------
+        begin : array (K, n)
+            States before the first step.
+        theta : array (blocks, q, n)
+            Elements.
+
+        Returns
+        -------
+        array (steps + 1, K, n)
+            The states.
+        list of array (K, blocks, q)
+            Regressors.
+        """
+        x, used = [begin], []
+        for u, w, dt in zip(self.u, self.weights, self.dt, strict=True):
+            phi = w[:, :, None] * (_regressors(x[-1], u, theta.shape[1]) * dt[:, None])[:, None, :]
+            used.append(phi)
+            x.append(x[-1] + phi.reshape(len(phi), -1) @ theta.reshape(-1, theta.shape[2]))
+        return np.stack(x), used
+
+    def transition(self, theta: Array, step: int) -> Array:
+        """Derivative of the state after one step by that before it.
+
+        Parameters
+        ----------
+        theta : array (blocks, q, n)
+            Elements.
+        step : int
+            Which step.
+
+        Returns
+        -------
+        array (K, n, n)
+            I + Δt A, blended.
+        """
+        n = theta.shape[2]
+        blended = np.tensordot(self.weights[step], theta[:, :n].transpose(0, 2, 1), axes=1)
+        return np.asarray(np.eye(n) + self.dt[step][:, None, None] * blended)
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Windows of one length: states at both ends (K, n), and the steps between."""
+
+    begin: Array
+    end: Array
+    steps: Steps
+
+
+def _starts(problem: Problem, k: NDArray[np.intp], steps: int) -> NDArray[np.intp]:
+    """Positions at which so many transitions in a row begin."""
+    regimes, z, s = problem.columns.regimes, problem.z_columns, problem.s_columns
     vectors = np.empty((0, len(k))) if regimes is None else regimes.vectors(z, s)
     first = unbroken_over(k, vectors, None if regimes is None else regimes.schedule)
     last = np.arange(steps - 1, len(k))
     start = last - (steps - 1)
-    start = start[first[last] <= start]
-    most = min(max(_STEPS_LOOKED_AT // steps, _FEWEST), _MOST)
-    if len(start) > most:
-        start = start[np.linspace(0, len(start) - 1, most).astype(np.intp)]
+    return start[first[last] <= start]
+
+
+def _some(start: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """So many of them at most, evenly."""
+    return start if len(start) <= most else start[np.linspace(0, len(start) - 1, most).astype(np.intp)]
+
+
+def segments(problem: Problem, k: NDArray[np.intp], steps: int, samples: int) -> tuple[Steps, Array] | None:
+    """Stretches of so many transitions in a row that do not overlap.
+
+    Parameters
+    ----------
+    problem : Problem
+        The transitions.
+    k : array of int (N,)
+        Numbers of their samples; where one does not follow the one before, a segment ends.
+    steps : int
+        Transitions of each.
+    samples : int
+        Of all together at most, about.
+
+    Returns
+    -------
+    Steps
+        Of K segments.
+    array (steps + 1, K, n)
+        The recorded states, normalised; None for both if there is no segment.
+    """
+    start: list[int] = []
+    for position in _starts(problem, k, steps).tolist():
+        if not start or position >= start[-1] + steps:
+            start.append(position)
+    if not start:
+        return None
+    begin = _some(np.array(start, dtype=np.intp), max(samples // steps, 1))
+    at = begin + np.arange(steps)[:, None]
+    after = np.moveaxis(problem.next_columns[:, at], 0, -1)
+    return Steps.of(problem, at), np.concatenate([problem.z_columns[: problem.n, begin].T[None], after])
+
+
+def _windows(problem: Problem, k: NDArray[np.intp], steps: int) -> _Windows | None:
+    start = _some(_starts(problem, k, steps), min(max(_STEPS_LOOKED_AT // steps, _FEWEST), _MOST))
     if not len(start):
         return None
     at = start + np.arange(steps)[:, None]
-    weights = np.ones((*at.shape, 1))
-    if regimes is not None:
-        flat = at.ravel()
-        found = regimes.weights(z[:, flat], None if s is None else s[:, flat])
-        weights = np.moveaxis(found.reshape(-1, *at.shape), 0, -1)
-    u = np.moveaxis(z[n:, at], 0, -1)
-    return _Windows(z[:n, start].T, problem.next_columns[:, at[-1]].T, u, weights, problem.dt[at])
+    begin, end = problem.z_columns[: problem.n, start].T, problem.next_columns[:, at[-1]].T
+    return _Windows(begin, end, Steps.of(problem, at))
 
 
-class _Elements:
-    """The unknown nominal elements of all rows as one vector, and what it means."""
+class Elements:
+    """The unknown nominal elements of all rows as one vector, and what it means.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        With the elements by least squares of one step, and what is known of them.
+    blocks : int
+        Of the schedule.
+    """
 
     def __init__(self, rows: Sequence[Row], blocks: int) -> None:
         self._fixed = np.stack([row.fixed_theta for row in rows])  # (n, blocks q)
@@ -90,13 +217,64 @@ class _Elements:
         self.first = np.concatenate([row.theta[row.phi_columns.first] for row in rows])
 
     def theta(self, values: Array) -> Array:
-        """Elements (blocks, q, n)."""
+        """Elements of values of the unknowns.
+
+        Parameters
+        ----------
+        values : array (size,)
+            The unknowns.
+
+        Returns
+        -------
+        array (blocks, q, n)
+            With those that are fixed.
+        """
         parts = [values[a:b] for a, b in zip(self._at, self._at[1:], strict=False)]
         full = self._fixed + np.stack([v @ m for v, m in zip(parts, self._maps, strict=True)])
         return np.ascontiguousarray(full.T).reshape(self.blocks, -1, len(full))
 
+    def values(self, theta: Array) -> Array:
+        """The unknowns of elements; what several blocks share is taken as their mean.
+
+        Parameters
+        ----------
+        theta : array (blocks, q, n)
+            Elements.
+
+        Returns
+        -------
+        array (size,)
+            The inverse of `theta`.
+        """
+        full = theta.reshape(-1, theta.shape[2]).T - self._fixed
+        return np.concatenate([m @ row / m.sum(axis=1) for row, m in zip(full, self._maps, strict=True)])
+
+    def add(self, by_unknowns: Array, regressors: Array) -> None:
+        """Add to derivatives of states by the unknowns those of one step.
+
+        Parameters
+        ----------
+        by_unknowns : array (K, n, size)
+            Changed in place.
+        regressors : array (K, blocks q)
+            Of the step, weighted.
+        """
+        for i, (a, b, m) in enumerate(zip(self._at, self._at[1:], self._maps, strict=False)):
+            by_unknowns[:, i, a:b] += regressors @ m.T
+
     def chosen(self, jacobian: Array) -> Array:
-        """(K, n, blocks q, n) by the elements, as (K n, size) by the unknowns."""
+        """Derivatives by the unknowns, of those by the elements.
+
+        Parameters
+        ----------
+        jacobian : array (K, n, blocks q, n)
+            By the elements.
+
+        Returns
+        -------
+        array (K n, size)
+            By the unknowns.
+        """
         columns = [jacobian[..., i] @ m.T for i, m in enumerate(self._maps)]
         return np.concatenate(columns, axis=2).reshape(-1, self.size)
 
@@ -107,26 +285,15 @@ def _regressors(x: Array, u: Array, q: int) -> Array:
     return z if z.shape[1] == q else np.concatenate([z, np.ones((len(z), 1))], axis=1)
 
 
-def _run(windows: _Windows, theta: Array) -> tuple[Array, list[Array]]:
-    """x̂ at the ends, and the regressors of each step (K, blocks, q), weighted."""
-    x, used = windows.begin, []
-    for u, w, dt in zip(windows.u, windows.weights, windows.dt, strict=True):
-        phi = w[:, :, None] * (_regressors(x, u, theta.shape[1]) * dt[:, None])[:, None, :]
-        used.append(phi)
-        x = x + phi.reshape(len(x), -1) @ theta.reshape(-1, theta.shape[2])
-    return x, used
-
-
 def _jacobian(windows: _Windows, theta: Array, used: Sequence[Array]) -> Array:
     """Derivative of x̂ at the ends by the elements, (K, n, blocks q, n): backwards over the steps."""
     n = theta.shape[2]
-    count, back = len(windows.begin), np.eye(n)
+    count = len(windows.begin)
     found = np.zeros((count, n, theta.shape[0] * theta.shape[1], n))
-    onward = np.broadcast_to(back, (count, n, n))  # of the end by the state after the step
-    for phi, w, dt in zip(reversed(used), windows.weights[::-1], windows.dt[::-1], strict=True):
-        found += phi.reshape(count, 1, -1, 1) * onward[:, :, None, :]
-        step = back + dt[:, None, None] * np.tensordot(w, theta[:, :n].transpose(0, 2, 1), axes=1)
-        onward = onward @ step
+    onward = np.broadcast_to(np.eye(n), (count, n, n))  # of the end by the state after the step
+    for step in reversed(range(len(used))):
+        found += used[step].reshape(count, 1, -1, 1) * onward[:, :, None, :]
+        onward = onward @ windows.steps.transition(theta, step)
     return found
 
 
@@ -150,7 +317,7 @@ def runs_over_steps(problem: Problem, k: NDArray[np.intp], rows: Sequence[Row], 
         Elements θ of [x; u] or [x; u; 1], one block after another. Nothing where there are too many unknowns or no
         windows, or no step makes the error smaller.
     """
-    elements = _Elements(rows, problem.columns.count)
+    elements = Elements(rows, problem.columns.count)
     if not 0 < elements.size <= MOST_UNKNOWNS:
         return
     values, scale, steps = elements.first, None, 1
@@ -159,7 +326,7 @@ def runs_over_steps(problem: Problem, k: NDArray[np.intp], rows: Sequence[Row], 
         if windows is None:
             return
         if scale is None:  # of the error one step ahead: the states count alike
-            error = windows.end - _run(windows, elements.theta(values))[0]
+            error = windows.end - windows.steps.run(windows.begin, elements.theta(values))[0][-1]
             scale = np.sqrt(np.mean(error**2, axis=0))
             scale = np.where(scale > 0.0, scale, 1.0)
         else:
@@ -171,14 +338,14 @@ def runs_over_steps(problem: Problem, k: NDArray[np.intp], rows: Sequence[Row], 
         steps = min(_LONGER * steps, longest)
 
 
-def _nearest(windows: _Windows, elements: _Elements, values: Array, scale: Array) -> tuple[Array, bool]:
+def _nearest(windows: _Windows, elements: Elements, values: Array, scale: Array) -> tuple[Array, bool]:
     """From these values to the least squared error over the windows, and whether it became smaller."""
     damping, gained = 1e-4, False
 
     def error_of(which: Array) -> tuple[Array, list[Array], float]:
         with np.errstate(over="ignore", invalid="ignore"):
-            x, used = _run(windows, elements.theta(which))
-            left = ((windows.end - x) / scale).ravel()
+            x, used = windows.steps.run(windows.begin, elements.theta(which))
+            left = ((windows.end - x[-1]) / scale).ravel()
             return left, used, float(left @ left)
 
     left, used, before = error_of(values)
