@@ -24,6 +24,7 @@ from uncertain_lti.identification import passes
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Partition, Problem
+from uncertain_lti.identification.spread import likelier_alone
 from uncertain_lti.model.domain import Occupancy, cells_for
 from uncertain_lti.model.residuals import Residuals
 
@@ -33,6 +34,8 @@ _LOOKED_AT = 50_000
 """Transitions that the domain is made from, about; of more, every second, third, ... counts."""
 _WORTH_A_THREAD = 100_000
 """Transitions per part from which on a thread of its own pays."""
+_COMPARED = 20_000
+"""Residuals that the two forms of `model.residuals` are compared on, about."""
 
 
 class Fleet:
@@ -185,7 +188,10 @@ class Fleet:
         return sum(others, first)
 
     def envelope(self, model: Envelope) -> tuple[Residuals, Array, Array]:
-        """Mean and covariance of the utilisation, and widths at the transitions of each block.
+        """Mean and covariance of the utilisation, or of the residual, and widths at the transitions of each block.
+
+        With one covariance of the residual its spread is the same in all regimes, with one of the utilisation it is as
+        the half-width; the form by which the transitions are likelier is taken.
 
         Parameters
         ----------
@@ -201,14 +207,17 @@ class Fleet:
         array (R, n)
             Of each block the largest width.
         """
-        results = self.map(passes.envelope_sums, self._same(model))
-        mean = np.sum([r[0] for r in results], axis=0) / self.N
-        products = np.sum([r[1] for r in results], axis=0) / self.N
+        results = self.map(passes.envelope_sums, self._same(model, max(1, self.N // _COMPARED)))
+        left, half = (np.concatenate([r[i] for r in results]) for i in (4, 5))
+        relative = not likelier_alone(left, half)
+        form = 0 if relative else 1
+        mean = np.sum([r[0][form] for r in results], axis=0) / self.N
+        products = np.sum([r[1][form] for r in results], axis=0) / self.N
         covariance = products - np.outer(mean, mean)
         values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
         if values[0] < 0.0:  # by rounding
             covariance = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        residuals = Residuals(mean, 0.5 * (covariance + covariance.T))
+        residuals = Residuals(mean, 0.5 * (covariance + covariance.T), relative)
         return residuals, np.sum([r[2] for r in results], axis=0), np.max([r[3] for r in results], axis=0)
 
     def moving_from_rest(self) -> tuple[int, int, float]:

@@ -831,11 +831,11 @@ def _judged_in_doubt(block: Block, model: Envelope, known: Array, regimes: Regim
     return Judged(outside, largest, largest * np.sqrt(block.weights))
 
 
-def envelope_sums(part: Partition, model: Envelope) -> tuple[Array, Array, Array, Array]:
+def envelope_sums(part: Partition, model: Envelope, stride: int) -> tuple[Array, ...]:
     """Sums over all transitions of what the envelope is there.
 
-    That is the utilisation r = (x_next - centre) / half of every transition, its products, and the widths per step at
-    the transitions of each block, those of which it has the largest weight.
+    That is the residual x_next - centre of every transition, the utilisation (x_next - centre) / half, their products,
+    and the widths per step at the transitions of each block, those of which it has the largest weight.
 
     Parameters
     ----------
@@ -843,20 +843,27 @@ def envelope_sums(part: Partition, model: Envelope) -> tuple[Array, Array, Array
         The transitions.
     model : Envelope
         Gives the centre and the half-width.
+    stride : int
+        Of every so many transitions, one is returned by itself.
 
     Returns
     -------
-    array (n,)
-        Σ r.
-    array (n, n)
-        Σ r rᵀ.
+    array (2, n)
+        Σ r of the utilisation, then of the residual.
+    array (2, n, n)
+        Σ r rᵀ of the same.
     array (R, n)
         Of each block of a schedule the sum of the widths, normalised.
     array (R, n)
         Of each block of a schedule the largest width.
+    array (K, n)
+        Some residuals.
+    array (K, n)
+        Their half-widths.
     """
     columns, n = part.columns, part.n
-    total, products = np.zeros(n), np.zeros((n, n))
+    total, products = np.zeros((2, n)), np.zeros((2, n, n))
+    some: list[list[Array]] = [[], []]
     widths, largest = np.zeros((columns.count, n)), np.zeros((columns.count, n))
     for block in _pieces(part):
         quick = _Quick.of(block, model, columns.regimes)
@@ -866,13 +873,18 @@ def envelope_sums(part: Partition, model: Envelope) -> tuple[Array, Array, Array
             widths[k] += own.sum(axis=1)
             largest[k] = np.maximum(largest[k], own.max(axis=1))
         if (half.min(axis=1) > _NARROW * quick.error).all():
-            r = quick.distance / -half
+            left = -quick.distance
+            r = left / half
         else:
             centre, half = _centre_and_half(model, block)
-            r = np.asarray(utilisation_of(block.x_next - centre, half))
-        total += r.sum(axis=1)
-        products += gram_of(r, r)
-    return total, products, widths, largest
+            left = block.x_next - centre
+            r = np.asarray(utilisation_of(left, half))
+        for i, values in enumerate((r, left)):
+            total[i] += values.sum(axis=1)
+            products[i] += gram_of(values, values)
+        for kept, values in zip(some, (left, half), strict=True):
+            kept.append(values[:, ::stride].T.copy())
+    return total, products, widths, largest, np.concatenate(some[0]), np.concatenate(some[1])
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:

@@ -119,7 +119,8 @@ class StatisticRule:
     - ``cusum``: the larger of :math:`s_k^± = \max(0, s_{k-1}^± T / (T + Δt_k) + (± u_k - a) Δt_k / T)`, with a the
       allowance: a sum that forgets, so that what it reaches in a session does not grow with its length;
     - ``chi2``: :math:`\sum (u_k - \bar u)^T C^{-1} (u_k - \bar u) Δt_k / T` of the utilisation of all states together,
-      with the mean and the covariance of `UncertainLTI.residuals` or, at a horizon, of `Horizon.residuals`;
+      or of their residuals, with the mean and the covariance of `UncertainLTI.residuals` or, at a horizon, of
+      `Horizon.residuals`;
     - ``mewma``: :math:`e_k^T (s_k C)^{-1} e_k` of its low-pass
       :math:`e_k = e_{k-1} + (u_k - \bar u - e_{k-1}) λ_k`, :math:`λ_k = Δt_k / (T + Δt_k)`, whose covariance is
       :math:`s_k C` with :math:`s_k = (1 - λ_k)^2 s_{k-1} + λ_k^2`: at a constant step :math:`λ / (2 - λ)`, where it

@@ -31,9 +31,10 @@ _LEAST = 1e-12
 class Residuals:
     """Mean and covariance of the utilisation (x_{k+1} - centre_k) / half_k over the transitions of the fit.
 
-    Of a horizon those of the utilisation of its envelope, over the windows of the fit. The spread of residuals changes
-    with x, u and the regime, as the half-widths do, so that one covariance describes the utilisation better. Model
-    files of before have that of the residual itself, x_{k+1} - centre_k, normalised.
+    Of a horizon those of the utilisation of its envelope, over the windows of the fit. If the spread of residuals
+    changes with x, u and the regime as the half-widths do, one covariance describes the utilisation better; noise of
+    the readings is the same everywhere, and then one of the residual itself, x_{k+1} - centre_k, normalised, does. The
+    fit takes the likelier one.
 
     Parameters
     ----------

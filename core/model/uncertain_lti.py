@@ -265,8 +265,8 @@ class UncertainLTI:
     def with_residuals_of(self, other: UncertainLTI, instead: bool = False) -> UncertainLTI:
         """The same model with the `residuals` of another fit, as far as it has the same horizons.
 
-        Where one of them has the form of model files of before, of the residual itself, that one is taken, as it is
-        what the thresholds of those files are for.
+        Where one is of the utilisation and one of the residual itself, this model keeps its own `instead`, and takes
+        those of the other otherwise: thresholds are for one form.
 
         Parameters
         ----------
@@ -285,7 +285,7 @@ class UncertainLTI:
             if own is None or given is None:
                 return own or given
             if given.relative != own.relative:
-                return own if given.relative else given
+                return own if instead else given
             return given if instead else own
 
         of = {horizon.steps: horizon.residuals for horizon in other.horizons}
