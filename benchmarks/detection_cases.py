@@ -15,12 +15,12 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from detectors import Runs
+from detectors import Residuals, Runs
 from regimes import FITTED_MOVES, LONG, waves
 from turbofan_fleet import simulate_fleet
 
@@ -146,9 +146,10 @@ def from_whole_degrees(moves: tuple[tuple[float, float], ...]) -> tuple[tuple[fl
     return ((0.0, start), (moves[1][0], start), *moves[2:])
 
 
-def simulated(runs: list[Run], keep: Path | None) -> list[Transient]:
-    """Runs of one length, simulated together or read from where they were kept."""
-    path = keep / f"{hashlib.sha256(repr(runs).encode()).hexdigest()[:20]}.npz" if keep else None
+def simulated(runs: list[Run], keep: Path | None, controls: np.ndarray | None = None) -> list[Transient]:
+    """Runs of one length, simulated together or read from where they were kept; as `simulate_fleet`."""
+    asked_for = hashlib.sha256(repr(runs).encode() + (b"" if controls is None else controls.tobytes()))
+    path = keep / f"{asked_for.hexdigest()[:20]}.npz" if keep else None
     if path is not None and path.is_file():
         with np.load(path) as data:
             x, u = data["x"], data["u"]
@@ -158,7 +159,7 @@ def simulated(runs: list[Run], keep: Path | None) -> list[Transient]:
             Transient(t_ns, x[i], u[i], name=f"turbofan {i}", signals=signals, max_gap=signals.max_gap)
             for i in range(len(x))
         ]
-    made = simulate_fleet(runs)
+    made = simulate_fleet(runs, controls)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(path, x=np.array([t.x for t in made]), u=np.array([t.u for t in made]))
@@ -168,6 +169,32 @@ def simulated(runs: list[Run], keep: Path | None) -> list[Transient]:
 def turbofan_run(seed: int, noise: float, fault: Fault | None = None) -> Run:
     """A run of 30 s that is not fitted."""
     return Run(round(SECONDS / DT) + 1, lever=profile(seed), ramps=True, noise=noise, seed=seed, fault=fault)
+
+
+def of_the_plant(case: Case, noise: float, keep: Path | None) -> tuple[Case, Residuals]:
+    """The case for a detector that has the plant itself, and its residuals: readings less the plant's run beside them.
+
+    The plant is run without the fault, with the recorded controls; of a healthy run that leaves the noise alone, which
+    is drawn anew.
+    """
+    point, rng = operating_point(), np.random.default_rng(1)
+    kept: dict[int, np.ndarray] = {}
+    for faulty in case.faulty.values():
+        runs = faulty.runs
+        same = [replace(turbofan_run(30000 + i, 0.0), seed=0) for i in range(len(runs.x))]
+        controls = np.stack([t.u for t in runs.transients])
+        (plant,) = Recorded.of(simulated(same, keep, controls), point)
+        kept[id(runs)] = runs.x - plant.x
+
+    def quiet(parts: list[Recorded]) -> list[Recorded]:
+        return [replace(runs, x=noise * rng.standard_normal(runs.x.shape)) for runs in parts]
+
+    learn, healthy = quiet(case.learn), quiet(case.healthy)
+    kept |= {id(runs): runs.x for runs in (*learn, *healthy)}
+    found = replace(
+        case, title=case.title.replace("Turbofan", "The plant as model"), fitted=learn[:1], learn=learn, healthy=healthy
+    )
+    return found, lambda runs: kept[id(runs)][:, 1:]
 
 
 def turbofan_case(noise: float, options: argparse.Namespace) -> Case:

@@ -104,10 +104,10 @@ def later(one: Array, other: Array, rng: np.random.Generator) -> tuple[float, fl
     return float(np.median(ratio)), float(low), float(high)
 
 
-def false_violations(case: Case, detectors: Mapping[str, Score]) -> str:
+def false_violations(case: Case, detectors: Mapping[str, Score], models: Iterable[str]) -> str:
     """Verdicts of healthy runs outside the envelope as it was fitted, at margin 1, for every horizon."""
     rows = []
-    for knots in ("1 knot", "3 knots"):
+    for knots in models:
         for horizon in (1, *HORIZONS):
             score = detectors[f"{OURS}, {knots}, {Kind('containment', 0.0, horizon).name}"]
             peaks, outside, verdicts = [], 0, 0

@@ -121,13 +121,15 @@ class FleetSolver:
         raise UncertainLTIError("turbofan: some gas path of many was not matched; keep closer to the working line")
 
 
-def simulate_fleet(runs: Sequence[Run]) -> list[Transient]:
+def simulate_fleet(runs: Sequence[Run], controls: Array | None = None) -> list[Transient]:
     """`turbofan_runs.simulate` of runs of one length.
 
     Parameters
     ----------
     runs : sequence of Run
         Of as many samples each.
+    controls : array (runs, samples, 4), optional
+        Recorded controls, in place of those of the controllers.
 
     Returns
     -------
@@ -163,7 +165,9 @@ def simulate_fleet(runs: Sequence[Run]) -> list[Transient]:
             if run.noise:
                 reading = reading + run.noise * point.X * generators[r].standard_normal(5)
             x_read[r, k] = _rounded(reading, point.X)
-            if run.amplitude is None:
+            if controls is not None:
+                u_sent[r, k] = controls[r, k]
+            elif run.amplitude is None:
                 u_sent[r, k] = controllers[r].step(_lever(run, t), x_read[r, k])
             else:
                 u_sent[r, k] = begin[r].u + point.U * pulses(t, run.amplitude)
