@@ -22,10 +22,11 @@ from test_event_log import Rig
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.signature import Signature, closeness
-from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer
+from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Likeness, Part
 from uncertain_lti.monitor.session import OK
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.reports.model_text import model_text
 from uncertain_lti.reports.signature_text import signature_text
 from uncertain_lti.validation.signatures import learn_signatures
 
@@ -90,6 +91,21 @@ def test_an_unknown_fault_stays_unknown(taught: UncertainLTI) -> None:
         others = taught.replace(signatures=[s for s in taught.signatures if s.label != fault])
         found = max(explained(others, run(200, fault)), key=lambda like: like["verdicts"])
         assert found["label"] is None and "looks like no known fault" in found["text"]
+
+
+def test_faults_that_look_alike_are_both_named_and_neither_is_chosen(taught: UncertainLTI) -> None:
+    (known,) = (s for s in taught.signatures if s.label == FAULTS[0])
+    twins = taught.replace(signatures=[Signature(label, known.steps, known.moments) for label in ("one", "two")])
+    found = max(explained(twins, run(200, FAULTS[0])), key=lambda like: like["verdicts"])
+    assert found["label"] is None and "looks like two or one, too alike to tell (nearest two" in found["text"]
+    assert "no known fault" not in found["text"]
+    assert "signatures of faults: one, two" in model_text(UncertainLTI.from_dict(twins.to_dict()))
+
+
+def test_states_that_began_an_alarm_of_no_known_pattern_are_named() -> None:
+    pattern = Likeness("", (("worn", 0.3),), (), ("a", "b"), LEAST)
+    assert pattern.words == "looks like no known fault (nearest worn 0.30); began at a, b"
+    assert "began" not in Likeness("", (), (Part("sensor", "a", 0.9),), ("a",), LEAST).words
 
 
 def test_no_alarm_has_no_name(taught: UncertainLTI) -> None:

@@ -82,7 +82,8 @@ class Likeness(NamedTuple):
     def words(self) -> str:
         """In words, without a full stop; empty where there are too few verdicts, or nothing to say.
 
-        Parts are named if those that explain nearly as much are of one signal.
+        Parts are named if those that explain nearly as much are of one signal; without any, the states that were
+        outside when the alarm began, if there are signatures.
         """
         if self.verdicts < LEAST:
             return ""
@@ -91,9 +92,13 @@ class Likeness(NamedTuple):
             near = ", ".join(f"{label} {match:.2f}" for label, match in self.matches[bool(self.label) :][:2])
             if self.label:
                 return f"looks like {self.label} (match {self.matches[0][1]:.2f}{f', next {near}' * bool(near)})"
-            found.append(f"looks like no known fault (nearest {near})")
+            alike = [name for name, match in self.matches if match >= max(MATCH, self.matches[0][1] - AHEAD)]
+            what = f"{' or '.join(alike)}, too alike to tell" if alike else "no known fault"
+            found.append(f"looks like {what} (nearest {near})")
         if len({part.name for part in self.parts}) == 1:
             found.append("points to " + " or ".join(f"{p.kind} {p.name} ({p.share:.0%})" for p in self.parts))
+        elif self.first and self.matches:
+            found.append(f"began at {', '.join(self.first)}")
         return "; ".join(found)
 
 

@@ -80,6 +80,8 @@ def model_text(model: UncertainLTI) -> str:
             )
         else:
             lines.append(f"alarm: {rule.words}")
+    if model.signatures:
+        lines.append(f"signatures of faults: {', '.join(signature.label for signature in model.signatures)}")
     if (faults := detectable_data(model.validation)) is not None:
         lines += [condition_text(faults), *(f"  {text}" for text in detectable_words(faults))]
     return "\n".join(lines + [f"note: {message}" for message in facts.get("messages", [])])
