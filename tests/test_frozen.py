@@ -312,15 +312,33 @@ def test_what_noise_changes_at_every_step_is_frozen_at_its_first_slow_repeat() -
     assert verdicts.repeating[32:].all() and not verdicts.frozen.any()
 
 
-def test_three_steps_are_enough_of_a_noisy_state_that_is_fast() -> None:
+def test_a_quarter_second_is_enough_of_a_noisy_state_that_is_fast() -> None:
     repeats = Repeats([0.0], [0.0], [0.0], [LARGEST], [1000.0])
     model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
-    x = np.concatenate([np.linspace(1.0, 1.1, 20), np.full(10, 1.1)])[:, None]
-    transient = Transient(0.01 * np.arange(30), x, np.zeros((30, 1)))
-    assert np.flatnonzero(EnvelopeMonitor(model).check(transient).frozen).tolist() == list(range(22, 30))
+    x = np.concatenate([np.linspace(1.0, 1.1, 20), np.full(40, 1.1)])[:, None]
+    transient = Transient(0.01 * np.arange(60), x, np.zeros((60, 1)))
+    assert np.flatnonzero(EnvelopeMonitor(model).check(transient).frozen).tolist() == list(range(44, 60))
     few = model.replace(repeats=Repeats([0.0], [0.0], [0.0], [LARGEST], [999.0]))
     assert not EnvelopeMonitor(few).check(transient).frozen.any()
     assert UncertainLTI.from_dict(model.to_dict()).to_dict() == model.to_dict()
+
+
+def test_a_parked_machine_is_not_frozen_by_its_noise() -> None:
+    """Every state repeats there; one alone does not, whatever the others do before they stop."""
+    repeats = Repeats([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [LARGEST] * 2, [5000.0] * 2)
+    zeros = np.zeros((2, 2))
+    model = UncertainLTI(zeros, zeros[:, :1], zeros, zeros[:, :1], v=[0.5, 0.5], repeats=repeats)
+    noise = np.random.default_rng(1).normal(1.0, 0.1, (300, 2))
+    parked, stopping, stuck = noise.copy(), noise.copy(), noise.copy()
+    parked[100:] = parked[100]
+    stopping[100:, 0], stopping[120:, 1] = stopping[100, 0], stopping[120, 1]
+    stuck[100:, 0] = stuck[100, 0]
+    for x, frozen in ((parked, []), (stopping, []), (stuck, list(range(125, 300)))):
+        transient = Transient(0.01 * np.arange(300), x, np.zeros((300, 1)))
+        verdicts = EnvelopeMonitor(model).check(transient)
+        assert np.flatnonzero(verdicts.frozen.any(axis=1)).tolist() == frozen
+        assert verdicts.repeating[299].any() or frozen
+        same_as_live(model, transient)
 
 
 @pytest.mark.parametrize("recur", [False, True])

@@ -13,9 +13,10 @@ A parked machine repeats too, so a repeat alone is a warning. A state is frozen 
 repeat, moves it by more than its half-width, and farther than over any repeat of the fit; twice as far if the fit has
 repeats as long. Where another state has left the place that it had when the repeat began, the machine is not
 parked: there the sum of the model's one-step movements counts like its run. Nor is it parked while it is as active
-as in the recordings, and twice as active as over any repeat of theirs: then three repeats are enough. So they are of a
-state that noise changes at every step, also when the machine is at rest; unless the value is 0, as of what is switched
-off. A short repeat is usual up to twice the longest of the fit, as a coarse sensor repeats by chance.
+as in the recordings, and twice as active as over any repeat of theirs: then three repeats are enough. So they are over
+a quarter second, of a state that noise changes at every step, also when the machine is at rest; unless the value is 0,
+as of what is switched off, or all states repeat, as of a machine that is parked. A short repeat is usual up to twice
+the longest of the fit, as a coarse sensor repeats by chance.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ FARTHER = 2.0
 and how much longer a short one must be."""
 
 USUAL_S = 0.25
-"""Seconds up to which a repeat is usual, s, if the fit has repeats half as long: those of a coarse sensor in motion."""
+"""Seconds up to which a repeat is usual, s, if the fit has repeats half as long: those of a coarse sensor in motion.
+So long must one of a state last that noise changes: a machine that stops does not stop in all states at once."""
 
 LEAST = 3
 """Steps that a repeat must have while the machine is active, or of a state that noise changes."""
@@ -154,12 +156,13 @@ class FrozenWatch:
             return Looked(thawed=thawed)
         self._on = True
         lower, upper, own = bounds()
+        still = len(after) > 1 and all(map(eq, before, after))  # as a parked machine is
         frozen, repeating = [], []
         for moved in self._follow.push(t_ns, dt, before, after, lower, upper, own):
             i = moved.state
             if not self._counted[i]:
                 continue
-            if i in self._frozen or self._is_frozen(moved, after, lower, upper):
+            if i in self._frozen or self._is_frozen(moved, after, lower, upper, still):
                 frozen.append(moved)
             elif moved.seconds > self._longest[i]:
                 repeating.append(moved)
@@ -167,14 +170,17 @@ class FrozenWatch:
         thawed, self._frozen = not self._frozen <= now, now
         return Looked(tuple(frozen), thawed, tuple(repeating))
 
-    def _is_frozen(self, moved: Moved, after: Sequence[float], lower: Sequence[float], upper: Sequence[float]) -> bool:
+    def _is_frozen(
+        self, moved: Moved, after: Sequence[float], lower: Sequence[float], upper: Sequence[float], still: bool
+    ) -> bool:
         i = moved.state
         if moved.seconds <= self._usual[i]:
             return False
         if moved.steps >= LEAST and moved.activity > self._active[i]:
             return True
-        if self._noisy[i] >= NOISY and after[i] != 0.0:
-            if moved.steps >= LEAST or (moved.seconds >= SLOW_S and self._noisy[i] >= SLOW_NOISY):
+        if self._noisy[i] >= NOISY and after[i] != 0.0 and not still:
+            slow = moved.seconds >= SLOW_S and self._noisy[i] >= SLOW_NOISY
+            if slow or (moved.steps >= LEAST and moved.seconds >= USUAL_S):
                 return True
         if moved.seconds <= self._longest[i]:
             return moved.run > self._run_within[i]
