@@ -132,6 +132,18 @@ def test_a_recording_unlike_all_others_excuses_nothing():
     assert knots(4.0, 1100.0).excess(base) > EXCESS > knots(0.5, 900.0).excess(base)
 
 
+@pytest.mark.parametrize(("outside", "width", "taken"), [(7, 0.5, True), (9, 0.5, False), (9, 0.2, True)])
+def test_at_most_so_many_times_what_one_knot_leaves_outside(outside, width, taken):
+    """Also where that is a small share; not if the bounds are much narrower."""
+    judged = np.full(10, 10_000.0)
+    base = Candidate(1, judged=judged, outside=np.full(10, 3.0), log_width=np.zeros(10))
+    knots = Candidate(2, judged=judged, outside=np.full(10, float(outside)), log_width=np.full(10, np.log(width)))
+    assert knots.excess(base) < EXCESS
+    assert best_of([base, knots]) is (knots if taken else base)
+    few = [replace(c, judged=10.0 * judged) for c in (base, knots)]
+    assert best_of(few) is few[1]
+
+
 def test_a_choice_is_the_same_again():
     once, again = (choose_knots(RUNS, "x1", **options()).facts() for _ in range(2))
     assert json.dumps(once) == json.dumps(again)

@@ -50,6 +50,10 @@ WORSE = 0.01
 UNLIKE = 0.05
 """Share that one knot leaves outside of a left-out part, above which that part is unlike the other recordings: how much
 more of it another number of knots leaves outside is chance, and must not hide what it does to the rest."""
+TIMES = 2.5
+"""Of recordings that are like others at most so many times what one knot leaves outside may be, ..."""
+NEGLIGIBLE = 0.0002
+"""... but this share of their transitions anyway."""
 PAYS = 0.8
 """Mean width relative to one knot up to which more knots are worth having."""
 WANTED = 5
@@ -347,9 +351,11 @@ def choose_knots(
     knot's), unless the share outside exceeds that of one knot by less than
     its standard error, and by less than WORSE. That must hold of all parts, and of those alone that are like others
     (one knot leaves at most UNLIKE of them outside), if they are half of all: a recording that no other resembles
-    has so large an error that it would excuse anything. Of those whose mean width (geometric over states and left-out
-    parts) is at most PAYS of one knot's, the one with the least width is the best, and the fewest knots within one
-    standard error of it are chosen. Standard errors are those of the jackknife over what was left out.
+    has so large an error that it would excuse anything. Of the latter, more than TIMES what one knot leaves outside
+    refuses a number as well (not if the widths are at most MUCH, nor a share up to NEGLIGIBLE). Of those whose mean
+    width (geometric over states and left-out parts) is at most PAYS of one knot's, the one with the least width is the
+    best, and the fewest knots within one standard error of it are chosen. Standard errors are those of the jackknife
+    over what was left out.
 
     Parameters
     ----------
@@ -506,13 +512,16 @@ def _admissible(candidate: Candidate, base: Candidate, allowed: float) -> bool:
     """Whether its coverage does not speak against it."""
     if candidate.refused:
         return False
-    if candidate.width[0] <= math.log(MUCH):
+    much = candidate.width[0] <= math.log(MUCH)
+    if much:
         allowed = max(allowed, EXCESS_FOR_MUCH)
     for parts in base.counted():
         more, error = candidate.more_outside(base, parts)
         if candidate.excess(base, parts) > allowed and more >= min(error, WORSE):
             return False
-    return True
+    like = base.counted()[-1]
+    outside, one, judged = (float(a[like].sum()) for a in (candidate.outside, base.outside, base.judged))
+    return much or allowed > EXCESS or outside <= max(TIMES * one, NEGLIGIBLE * judged)
 
 
 def best_of(candidates: Sequence[Candidate], allowed: float = EXCESS) -> Candidate:
