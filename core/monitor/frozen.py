@@ -221,6 +221,25 @@ def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
     return f"{name} {what}, while the model moves it by {size:.3g} half-widths"
 
 
+def why_frozen(state: int, repeats: Repeats) -> str:
+    """Why a repeat of this state may be called frozen.
+
+    Parameters
+    ----------
+    state : int
+        Number of the state.
+    repeats : Repeats
+        Those of the fit.
+
+    Returns
+    -------
+    str
+        Follows what is repeated.
+    """
+    noisy = repeats.noisy_steps[state] >= NOISY and repeats.longest_repeat_s[state] == 0.0
+    return "while the model moves it" + (", or noise always changed it" if noisy else "")
+
+
 def repeat_words(seconds: float, longest: float) -> str:
     """What is said of a repeat.
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.jumps import jump_words, jumps
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.frozen import repeat_words
+from uncertain_lti.monitor.frozen import repeat_words, why_frozen
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.regimes import check_regimes, sample_blocks, unknown_in_words
@@ -201,6 +201,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: NDArray[np.bool_]) 
                     "seconds": seconds,
                     "told_after": told,
                     "longest_in_fit": longest,
+                    "why": why_frozen(i, model.repeats),
                     "text": f"{name} {repeat_words(seconds, longest)} from {transient.t[begin]:.4f} s",
                 }
             )

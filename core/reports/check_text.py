@@ -101,7 +101,7 @@ def repeats_text(data: Mapping[str, Any]) -> list[str]:
     list of str
         Lines without a full stop.
     """
-    lines = [f"FROZEN: {r['text']}, while the model moves it" for r in data["frozen"][:MOST_REPEATS]]
+    lines = [f"FROZEN: {r['text']}, {r['why']}" for r in data["frozen"][:MOST_REPEATS]]
     if (more := len(data["frozen"]) - MOST_REPEATS) > 0:
         lines.append(f"  and {plural(more, 'more frozen repeat')}; --json has all")
     longest: dict[str, dict[str, Any]] = {}

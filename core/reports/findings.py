@@ -264,7 +264,7 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     found = _violated(recording)
     if not recording["frozen"]:
         return found
-    first = f"frozen: {recording['frozen'][0]['text']}, while the model moves it"
+    first = "frozen: {text}, {why}".format_map(recording["frozen"][0])
     more = len(recording["frozen"]) - 1
     return {**found, "state": "alarm", "text": f"{first}{f', and {more} more' * bool(more)}. {found['text']}"}
 
