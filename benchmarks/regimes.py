@@ -125,7 +125,8 @@ def judge(model: UncertainLTI, transient: Transient) -> Judged:
     """Every transition by the monitor's own verdict, whatever the model's alarm rule."""
     verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
     half = 0.5 * (verdicts.upper - verdicts.lower)
-    away = np.abs(transient.x - 0.5 * (verdicts.upper + verdicts.lower)) / half
+    away = np.abs(transient.x - 0.5 * (verdicts.upper + verdicts.lower))
+    away = np.divide(away, half, out=np.full_like(away, np.nan), where=half != 0.0)  # none at rest without noise
     half = half / model.operating_point.X
     return Judged((verdicts.flags == 1.0)[1:], half[1:], verdicts.judged[1:], away[1:].max(axis=1))
 
