@@ -234,7 +234,9 @@ class Cells:
             each = product(elements[blocks].reshape(-1, r), columns[:, part])
             each = each.reshape(len(blocks), rows, -1)
             each *= self.weights[:, None, part]
-            each.sum(axis=0, out=total[:, part])
+            for k in range(1, len(each)):
+                each[0] += each[k]
+            total[:, part] = each[0]
         return total
 
     def spread(self, columns: Array) -> list[Array]:

@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.assembly import scaled_eigenvalues
 from uncertain_lti.identification.cells import Cells, Whole
 from uncertain_lti.identification.columns import Columns, Regimes
-from uncertain_lti.identification.problem import Block, Partition
+from uncertain_lti.identification.problem import Block, Partition, Problem
 from uncertain_lti.identification.products import gram_of, product
 from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of, utilisation_of
 
@@ -155,6 +155,8 @@ _FEW = 256
 """Transitions of a piece that are worth judging one by one."""
 _FEW_ALL = 20_000
 """Transitions up to which a scan spends its time elsewhere."""
+_KEPT = 2**20
+"""Transitions of a schedule up to which those in memory are kept sorted from one pass to the next: a copy of them."""
 _NARROW = 1e8
 """Half-widths are so many times as large as rounding where the order of the sums does not show in a utilisation."""
 _EPS, _TINY = float(np.finfo(np.float64).eps), 1e-290
@@ -170,6 +172,32 @@ def _pieces(part: Partition) -> Iterator[Block]:
             continue
         for start in range(0, len(block), most):
             yield block.piece(start, start + most)
+
+
+def _sorted_pieces(part: Partition, regimes: Regimes) -> Iterator[tuple[Block, Cells, Block]]:
+    """As `_pieces`, with how each is sorted, and sorted; in memory that is kept for the next pass."""
+    kept = part.sorted_pieces if isinstance(part, Problem) and part.N <= _KEPT else None
+    if kept:
+        yield from kept
+        return
+    found = []
+    for block in _pieces(part):
+        cells = Cells.of(regimes, block)
+        piece = block, cells, cells.sort(block)
+        if kept is not None:
+            found.append(piece)
+        yield piece
+    if kept is not None:
+        kept.extend(found)
+
+
+def _pieces_as_sorted(part: Partition) -> Iterator[tuple[Block, Cells | None, Block]]:
+    """As `_sorted_pieces`; without a schedule the pieces as they are."""
+    if part.columns.regimes is not None:
+        yield from _sorted_pieces(part, part.columns.regimes)
+        return
+    for block in _pieces(part):
+        yield block, None, block
 
 
 def occupied(partition: Partition, least: Array, greatest: Array, cells: int, stride: int) -> NDArray[np.bool_]:
@@ -233,13 +261,12 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
     sums: Moments | None = None
     sampled: list[Block] = []
     index: list[Index] = []
-    for block in _pieces(part):
+    for block, sorting, some in _pieces_as_sorted(part):
         if stride:
             first = -(block.start + offset) % stride
             sampled.append(block.every(first, stride))
             index.append(np.arange(first, len(block), stride) + (block.start + offset))
-        cells = Whole() if columns.regimes is None else Cells.of(columns.regimes, block)
-        block = cells.sort(block)
+        cells, block = sorting or Whole(), some
         # a constant step goes into the sums
         constant = bool((block.dt == block.dt[0]).all())
         unit = float(block.dt[0]) if constant else 1.0
@@ -450,9 +477,7 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
         return np.vstack([inner, outer])
 
     halves = shifted()
-    for block in _pieces(part):
-        cells = None if columns.regimes is None else Cells.of(columns.regimes, block)
-        some = block if cells is None else cells.sort(block)
+    for block, cells, some in _pieces_as_sorted(part):
         times = product if cells is None else cells.product
         # a constant step goes into the elements, unless the transitions are too few for it to save time
         step = float(block.dt[0]) if part.N > _FEW_ALL and (block.dt == block.dt[0]).all() else None
@@ -637,9 +662,9 @@ def judge(part: Partition, model: Envelope) -> Judged:
     """
     zeros = np.zeros(part.n)
     total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
-    for block in _pieces(part):
+    for block, cells, some in _pieces_as_sorted(part):
         quick = block.weights.ndim == 1
-        found = _judged_in_doubt(block, model, total.largest, part.columns.regimes) if quick else None
+        found = _judged_in_doubt(some, model, total.largest, cells) if quick else None
         total = total + (found or _judged(block, model))
     return total
 
@@ -678,8 +703,6 @@ class _Quick:
 
     Parameters
     ----------
-    block : Block
-        The transitions, sorted where there is a schedule.
     distance : array (n, K)
         Centre less x_next.
     half : array (n, K)
@@ -692,29 +715,23 @@ class _Quick:
         No distance is off by more.
     relative : float
         Rounding of the sums, relative to what they add.
-    cells : Cells or None
-        How the transitions are sorted.
     """
 
-    block: Block
     distance: Array
     half: Array
     floor: Array
     widest: Array
     error: Array
     relative: float
-    cells: Cells | None
 
     @classmethod
-    def of(cls, block: Block, model: Envelope, regimes: Regimes | None) -> _Quick:
-        """Of some transitions in any order; `regimes` is the schedule of the model."""
+    def of(cls, block: Block, model: Envelope, cells: Cells | None) -> _Quick:
+        """Of some transitions; `cells` is how they are sorted, where the model has a schedule."""
         with np.errstate(over="ignore", invalid="ignore"):  # values that it cannot carry: no error is finite
-            return cls._of(block, model.tables, regimes)
+            return cls._of(block, model.tables, cells)
 
     @classmethod
-    def _of(cls, block: Block, tables: tuple[Array, Array, Array], regimes: Regimes | None) -> _Quick:
-        cells = None if regimes is None else Cells.of(regimes, block)
-        block = block if cells is None else cells.sort(block)
+    def _of(cls, block: Block, tables: tuple[Array, Array, Array], cells: Cells | None) -> _Quick:
         # blended elements are no larger than those of the blocks
         nominal, spread, v = tables if cells is None else (np.abs(table).max(axis=0) for table in tables)
         n, p = block.n, len(block.z)
@@ -753,7 +770,7 @@ class _Quick:
         elif not constant:
             distance += block.z[:n]
         distance -= block.x_next
-        return cls(block, distance, half, floor, widest, error, relative, cells)
+        return cls(distance, half, floor, widest, error, relative)
 
 
 def _blended(cells: Cells, block: Block, psi: Array, tables: tuple[Array, Array, Array]) -> tuple[Array, Array]:
@@ -779,7 +796,7 @@ def _blended(cells: Cells, block: Block, psi: Array, tables: tuple[Array, Array,
     return rates(nominal, block.z, np.zeros_like(v)), rates(spread, psi, v)
 
 
-def _judged_in_doubt(block: Block, model: Envelope, known: Array, regimes: Regimes | None) -> Judged | None:
+def _judged_in_doubt(block: Block, model: Envelope, known: Array, cells: Cells | None) -> Judged | None:
     """`_judged` to the bit, from the transitions alone that the rounding of a faster arithmetic leaves in doubt.
 
     A transition that is inside, or narrower than the widest, by more than any order of the sums can differ is so by the
@@ -794,16 +811,16 @@ def _judged_in_doubt(block: Block, model: Envelope, known: Array, regimes: Regim
         The model, or a horizon.
     known : array (n,)
         Widths that were found already; transitions that are narrower need not be judged.
-    regimes : Regimes or None
-        The schedule of the model.
+    cells : Cells or None
+        How they are sorted, where the model has a schedule.
 
     Returns
     -------
     Judged or None
         None where the doubt is not worth the trouble; widths are 0 where none is larger than what was known.
     """
-    quick = _Quick.of(block, model, regimes)
-    block, error, half, widest, floor = quick.block, quick.error, quick.half, quick.widest, quick.floor
+    quick = _Quick.of(block, model, cells)
+    error, half, widest, floor = quick.error, quick.half, quick.widest, quick.floor
     if not np.isfinite(error).all():
         return None
     n, distance, relative = block.n, quick.distance, quick.relative
@@ -865,10 +882,10 @@ def envelope_sums(part: Partition, model: Envelope, stride: int) -> tuple[Array,
     total, products = np.zeros((2, n)), np.zeros((2, n, n))
     some: list[list[Array]] = [[], []]
     widths, largest = np.zeros((columns.count, n)), np.zeros((columns.count, n))
-    for block in _pieces(part):
-        quick = _Quick.of(block, model, columns.regimes)
+    for block, cells, ordered in _pieces_as_sorted(part):
+        quick = _Quick.of(ordered, model, cells)
         half = quick.half + quick.floor[:, None]
-        for k, where, there in () if quick.cells is None else quick.cells.main_parts():
+        for k, where, there in () if cells is None else cells.main_parts():
             own = 2.0 * half[:, where] * there
             widths[k] += own.sum(axis=1)
             largest[k] = np.maximum(largest[k], own.max(axis=1))

@@ -57,6 +57,7 @@ _HELD = 12
 _RIDGE = 1e-9
 """Share of the largest weight with which the ties of (11) hold on to the vertex where nothing else decides."""
 _TIES = (
+    (_ATTEMPTS[0], 2e-11),
     (_ATTEMPTS[0], 1e-10),
     (_ATTEMPTS[0], 4e-10),
     (_ATTEMPTS[0], 1e-9),
@@ -678,6 +679,7 @@ class Row:
         G, h = self._rows(self.pool) if box is None else self._distances(self.pool)
         kinds = 3 if box is None else 2
         number = kinds * np.tile(self.samples.index[self.pool], kinds) + np.repeat(np.arange(kinds), len(self.pool))
+        there = np.zeros((kinds, len(self.samples)), dtype=bool)  # rows that the simplex method has
         if self._simplex is None:  # of each sample the side that it is on, and its width
             self._simplex = self._minimax() if box is None else self._nearest()
             theta, d = self.scaled()
@@ -693,14 +695,17 @@ class Row:
             if len(idle):
                 self._simplex.drop(idle)
                 self._known = np.delete(self._known, idle - len(self.asked))
+        there[self._known % kinds, np.searchsorted(self.samples.index, self._known // kinds)] = True
+        others = ~there[:, self.pool].ravel()
         while True:  # of a sample few have more than one row that matters
-            wanted &= ~np.isin(number, self._known)
+            wanted &= others
             if wanted.any():
                 self._simplex.add(G[wanted], h[wanted])
                 self._known = np.concatenate([self._known, number[wanted]])
+                others &= ~wanted
             answer = self._simplex.solve()
             wanted = G @ answer - h < -TOLERANCE
-            if not (wanted & ~np.isin(number, self._known)).any():
+            if not (wanted & others).any():
                 break
         if box is not None:
             answer = np.concatenate([answer[:-1], box * answer[-1], answer[-1:]])
@@ -1054,6 +1059,7 @@ class Row:
         h = np.concatenate([h, limits, self.lower[low], -self.upper[high]])
         G, h = self._asked(np.vstack([G, rows, every[low], -every[high]]), h)
         h = np.minimum(h - G @ point, 0.0)  # the point satisfies them, but for rounding
+        count = len(h) - 3 * len(pool)
         anywhere = np.full(along.shape[1], np.inf)
         some = np.zeros(len(h))  # containment, and half-widths that may be 0; the limit has some room already
         some[: 2 * len(pool)] = 1.0
@@ -1061,15 +1067,28 @@ class Row:
         G, size = G @ along, np.linalg.norm(G, axis=1)
         moved = np.linalg.norm(G, axis=1) > 1e-9 * size  # the others are as they are in every optimum
         G, h, some = G[moved], h[moved], some[moved]
+        start = np.zeros(len(anywhere) + len(moved), dtype=np.int32)  # what was active among the rows last time
+        if "ties" in self._active:
+            known = self._active["ties"]
+            then = (len(known) - count) // 3
+            both = min(then, len(pool))  # the pool grows, but for discards
+            start[len(anywhere) :][: 3 * len(pool)].reshape(3, -1)[:, :both] = known[: 3 * then].reshape(3, -1)[
+                :, :both
+            ]
+            start[len(anywhere) + 3 * len(pool) :] = known[3 * then :]
+        start = start[np.concatenate([np.ones(len(anywhere), dtype=bool), moved])]
         for (factor, ridge), room in _TIES if len(anywhere) else ():
             h = np.minimum(h, -room * some)
             H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
             f, H = along.T @ (f + H @ point), along.T @ H @ along
             H += _RIDGE * float(np.diagonal(H).max()) * np.eye(len(f))
             try:
-                answer = solve_qp(H, f, G, h, -anywhere, anywhere, any_solver=False)
+                answer = solve_qp(H, f, G, h, -anywhere, anywhere, start, any_solver=False)
             except FitError:
                 continue
+            if answer.active is not None:
+                self._active["ties"] = np.zeros(len(moved), dtype=np.int32)
+                self._active["ties"][moved] = answer.active[len(anywhere) :]
             self.attempt = factor, ridge
             self._store_limited(np.append(point + along @ answer.xi, self.allowed))
             return answer.solver

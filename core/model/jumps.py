@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.limits import LARGEST
 
-_BLOCK = 1 << 14  # transitions that are looked at together: they stay in the cache
+_BLOCK = 1 << 11  # transitions that are looked at together: they stay in the cache
 
 
 def largest_steps(model: Any, transients: Iterable[Any]) -> Array:

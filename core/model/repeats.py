@@ -48,8 +48,8 @@ WINDOWS = 20
 """Windows that a share of them needs."""
 ACTIVE = 0.5
 """Share of the windows that may be less active than a machine that is called active; half of it where it was parked."""
-_BLOCK, _MOST = 1 << 16, 1 << 17  # transitions that are looked at together, and of one recording for its activity
-_SPREAD = 1 << 14  # transitions of each part that is looked at where a recording has more than that
+_BLOCK, _MOST = 1 << 16, 1 << 16  # transitions that are looked at together, and of one recording for its activity
+_SPREAD = 1 << 13  # transitions of each part that is looked at where a recording has more than that
 _DISTINCT = 4096  # values of a block that are compared with one another
 _TWICE = 1e-3  # share of them that may come twice: more do so by chance in a coarse sensor
 MORE_ACTIVE = 2.0
@@ -369,9 +369,7 @@ def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
     if len(t) > _MOST:
         begin, length = range(0, len(t) - _SPREAD + 1, (len(t) - _SPREAD) // (_MOST // _SPREAD - 1)), _SPREAD
     for a in begin:
-        chosen = np.zeros(len(t), dtype=bool)
-        chosen[a : a + length] = True
-        part, at = steps.take(chosen), t[a : a + length]
+        part, at = steps.take(slice(a, a + length)), t[a : a + length]
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             centre, half = np.empty((model.n, len(at))), np.empty((model.n, len(at)))
             z = model.normalised_columns(part)

@@ -60,13 +60,13 @@ class Transitions:
     x_next: Array
     s: Array
 
-    def take(self, which: NDArray[np.bool_]) -> Transitions:
+    def take(self, which: NDArray[np.bool_] | slice) -> Transitions:
         """Some of them.
 
         Parameters
         ----------
-        which : array of bool (N,)
-            Those that are wanted.
+        which : array of bool (N,) or slice
+            Those that are wanted; a slice is no copy.
 
         Returns
         -------
