@@ -45,8 +45,8 @@ def largest_steps(model: Any, transients: Iterable[Any]) -> Array:
             part = slice(a, a + _BLOCK)
             with np.errstate(over="ignore", invalid="ignore"):
                 change = steps.x_next[part] - steps.x[part]
-            np.abs(change, out=change)
-            largest = np.maximum(largest, change.max(axis=0, initial=0.0))
+            along = np.ascontiguousarray(change.T)  # numpy is slow at the maximum of short rows
+            largest = np.maximum(largest, np.abs(along, out=along).max(axis=1, initial=0.0))
     return np.asarray(np.minimum(largest / model.operating_point.X, LARGEST))
 
 
