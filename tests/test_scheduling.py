@@ -13,6 +13,7 @@ import argparse
 import inspect
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,16 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.free_run import free_run
-from uncertain_lti.proposal.scheduling import EXCESS, EXCESS_FOR_MUCH, WANTED, Candidate, best_of, choose_knots
+from uncertain_lti.proposal.scheduling import (
+    EXCESS,
+    EXCESS_FOR_MUCH,
+    WANTED,
+    Candidate,
+    Fold,
+    best_of,
+    choose_knots,
+    decide,
+)
 from uncertain_lti.proposal.suggestion import promise, suggest_schedule, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
 from uncertain_lti.validation.fitted_model import validate_model
@@ -130,6 +140,12 @@ def test_a_recording_unlike_all_others_excuses_nothing():
         assert worse.more_outside(base)[0] < worse.more_outside(base)[1]
         assert best_of([base, worse]) is base
     assert knots(4.0, 1100.0).excess(base) > EXCESS > knots(0.5, 900.0).excess(base)
+    trials = SimpleNamespace(fold=Fold(None, None, None, "recording"))
+    reason = decide("x1", [base, fine], trials).reason
+    assert (
+        "94.42% inside, where one knot has 95.46% (99.91% and 99.96% without the 1 of 10 parts that are unlike"
+        in reason
+    )
 
 
 @pytest.mark.parametrize(("outside", "width", "taken"), [(7, 0.5, True), (9, 0.5, False), (9, 0.2, True)])

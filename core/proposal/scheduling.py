@@ -587,7 +587,7 @@ def _reason(candidates: Sequence[Candidate], best: Candidate, chosen: Candidate)
         inside, one = f"{1 - chosen.share:.4g}", f"{1 - base.share:.4g}"
         text = (
             f"on left-out data the mean width is x {math.exp(chosen.width[0]):.2g} of one knot's, with "
-            f"{float(inside):.2%} inside, where one knot has {float(one):.2%}"
+            f"{float(inside):.2%} inside, where one knot has {float(one):.2%}{_like_words(chosen, base, inside=True)}"
         )
         if chosen is not best:
             text += f"; {best.count} knots, x {math.exp(best.width[0]):.2g}, are within its error"
@@ -605,7 +605,20 @@ def _reason(candidates: Sequence[Candidate], best: Candidate, chosen: Candidate)
     nearest = min(narrow, key=lambda c: c.excess(base))
     return (
         f"with {nearest.count} knots {nearest.share:.1%} of the left-out transitions are outside, where one knot has "
-        f"{base.share:.1%}"
+        f"{base.share:.1%}{_like_words(nearest, base, inside=False)}"
+    )
+
+
+def _like_words(candidate: Candidate, base: Candidate, inside: bool) -> str:
+    """The same two shares where only some left-out parts are like others."""
+    every, *likes = base.counted()
+    if not likes:
+        return ""
+    shares = [float(c.outside[likes[0]].sum() / c.judged[likes[0]].sum()) for c in (candidate, base)]
+    first, second = (f"{1 - share if inside else share:.2%}" for share in shares)
+    return (
+        f" ({first} and {second} without the {len(every) - int(likes[0].sum())} of {len(every)} parts that are unlike "
+        f"the others, of which one knot leaves over {UNLIKE:.0%} outside)"
     )
 
 
