@@ -46,7 +46,7 @@ from uncertain_lti.validation.part import judge
 CONFIDENCE = 0.9
 OURS = "ours"
 """Names of this project's rules begin with it."""
-SEVERAL = ("armed together", "as tuned")
+SEVERAL = ("armed together", "armed cautiously", "as tuned")
 """How the names of several rules at once end."""
 
 # --- thresholds, delays ---
@@ -85,9 +85,14 @@ def threshold_of(case: Case, score: Score, allowed: int) -> float:
     return float(np.sort(np.concatenate([score(runs).max(axis=1) for runs in case.learn]))[::-1][allowed])
 
 
-def evaluate(case: Case, score: Score) -> Outcome:
+def cautious(allowed: int) -> int:
+    """The most alarms on `learn` after which so many are, with that confidence, not exceeded on the same again."""
+    return max([k for k in range(allowed + 1) if chi2.ppf(CONFIDENCE, 2 * (k + 1)) / 2 <= allowed], default=0)
+
+
+def evaluate(case: Case, score: Score, allowed: int | None = None) -> Outcome:
     """Learn the threshold, count false alarms, find the delays."""
-    threshold = threshold_of(case, score, case.allowed)
+    threshold = threshold_of(case, score, case.allowed if allowed is None else allowed)
     largest = np.concatenate([score(runs).max(axis=1) for runs in case.healthy])
     peaks, delays, early = {}, {}, {}
     for label, faulty in case.faulty.items():

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from detection_cases import HORIZONS, Case
-from detection_procedure import CONFIDENCE, OURS, SEVERAL, Kind, Outcome, evaluate
+from detection_procedure import CONFIDENCE, OURS, SEVERAL, Kind, Outcome, cautious, evaluate
 from detectors import Array, Score
 from scipy.stats import beta
 
@@ -143,7 +143,7 @@ def judged(case: Case, detectors: Mapping[str, Score]) -> Report:
     """Every detector on the case."""
     outcomes = {}
     for name, score in detectors.items():
-        outcomes[name] = evaluate(case, score)
+        outcomes[name] = evaluate(case, score, cautious(case.allowed) if name.endswith("cautiously") else None)
         print(f"{case.title}: {name}: {outcomes[name].share():.3f}", file=sys.stderr, flush=True)
     return reported(case, outcomes)
 
