@@ -193,6 +193,7 @@ def archive_text(model: UncertainLTI) -> str:
             f"{plural(facts['solver']['passes'], 'pass')}",
             table(("one-step envelope", "mean width", "largest"), rows),
             *dynamics_text(model),
+            *(f"note: {message}" for message in facts.get("messages", [])),
         ]
     )
 
@@ -242,8 +243,8 @@ def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -
         )
     elif outside:
         worry = outside
-    elif facts.get("messages"):
-        worry = facts["messages"][0]
+    elif minded := [text for text in facts.get("messages", []) if "schedules nothing" not in text]:
+        worry = minded[0]
     elif facts["transients"] == 1:
         worry = "one recording says nothing of another day; check the model on one that was not fitted"
     else:
