@@ -251,7 +251,7 @@ def fit_horizons(
                 f"in a row, and {few} are needed; give shorter horizons, or longer recordings"
             )
             continue
-        largest = np.abs(windows.run).max(axis=1)
+        largest = np.maximum(windows.run.max(axis=1), -windows.run.min(axis=1))
         if not (largest <= LARGEST).all():
             name = model.state_names[int(np.argmax(~(largest <= LARGEST)))]
             messages.append(
@@ -260,9 +260,10 @@ def fit_horizons(
             )
             continue
         last = windows.last
+        unbroken = len(last) == int(last[-1]) - int(last[0]) + 1
         part = Problem(
             windows.z[:p],
-            problem.next_columns[:, last],
+            problem.next_columns[:, int(last[0]) : int(last[-1]) + 1] if unbroken else problem.next_columns[:, last],
             windows.time,
             problem.source[windows.start],
             problem.k[windows.start],
@@ -275,7 +276,7 @@ def fit_horizons(
         fixed = centre | (halves if kind == "constant" else {})
         structure = Structure(n, p - n, fixed=fixed) if fixed else None
         horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
-        move = np.abs(part.next_columns - part.z_columns[:n]).max(axis=1)
+        move = np.max([np.abs(block.x_next - block.z[:n]).max(axis=1) for block in part.blocks()], axis=0)
         if (0.5 * fact["mean_width"] > WIDER * move).all():
             messages.append(
                 f"no horizon of {windows.steps} steps: its envelope is wider than if every state stayed where it was "

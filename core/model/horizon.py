@@ -221,7 +221,7 @@ def windows_of(
         Of each length; good until the next one is asked for.
     """
     run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
-    done = 0
+    done, kept = 0, None
     for length in steps:
         judge.advance(run, time, control, z, dt, begin, done, length)
         done = length
@@ -229,11 +229,17 @@ def windows_of(
         start = last - (length - 1)
         whole = begin[last] <= start
         if whole.all():
-            part: Any = slice(0, len(start))
-        else:
-            part = start = start[whole]
-        mean = control[:, part] / time[part]
-        yield Windows(length, start, np.concatenate([z[:n, part], mean, vectors[:, part]]), run[:, part], time[part])
+            count = len(start)
+            if kept is None:  # of a window but its controls are the same for all lengths
+                kept = np.concatenate([z[:n], control, vectors])
+            np.divide(control[:, :count], time[:count], out=kept[n : n + m, :count])
+            yield Windows(length, start, kept[:, :count], run[:, :count], time[:count])
+            continue
+        start = start[whole]
+        mean = control[:, start] / time[start]
+        yield Windows(
+            length, start, np.concatenate([z[:n, start], mean, vectors[:, start]]), run[:, start], time[start]
+        )
 
 
 class Horizon:
