@@ -276,6 +276,15 @@ def test_the_least_largest_width_by_the_nominal_elements_alone(monkeypatch, addi
     assert outside_normalised(model, transient) == 0
 
 
+@pytest.mark.parametrize("weight", [1e-18, 1e18])
+def test_the_least_largest_width_whatever_the_weights(weight):
+    transient = drawn(THREE, 1000, 8, noise=1e-4)
+    plain = fit(transient, "lp", additive="noise", schedule=THREE)
+    weighted = fit(transient, "lp", additive="noise", schedule=THREE, weights=np.full(2, weight))
+    objective = np.asarray(weighted.fit_summary["objective"]) / np.sqrt(weight)
+    assert objective == pytest.approx(plain.fit_summary["objective"], rel=1e-7)
+
+
 def test_a_piecewise_linear_plant_is_recovered():
     transient = drawn(SCHEDULES["further"], 2000, 5, spread=0.0)
     rng = np.random.default_rng(5)

@@ -220,6 +220,7 @@ class Row:
         self.samples = Samples.join([], len(sums.low))
         self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
         self.limit: float | None = None  # δ of (11) in units of scale x width_unit
+        self._unit = 1.0  # of the δ that the nominal elements alone decide, in units of the limit
         self.allowed = 0.0  # δ that the ties may have, in the same units
         self.exact = sums.visits.size > 1  # (11) by the simplex method
         self.least = 0.0  # δ of (11) that it found, in the same units as the limit
@@ -676,6 +677,8 @@ class Row:
             There is no optimum.
         """
         box = self.box
+        if box is not None and self._simplex is None:
+            self._unit = float(np.median(self.width[self.pool]))
         G, h = self._rows(self.pool) if box is None else self._distances(self.pool)
         kinds = 3 if box is None else 2
         number = kinds * np.tile(self.samples.index[self.pool], kinds) + np.repeat(np.arange(kinds), len(self.pool))
@@ -708,7 +711,8 @@ class Row:
             if not (wanted & others).any():
                 break
         if box is not None:
-            answer = np.concatenate([answer[:-1], box * answer[-1], answer[-1:]])
+            delta = answer[-1] * self._unit
+            answer = np.concatenate([answer[:-1], box * delta, [delta]])
         self.least = float(answer[-1])
         self._store_limited(answer)
         return "HiGHS simplex"
@@ -740,8 +744,11 @@ class Row:
         return None
 
     def _distances(self, pool: Index) -> tuple[Array, Array]:
-        """G [θ δ] >= h: the centre of samples of the pool is no further from the next sample than δ allows."""
-        width = self.width[pool]
+        """G [θ δ] >= h: the centre of samples of the pool is no further from the next sample than δ allows.
+
+        δ is in units of order one, whatever the weights are.
+        """
+        width = self.width[pool] / self._unit
         unit = np.minimum(1.0, 1.0 / width)
         phi, y = self.phi[pool] * (width * unit)[:, None], self.y[pool] * width * unit
         sides = np.hstack([phi, unit[:, None]]), np.hstack([-phi, unit[:, None]])
@@ -1106,7 +1113,7 @@ class Row:
         if box is None:
             point, carrying = point[:-1], self._simplex.carrying()[:, :-1]
         else:
-            point = np.concatenate([point[:-1], box * point[-1]])
+            point = np.concatenate([point[:-1], box * (point[-1] * self._unit)])
             carrying = self._carrying_box()
         norm = np.linalg.norm(carrying, axis=1)
         _, values, right = np.linalg.svd(carrying[norm > 0.0] / norm[norm > 0.0, None])
