@@ -86,17 +86,15 @@ def run_of(problem: Problem, structure: Structure | None = None) -> Run:
     Run
         With one block for each of the schedule.
     """
-    rows = _started(problem, structure)
-    theta = np.column_stack([row.theta for row in rows]).reshape(problem.columns.count, -1, problem.n)
-    return _as_run(problem, theta)
+    return _as_run(problem, _started(problem, structure)[1])
 
 
-def _started(problem: Problem, structure: Structure | None) -> list[Row]:
-    """Rows with the elements by least squares of one step."""
-    rows = WorkingSet(Fleet.of(problem), structure).rows
+def _started(problem: Problem, structure: Structure | None) -> tuple[list[Row], Array]:
+    """Rows with the elements by least squares of one step, and these elements (blocks, q, n)."""
+    rows = list(WorkingSet(Fleet.of(problem), structure).rows)
     for row in rows:
         row.start()
-    return list(rows)
+    return rows, np.column_stack([row.theta for row in rows]).reshape(problem.columns.count, -1, problem.n)
 
 
 def _as_run(problem: Problem, theta: Array) -> Run:
@@ -137,7 +135,8 @@ def better_run(
         Whether its envelopes need a correction.
     """
     lengths = sorted(set(steps))
-    k, signals, dt, after = *_in_order(problem), problem.dt, problem.next_columns
+    order, signals = _in_order(problem)
+    k, dt, after = order, problem.dt, problem.next_columns
     piece = max(20 * lengths[-1], 1000)
     if len(dt) > _COMPARED:
         starts = np.linspace(0, len(dt) - piece, max(_COMPARED // piece, 1)).astype(np.intp)
@@ -156,8 +155,7 @@ def better_run(
             logs.append(np.log(np.maximum(np.abs(left).max(axis=0, initial=0.0), _ROUNDING)))
         return float(np.mean(logs)) if logs else 0.0
 
-    rows, order = _started(problem, structure), _in_order(problem)[0]
-    one = np.column_stack([row.theta for row in rows]).reshape(problem.columns.count, -1, problem.n)
+    rows, one = _started(problem, structure)
     found, corrected, nearest = None, True, distance(model)
     for several, theta in enumerate(_tried(problem, order, rows, one, lengths[-1])):
         if not np.isfinite(theta).all():

@@ -221,9 +221,9 @@ def windows_of(
         Of each length; good until the next one is asked for.
     """
     run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
-    done, kept = 0, None
+    done, kept, by_transition = 0, None, np.asfortranarray(z)  # as `advance` reads them
     for length in steps:
-        judge.advance(run, time, control, z, dt, begin, done, length)
+        judge.advance(run, time, control, by_transition, dt, begin, done, length)
         done = length
         last = np.arange(length - 1, len(dt))
         start = last - (length - 1)
