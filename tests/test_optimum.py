@@ -48,6 +48,15 @@ def test_no_fit_is_above_its_optimum(first):
     assert compared >= 14
 
 
+@pytest.mark.parametrize("seed", [9, 98, 108])
+def test_with_knots_where_the_first_centre_contains_every_sample(seed):
+    """Of `python benchmarks/optimum.py --knots`: the simplex method starts from no sample at all in some row."""
+    found = optimum.compare(optimum.with_knots(seed), "lp")
+    known = np.isfinite(found.excess)
+    assert found.error is None and known.any() and (found.excess[known] <= 1e-6).all()
+    assert found.gap >= found.true_gap - 2 * optimum.AGREE
+
+
 @pytest.mark.parametrize("seed, known", [(59, True), (304, True), (84, False), (399, False)])
 def test_rows_that_are_solved_in_turn_have_a_bound(seed, known):
     """Full weights, and by rounding the objective falls as some half-widths grow: without end, a slope would say."""

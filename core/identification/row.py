@@ -678,7 +678,7 @@ class Row:
         """
         box = self.box
         if box is not None and self._simplex is None:
-            self._unit = float(np.median(self.width[self.pool]))
+            self._unit = float(np.median(self.width[self.pool] if len(self.pool) else self.width))
         G, h = self._rows(self.pool) if box is None else self._distances(self.pool)
         kinds = 3 if box is None else 2
         number = kinds * np.tile(self.samples.index[self.pool], kinds) + np.repeat(np.arange(kinds), len(self.pool))
