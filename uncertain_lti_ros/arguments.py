@@ -51,20 +51,9 @@ class ArgumentError(UncertainLTIError):
 class Declared:
     """One parameter of a node.
 
-    Parameters
-    ----------
-    name : str
-        Its name.
-    default : str or bool or int or float
-        Its default, which gives the type.
-    text : str
-        What it means, for `--help` and `ros2 param describe`.
-    fixed : bool, default False
-        It can be given at the start only.
-    low : float, optional
-        Least value; None without a range.
-    high : float, optional
-        Greatest value; None without a range.
+    `name`: its name; `default`: its default, which gives the type; `text`: what it means, for `--help` and `ros2 param
+    describe`; `fixed`: it can be given at the start only; `low`: least value; None without a range; `high`: greatest
+    value; None without a range.
     """
 
     name: str
@@ -75,13 +64,7 @@ class Declared:
     high: float | None = None
 
     def descriptor(self) -> ParameterDescriptor:
-        """What `ros2 param describe` shows.
-
-        Returns
-        -------
-        ParameterDescriptor
-            With the range.
-        """
+        """What `ros2 param describe` shows."""
         descriptor = ParameterDescriptor(description=self.text, read_only=self.fixed)
         if self.low is not None and self.high is not None:
             if isinstance(self.default, int):
@@ -107,25 +90,7 @@ class Declared:
 
 
 def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
-    """Declare the parameters of a node.
-
-    Parameters
-    ----------
-    node : Node
-        The node.
-    parameters : iterable of Declared
-        To declare.
-
-    Returns
-    -------
-    dict
-        Name -> value.
-
-    Raises
-    ------
-    ArgumentError
-        A value of another type, or outside its range, was given.
-    """
+    """Declare the parameters of a node."""
     values = {}
     for parameter in parameters:
         given = node._parameter_overrides.get(parameter.name)
@@ -148,20 +113,7 @@ def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
 
 
 def whole_to_real(given: Parameter, default: object) -> Parameter:
-    """A parameter with its whole number as a real one, if a real one is meant; rclpy takes 2.0 there, and refuses 2.
-
-    Parameters
-    ----------
-    given : Parameter
-        As set by the user.
-    default : object
-        Its default; other types than a real number leave the parameter as it is.
-
-    Returns
-    -------
-    Parameter
-        Of the type of the default, if it was a whole number and a real one is meant.
-    """
+    """A parameter with its whole number as a real one, if a real one is meant; rclpy takes 2.0 there, and refuses 2."""
     if isinstance(default, float) and type(given.value) is int:
         return Parameter(given.name, value=float(given.value))
     return given
@@ -177,24 +129,6 @@ def run_node(
     """Run a node on some arguments.
 
     `--help` prints what the node is and its parameters.
-
-    Parameters
-    ----------
-    name : str
-        Of the program.
-    summary : str
-        What it is, for `--help`.
-    parameters : sequence of Declared
-        Of the node, for `--help`.
-    run : callable
-        Takes the arguments and returns the exit status.
-    args : sequence of str or None
-        Words of the command line; None for those of the process.
-
-    Returns
-    -------
-    int
-        Exit status; 2 for an UncertainLTIError, which is printed.
     """
     given = list(sys.argv[1:] if args is None else args)
     if "--help" in given or "-h" in given:
@@ -308,18 +242,7 @@ def _hold_value(flag: str, value: str) -> None:
 
 
 def in_words(error: Exception) -> str:
-    """One sentence from an error of rcl, which names lines of its own source.
-
-    Parameters
-    ----------
-    error : Exception
-        Of rcl.
-
-    Returns
-    -------
-    str
-        The sentence, with its remedy.
-    """
+    """One sentence from an error of rcl, which names lines of its own source."""
     text = re.sub(r",? at /\S+:\d+", "", " ".join(str(error).split()))
     text = re.sub(r"Error: error not set\W*", "", text).removeprefix("failed to initialize rcl: ").rstrip(". ")
     if typed := re.search(r"parameter '(\S+)' to '(.*)' of type '\w+', expecting type '(\w+)'", text):
@@ -344,18 +267,6 @@ def hold_overrides(node: Node, args: Sequence[str]) -> None:
     """Refuse parameters that were given and that the node does not have; log what may be meant for others.
 
     A name in a file that resembles none of this node's may belong to another node that shares the file.
-
-    Parameters
-    ----------
-    node : Node
-        With its parameters declared.
-    args : sequence of str
-        Words of the command line.
-
-    Raises
-    ------
-    ArgumentError
-        A name was given at the command line, or is nearly one of this node's.
     """
     overrides = node._parameter_overrides
     known = sorted(node._parameters)

@@ -49,40 +49,14 @@ _DISCOVERY = 1.5  # s in which the programs of a domain find each other
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti demo`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti demo`."""
     parser.add_argument("--output", metavar="FOLDER", default="demo-output", help="where model and figure are written")
     parser.add_argument("--rate", type=speed, default=4.0, metavar="R", help="speed of the player (default 4)")
     parser.add_argument("--json", action="store_true", help="print what came out as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    int
-        Exit status: 0 where the live verdicts are those of the offline check and the departure was seen, else 2.
-
-    Raises
-    ------
-    UncertainLTIError
-        A node does not answer, or another monitor runs in the same domain.
-    KeyboardInterrupt
-        A signal came.
-    BagError
-        The recordings are not there.
-    """
+    """Run the demo."""
     if args.json:
         with contextlib.redirect_stdout(io.StringIO()):
             status, data = _demo(args)

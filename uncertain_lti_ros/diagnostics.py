@@ -25,12 +25,7 @@ from uncertain_lti_ros.subscriptions import MatchedSubscription
 class Diagnostics:
     """Publisher of the node's reports.
 
-    Parameters
-    ----------
-    node : Node
-        Gives its name.
-    hardware_id : str
-        Of every status; empty for the node's name.
+    `node`: gives its name; `hardware_id`: of every status; empty for the node's name.
     """
 
     def __init__(self, node: Node, hardware_id: str) -> None:
@@ -45,17 +40,7 @@ class Diagnostics:
         return int(self._publisher.get_subscription_count())
 
     def publish(self, reports: Sequence[Report], stamp: Any, model: str) -> None:
-        """Publish one message.
-
-        Parameters
-        ----------
-        reports : sequence of Report
-            Of the monitor, and of each state.
-        stamp : builtin_interfaces.msg.Time
-            Of the message.
-        model : str
-            Path of the model file.
-        """
+        """Publish one message."""
         message = DiagnosticArray()
         message.header.stamp = stamp
         for report in reports:
@@ -72,28 +57,11 @@ class Diagnostics:
         self._publisher.publish(message)
 
     def wait(self, seconds: float) -> None:
-        """Wait until every reader has every report.
-
-        Parameters
-        ----------
-        seconds : float
-            How long at most, s.
-        """
+        """Wait until every reader has every report."""
         self._publisher.wait_for_all_acked(Duration(seconds=seconds))
 
     def problems(self, inputs: Mapping[str, MatchedSubscription]) -> list[str]:
-        """What keeps messages from coming, and what was lost since the last report.
-
-        Parameters
-        ----------
-        inputs : mapping of str to MatchedSubscription
-            By topic.
-
-        Returns
-        -------
-        list of str
-            One sentence each.
-        """
+        """What keeps messages from coming, and what was lost since the last report."""
         problems = []
         for topic, subscription in inputs.items():
             problems += subscription.problems
@@ -105,29 +73,12 @@ class Diagnostics:
         return problems
 
     def reported(self, inputs: Mapping[str, MatchedSubscription]) -> None:
-        """The counts so far have been reported.
-
-        Parameters
-        ----------
-        inputs : mapping of str to MatchedSubscription
-            By topic.
-        """
+        """The counts so far have been reported."""
         self._reported = {topic: (subscription.lost, subscription.late) for topic, subscription in inputs.items()}
 
 
 def input_values(inputs: Mapping[str, MatchedSubscription]) -> dict[str, str]:
-    """Counts and quality of service of subscriptions, for a report.
-
-    Parameters
-    ----------
-    inputs : mapping of str to MatchedSubscription
-        By topic.
-
-    Returns
-    -------
-    dict of str to str
-        Key -> text.
-    """
+    """Counts and quality of service of subscriptions, for a report."""
     found: dict[str, str] = {}
     for topic, subscription in inputs.items():
         found |= {

@@ -89,18 +89,8 @@ class EnvelopeMonitorNode(LifecycleNode):
     Several may be in one process, on one executor. `start` configures and activates; the program does that if
     `autostart` is true, others decide for themselves.
 
-    Parameters
-    ----------
-    name : str, optional
-        Of the node.
-    **options : Any
-        Of `rclpy.node.Node`: `namespace`, `parameter_overrides`, `context`, `cli_args`, `use_global_arguments` and
-        so on.
-
-    Raises
-    ------
-    ArgumentError
-        A parameter has a value that it cannot take.
+    `name`: of the node; `**options`: of `rclpy.node.Node`: `namespace`, `parameter_overrides`, `context`, `cli_args`,
+    `use_global_arguments` and so on.
     """
 
     def __init__(self, name: str = NAME, **options: Any) -> None:
@@ -146,13 +136,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @session.setter
     def session(self, session: Session | None) -> None:
-        """Judge by another.
-
-        Parameters
-        ----------
-        session : Session or None
-            None to stop.
-        """
+        """Judge by another."""
         self.intake.session = session
 
     @property
@@ -162,13 +146,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @active.setter
     def active(self, active: bool) -> None:
-        """Begin or cease to take messages.
-
-        Parameters
-        ----------
-        active : bool
-            Whether they are taken.
-        """
+        """Begin or cease to take messages."""
         self.intake.active = active
 
     # --- parameters ---
@@ -260,18 +238,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @_failures_noted
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load and check the model, and offer the outputs.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            Before the transition.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            FAILURE if the model or a parameter cannot be used.
-        """
+        """Load and check the model, and offer the outputs."""
         path = str(self.settings.value("model"))
         try:
             self.settings.requested_qos()
@@ -295,23 +262,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @_failures_noted
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Start with no sample and no verdict, and subscribe.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            Before the transition.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Of the node's own activation.
-
-        Raises
-        ------
-        ModelError
-            A parameter of the quality of service has an unknown value.
-        """
+        """Start with no sample and no verdict, and subscribe."""
         assert self.session is not None
         result = super().on_activate(state)
         self.session.restart(time.monotonic())
@@ -328,71 +279,27 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @_failures_noted
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop listening; no heartbeat is published from now on.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            Before the transition.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Of the node's own deactivation.
-        """
+        """Stop listening; no heartbeat is published from now on."""
         self._unsubscribe()
         self.get_logger().info("no longer active: no verdicts are given")
         return super().on_deactivate(state)
 
     @_failures_noted
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the model.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            Before the transition.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Of the node's own cleanup.
-        """
+        """Forget the model."""
         result = super().on_cleanup(state)
         self._release()
         return result
 
     @_failures_noted
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release all resources.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            Before the transition.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Of the node's own shutdown.
-        """
+        """Release all resources."""
         result = super().on_shutdown(state)
         self._release()
         return result
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release all resources; the node can be configured again.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            Before the transition.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            SUCCESS.
-        """
+        """Release all resources; the node can be configured again."""
         self.reason = "a transition failed unexpectedly; see the log"
         self.get_logger().error(self.reason)
         self._release()
@@ -415,15 +322,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- unexpected errors ---
 
     def note_failure(self, where: str, error: Exception) -> None:
-        """Count an unexpected error, log it, and put it into the next diagnostics; the node goes on.
-
-        Parameters
-        ----------
-        where : str
-            What was being done.
-        error : Exception
-            The error.
-        """
+        """Count an unexpected error, log it, and put it into the next diagnostics; the node goes on."""
         self.failures.note(where, error)
 
     # --- messages ---
@@ -658,18 +557,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until a signal ends it.
-
-    Parameters
-    ----------
-    args : list of str, optional
-        Words of the command line; None for those of the process.
-
-    Returns
-    -------
-    int
-        Exit status: 0 after a signal, 2 for arguments that the node cannot use, and if it is required and cannot start.
-    """
+    """Run the node until a signal ends it."""
     return run_node(NAME, _SUMMARY, PARAMETERS, _run, args)
 
 

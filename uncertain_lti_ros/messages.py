@@ -30,23 +30,7 @@ _NUMBERS = {
 
 @cache
 def message_class(type_name: str) -> Any:
-    """Class of a message type such as `sensor_msgs/msg/JointState`.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name or package/Name.
-
-    Returns
-    -------
-    type
-        The class.
-
-    Raises
-    ------
-    SignalError
-        The type's Python package is not installed, or has no such type.
-    """
+    """Class of a message type such as `sensor_msgs/msg/JointState`."""
     parts = type_name.split("/")
     package, name = parts[0], parts[-1]
     if not (len(parts) == 2 or (len(parts) == 3 and parts[1] == "msg")) or not (package and name.isidentifier()):
@@ -66,23 +50,7 @@ def message_class(type_name: str) -> Any:
 
 
 def live_fields(type_name: str) -> Mapping[str, FieldType]:
-    """Fields of an installed message type.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-
-    Returns
-    -------
-    mapping of str to FieldType
-        Field name -> FieldType.
-
-    Raises
-    ------
-    SignalError
-        The type is not installed.
-    """
+    """Fields of an installed message type."""
     described = message_class(type_name).get_fields_and_field_types()
     return {name: _field_type(text) for name, text in described.items()}
 
@@ -113,18 +81,7 @@ def _field_type(text: str) -> FieldType:
 
 
 def full_name(type_name: str) -> str:
-    """A type's name in full.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name or package/Name.
-
-    Returns
-    -------
-    str
-        As package/msg/Name.
-    """
+    """A type's name in full."""
     parts = type_name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
 
@@ -133,21 +90,6 @@ def definition(type_name: str) -> str:
     """Definition of an installed type and of all it uses, as MCAP's schema encoding `ros2msg` wants it.
 
     Constants and default values are not in it: a class does not hold them, and no reader of messages needs them.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-
-    Returns
-    -------
-    str
-        The text.
-
-    Raises
-    ------
-    SignalError
-        A type is not installed.
     """
     bodies: dict[str, str] = {}
     waiting = [full_name(type_name)]

@@ -21,25 +21,7 @@ from uncertain_lti.monitor.verdict_messages import NamedVector
 
 
 def sendable(names: Sequence[str], velocities: bool = False) -> NamedVector:
-    """Messages with some names, checked against what the middleware reads from them.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Of the states.
-    velocities : bool, default False
-        Whether `velocity` holds as many numbers as `position`, or none.
-
-    Returns
-    -------
-    NamedVector
-        To be filled in.
-
-    Raises
-    ------
-    ModelError
-        The middleware does not read the names as they are.
-    """
+    """Messages with some names, checked against what the middleware reads from them."""
     vector = NamedVector(names, velocities)
     numbers = [0.0] * len(names)
     same = JointState(name=list(names), position=numbers, velocity=numbers if velocities else [])

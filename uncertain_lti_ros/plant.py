@@ -53,18 +53,7 @@ class Plant(Node):
 
 
 def run(life: Life) -> int:
-    """Wait for subscribers, publish one transient, wait until it has been received.
-
-    Parameters
-    ----------
-    life : Life
-        Of a `Plant`.
-
-    Returns
-    -------
-    int
-        Exit status, as of `publish`.
-    """
+    """Wait for subscribers, publish one transient, wait until it has been received."""
     node = life.node
     assert isinstance(node, Plant)
     return publish(
@@ -84,26 +73,7 @@ def run(life: Life) -> int:
 def publish(
     life: Life, publishers: tuple[Publisher, Publisher], make: Callable[[], Transient], rate: float, wait: float
 ) -> int:
-    """Publish states and controls of a transient once both topics have subscribers.
-
-    Parameters
-    ----------
-    life : Life
-        Of the node.
-    publishers : (Publisher, Publisher)
-        Of states and controls.
-    make : callable
-        Makes the transient when subscribers are there.
-    rate : float
-        Speed, times real time.
-    wait : float
-        How long to wait for subscribers, s.
-
-    Returns
-    -------
-    int
-        Exit status: 2 where none came, else 0.
-    """
+    """Publish states and controls of a transient once both topics have subscribers."""
     node = life.node
     if not _subscribed(life, publishers, wait):
         if life.alive:
@@ -145,18 +115,7 @@ def _subscribed(life: Life, publishers: tuple[Publisher, ...], limit: float) -> 
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until its transient is over.
-
-    Parameters
-    ----------
-    args : list of str, optional
-        Words of the command line; None for those of the process.
-
-    Returns
-    -------
-    int
-        Exit status, as of `run_node`.
-    """
+    """Run the node until its transient is over."""
 
     def started(args: list[str]) -> int:
         with living(Plant, args) as life:

@@ -52,13 +52,7 @@ _REPEAT = 0.1  # s after which /clock, which is best effort, is sent again
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti play`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti play`."""
     parser.add_argument("bag", metavar="BAG", help="recording (MCAP file, or folder of a split one)")
     parser.add_argument("--rate", type=speed, metavar="R", help="speed, times real time (default 1)")
     parser.add_argument("--clock", action="store_true", help="publish /clock (log time) before each message")
@@ -86,25 +80,7 @@ class _Played:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play a recording to its end, or until a signal.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    int
-        Exit status: 0 at the end, 130 after SIGINT, 143 after SIGTERM.
-
-    Raises
-    ------
-    BagError
-        The recording or a topic is not there, or nothing in it can be played.
-    UncertainLTIError
-        The node of --lockstep is not there or does not take a message.
-    """
+    """Play a recording to its end, or until a signal."""
     hush(args.quiet)
     if args.lockstep and args.rate is not None:
         raise UncertainLTIError("--lockstep goes as fast as the node takes messages; leave out --rate")
@@ -243,22 +219,6 @@ def when_due(
     """Hand over each message at its time, never before, until `alive` returns False.
 
     The first is due at once; at most `crowd` messages a second go out, also while catching up.
-
-    Parameters
-    ----------
-    messages : iterable of RawMessage
-        In order of log time.
-    rate : float
-        Speed, times real time.
-    crowd : float
-        Messages a second at most.
-    alive : callable
-        Takes nothing; whether to go on.
-
-    Yields
-    ------
-    (RawMessage, float)
-        The message, and how late it is, s.
     """
     began = last = time.monotonic()
     first: int | None = None

@@ -29,12 +29,7 @@ POLL = 0.1
 class PolledEvents:
     """Event handlers of one publisher or subscription, outside the executor.
 
-    Parameters
-    ----------
-    node : Node
-        Owner of the entity.
-    entity : Publisher or Subscription
-        Just created: the executor has not seen it yet.
+    `node`: owner of the entity; `entity`: just created: the executor has not seen it yet.
     """
 
     def __init__(self, node: Node, entity: Publisher | Subscription) -> None:

@@ -43,12 +43,7 @@ class Life:
     is used, which delivers messages that arrive together in order of subscription. The multi-threaded one
     loses messages and is not used.
 
-    Parameters
-    ----------
-    node : Node
-        The node.
-    stop : list of int
-        Signals received; the list is filled in elsewhere.
+    `node`: the node; `stop`: signals received; the list is filled in elsewhere.
     """
 
     def __init__(self, node: Node, stop: list[int]) -> None:
@@ -76,24 +71,13 @@ class Life:
         return self._stop[0] if self._stop else None
 
     def spin_once(self, seconds: float = _LATENCY) -> None:
-        """Wait for work, and do it.
-
-        Parameters
-        ----------
-        seconds : float, optional
-            How long at most, s; never longer than the default.
-        """
+        """Wait for work, and do it."""
         self.executor.spin_once(timeout_sec=min(seconds, _LATENCY))
 
     def spin(self, note: Callable[[str, Exception], None]) -> None:
         """Work until the end; an error that a callback lets through is noted, and the work goes on.
 
         The node must have a timer: a signal is handled only when Python runs.
-
-        Parameters
-        ----------
-        note : callable
-            Takes where an error came from, and the error.
         """
         while self.alive:
             self._end = Future(executor=self.executor)
@@ -130,24 +114,6 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
 
     Fast DDS 2.14 waits for ever for its own listeners when a participant is destroyed while it comes to know another.
     After a signal SIGALRM then ends the process, as no Python runs meanwhile.
-
-    Parameters
-    ----------
-    make_node : callable
-        Makes the node.
-    args : list of str, optional
-        ROS arguments.
-
-    Yields
-    ------
-    Life
-        Of the node, until the block ends.
-
-    Raises
-    ------
-    ArgumentError
-        An argument, or a setting of the middleware, cannot be used; or a parameter is given that the node does not
-        have, or a value that it cannot take.
     """
     args = list(args or [])
     stop: list[int] = []

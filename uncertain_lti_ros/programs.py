@@ -19,35 +19,17 @@ _BAD_USAGE, _FAULT, _INTERRUPTED = 2, 70, 130
 
 
 def envelope_monitor() -> int:
-    """The live monitor.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """The live monitor."""
     return _run("envelope_monitor")
 
 
 def plant() -> int:
-    """The published engine.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """The published engine."""
     return _run("plant")
 
 
 def turbofan() -> int:
-    """The nonlinear engine.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """The nonlinear engine."""
     return _run("turbofan")
 
 

@@ -36,25 +36,9 @@ _LAST_WORDS = 1.0  # s that the end waits until readers have the last messages
 class OutputPublisher:
     """One topic of the node, and how many listen to it; takes serialised messages.
 
-    Parameters
-    ----------
-    node : LifecycleNode
-        The node.
-    kind : type
-        Message class.
-    name : str
-        Of the topic, below the node's.
-    qos : QoSProfile
-        What is offered.
-    changed : callable
-        Called when there are more or fewer listeners.
-
-    Attributes
-    ----------
-    send : callable
-        Publishes the bytes of a message.
-    poll : callable
-        Reads the events of the middleware.
+    `node`: the node; `kind`: message class; `name`: of the topic, below the node's; `qos`: what is offered; `changed`:
+    called when there are more or fewer listeners; `send`: publishes the bytes of a message; `poll`: reads the events of
+    the middleware.
     """
 
     def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile, changed: Callable[[], None]) -> None:
@@ -75,13 +59,7 @@ class OutputPublisher:
 
     @listeners.setter
     def listeners(self, count: int) -> None:
-        """Take another number.
-
-        Parameters
-        ----------
-        count : int
-            Subscriptions.
-        """
+        """Take another number."""
         self._listeners = count
         self._changed()
 
@@ -89,13 +67,7 @@ class OutputPublisher:
         self.listeners = event.current_count
 
     def destroy(self, patience: float) -> None:
-        """Stop publishing, once every reliable reader has everything.
-
-        Parameters
-        ----------
-        patience : float
-            How long that is waited for at most, s.
-        """
+        """Stop publishing, once every reliable reader has everything."""
         if self._listeners:
             self._publisher.wait_for_all_acked(Duration(seconds=patience))
         self._events.destroy()
@@ -105,19 +77,8 @@ class OutputPublisher:
 class Outputs:
     """The publishers of all `OUTPUTS`.
 
-    Parameters
-    ----------
-    node : LifecycleNode
-        The node.
-    now : float
-        Steady time, s.
-
-    Attributes
-    ----------
-    sender : Sender
-        Publishes on them.
-    publishers : dict of str to OutputPublisher
-        By name of the output; empty while the node is not configured.
+    `node`: the node; `now`: steady time, s; `sender`: publishes on them; `publishers`: by name of the output; empty
+    while the node is not configured.
     """
 
     def __init__(self, node: LifecycleNode, now: float) -> None:
@@ -126,13 +87,7 @@ class Outputs:
         self.publishers: dict[str, OutputPublisher] = {}
 
     def open(self, heartbeat: float) -> None:
-        """Make the publishers.
-
-        Parameters
-        ----------
-        heartbeat : float
-            Deadline that ~/violation offers, s.
-        """
+        """Make the publishers."""
         qos = QoSProfile(depth=_OUTPUT_DEPTH)
         beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=heartbeat))
         kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -144,13 +99,7 @@ class Outputs:
         self.sender.open(self.publishers)
 
     def prepare(self, session: Session) -> None:
-        """Lay out the messages of a model and its alarm.
-
-        Parameters
-        ----------
-        session : Session
-            Has both.
-        """
+        """Lay out the messages of a model and its alarm."""
         model = session.model
         self.sender.prepare(VerdictMessages(model.state_names, sendable, model.steps, session.monitor.alarms.names))
 

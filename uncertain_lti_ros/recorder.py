@@ -36,13 +36,7 @@ _CHUNK = 1 << 20  # bytes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti record`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti record`."""
     parser.add_argument("topics", nargs="+", metavar="TOPIC", help="topic to record; waited for until it is there")
     parser.add_argument("--output", "-o", required=True, metavar="BAG", help="MCAP file to write; must not exist yet")
     parser.add_argument("--duration", type=seconds, metavar="S", help="stop S seconds after the first message")
@@ -59,23 +53,6 @@ def run(args: argparse.Namespace) -> int:
     """Record until SIGINT, SIGTERM or the end of the duration; the file is whole or not there.
 
     While recording it is called BAG.part, with all but the last seconds readable.
-
-    Parameters
-    ----------
-    args : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    BagError
-        The output exists or cannot be written, a topic never came, or nothing was recorded.
-    SignalError
-        The message type of a topic is not installed.
     """
     hush(args.quiet)
     output = Path(args.output)

@@ -34,31 +34,7 @@ _type_fields = cache(live_fields)
 
 
 def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | None = None) -> Session:
-    """Load a model file, and start a session with it.
-
-    Parameters
-    ----------
-    path : str
-        Of the file.
-    rule : Rule
-        The alarm rule.
-    settings : Settings
-        Of the node; messages over its `largest_message` are not read.
-    arming : Arming, optional
-        Of the session before.
-
-    Returns
-    -------
-    Session
-        With no sample.
-
-    Raises
-    ------
-    ModelError
-        There is no such file, it is no model, or the rule does not fit it.
-    SignalError
-        A field is not in its type, or the model does not state how samples are cut.
-    """
+    """Load a model file, and start a session with it."""
     if not path:
         raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")
     file = Path(path).expanduser()  # no shell does that behind :=

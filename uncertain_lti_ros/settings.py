@@ -29,15 +29,7 @@ MIB = 1 << 20
 class Settings:
     """What the parameters of a node are set to.
 
-    Parameters
-    ----------
-    node : Node
-        Its parameters are declared.
-
-    Attributes
-    ----------
-    largest_message : int
-        Bytes of the largest message that is read.
+    `node`: its parameters are declared; `largest_message`: bytes of the largest message that is read.
     """
 
     def __init__(self, node: Node) -> None:
@@ -46,50 +38,17 @@ class Settings:
         self.largest_message = self.size("largest_message")
 
     def value(self, name: str) -> Any:
-        """A parameter as it is set.
-
-        Parameters
-        ----------
-        name : str
-            Of the parameter.
-
-        Returns
-        -------
-        object
-            Of the type that was declared.
-        """
+        """A parameter as it is set."""
         return self._node.get_parameter(name).value
 
     def real(self, name: str) -> float:
-        """A parameter that is a number.
-
-        Parameters
-        ----------
-        name : str
-            Of the parameter.
-
-        Returns
-        -------
-        float
-            In the parameter's own unit.
-        """
+        """A parameter that is a number."""
         if name not in self._reals:  # a call of rclpy takes 10 µs
             self._reals[name] = float(self._node.get_parameter(name).value)
         return self._reals[name]
 
     def size(self, name: str) -> int:
-        """A parameter that is a size in MiB.
-
-        Parameters
-        ----------
-        name : str
-            Of the parameter.
-
-        Returns
-        -------
-        int
-            Bytes.
-        """
+        """A parameter that is a size in MiB."""
         return round(self.real(name) * MIB)
 
     def changed(self) -> None:
@@ -98,33 +57,11 @@ class Settings:
         self.largest_message = self.size("largest_message")
 
     def rule(self, changes: dict[str, Any]) -> Rule:
-        """The alarm rule that the parameters define.
-
-        Parameters
-        ----------
-        changes : dict
-            Parameters of the rule that are about to be set, and their values.
-
-        Returns
-        -------
-        Rule
-            With these changes.
-        """
+        """The alarm rule that the parameters define."""
         return Rule(**{name: changes.get(name, self.value(name)) for name in RULE})
 
     def requested_qos(self) -> RequestedQos:
-        """The quality of service that the parameters request.
-
-        Returns
-        -------
-        RequestedQos
-            Of every subscription to a topic of the model.
-
-        Raises
-        ------
-        ModelError
-            A parameter of the quality of service has an unknown value.
-        """
+        """The quality of service that the parameters request."""
         chosen: dict[str, Any] = {}
         for name, known in (("reliability", RELIABILITY), ("durability", DURABILITY)):
             text = self.value(f"qos.{name}")
@@ -134,18 +71,7 @@ class Settings:
         return RequestedQos(self.value("qos.depth"), **chosen)
 
     def topic_prefix(self) -> str:
-        """What is put before every topic of the model.
-
-        Returns
-        -------
-        str
-            Without a slash at its end; empty for nothing.
-
-        Raises
-        ------
-        ModelError
-            It is no name of a topic.
-        """
+        """What is put before every topic of the model."""
         prefix = str(self.value("topic_prefix")).rstrip("/")
         try:
             if prefix:
@@ -157,18 +83,7 @@ class Settings:
         return prefix
 
     def check_snapshots(self, on_alarm: bool) -> None:
-        """Refuse snapshots on an alarm without a folder for them.
-
-        Parameters
-        ----------
-        on_alarm : bool
-            Whether alarms trigger snapshots.
-
-        Raises
-        ------
-        ModelError
-            There is no folder.
-        """
+        """Refuse snapshots on an alarm without a folder for them."""
         if on_alarm and not self.value("snapshot.folder"):
             raise ModelError(
                 "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the "

@@ -29,17 +29,8 @@ _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 class Snapshots:
     """The last seconds of a node, written to a file when a service asks for it or after an alarm.
 
-    Parameters
-    ----------
-    node : Node
-        Gives its name and its topics.
-    settings : Settings
-        The parameters `snapshot.*` of the node.
-
-    Attributes
-    ----------
-    recent : Recent or None
-        The messages in memory; None while there is no folder to write to, or no session.
+    `node`: gives its name and its topics; `settings`: the parameters `snapshot.*` of the node; `recent`: the messages
+    in memory; None while there is no folder to write to, or no session.
     """
 
     def __init__(self, node: Node, settings: Settings) -> None:
@@ -50,13 +41,7 @@ class Snapshots:
         self._alarmed = -math.inf  # when an alarm was last over
 
     def open(self) -> None:
-        """Keep messages from now on, if there is a folder to write to.
-
-        Raises
-        ------
-        ModelError
-            The folder cannot be written to, or is missing and alarms ask for snapshots.
-        """
+        """Keep messages from now on, if there is a folder to write to."""
         folder = str(self._settings.value("snapshot.folder"))
         self._settings.check_snapshots(self._settings.value("snapshot.on_alarm"))
         if folder:
@@ -66,13 +51,7 @@ class Snapshots:
             self.recent = Recent(self._settings.real("snapshot.seconds"), self._settings.size("snapshot.memory"))
 
     def close(self, session: Session | None) -> None:
-        """Write what is due, and forget all messages.
-
-        Parameters
-        ----------
-        session : Session, optional
-            The session that ends.
-        """
+        """Write what is due, and forget all messages."""
         if self._due is not None and session is not None:
             self._take_due(session)
         if self._album is not None:
@@ -85,28 +64,14 @@ class Snapshots:
             self.recent.clear()
 
     def add(self, entry: Entry, raised: bool) -> None:
-        """Keep one more message; call it while `recent` is not None.
-
-        Parameters
-        ----------
-        entry : Entry
-            The latest.
-        raised : bool
-            Whether it raised the alarm.
-        """
+        """Keep one more message; call it while `recent` is not None."""
         assert self.recent is not None
         self.recent.add(entry)
         if raised and self._due is None and self._is_first_alarm(entry.now):
             self._due = entry.now + self._settings.real("snapshot.after")
 
     def alarm_over(self, now: float) -> None:
-        """The alarm is over.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-        """
+        """The alarm is over."""
         self._alarmed = now
 
     def _is_first_alarm(self, now: float) -> bool:
@@ -114,13 +79,7 @@ class Snapshots:
         return now - self._alarmed >= self._settings.real("snapshot.seconds")
 
     def write_due(self, session: Session) -> None:
-        """Begin to write the snapshot of an alarm, if it is due.
-
-        Parameters
-        ----------
-        session : Session
-            The session.
-        """
+        """Begin to write the snapshot of an alarm, if it is due."""
         if self._due is not None and time.monotonic() >= self._due:
             self._take_due(session)
 
@@ -136,23 +95,7 @@ class Snapshots:
                 self._node.get_logger().error(str(error))
 
     def write(self, session: Session | None) -> str:
-        """Write the last seconds to a file.
-
-        Parameters
-        ----------
-        session : Session, optional
-            The session, if there is one.
-
-        Returns
-        -------
-        str
-            The outcome, a sentence.
-
-        Raises
-        ------
-        ModelError
-            There is no folder, nothing to write, or writing failed; states the reason.
-        """
+        """Write the last seconds to a file."""
         if self._album is None or session is None:
             if self._settings.value("snapshot.folder"):
                 raise ModelError("the node is not configured, so there is nothing to write")

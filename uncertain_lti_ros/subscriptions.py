@@ -36,14 +36,8 @@ _NEVER_NS = 2**62
 class RequestedQos:
     """Quality of service that a user requests for subscriptions.
 
-    Parameters
-    ----------
-    depth : int, optional
-        Messages kept until they are taken.
-    reliability : ReliabilityPolicy or None, optional
-        None for what the publishers offer.
-    durability : DurabilityPolicy or None, optional
-        None for what the publishers offer.
+    `depth`: messages kept until they are taken; `reliability`: none for what the publishers offer; `durability`: none
+    for what the publishers offer.
     """
 
     depth: int = DEPTH
@@ -56,20 +50,6 @@ def choose_qos(offers: Iterable[QoSProfile], requested: RequestedQos, history: b
 
     Reliable only if every publisher is, transient local only if every publisher is; without any, reliable and volatile.
     The deadline is the longest that publishers offer, and none where one of them offers none.
-
-    Parameters
-    ----------
-    offers : iterable of QoSProfile
-        Of the publishers.
-    requested : RequestedQos
-        Takes precedence over what they offer.
-    history : bool, default True
-        Whether messages sent before may be requested; if some were received, that would repeat them.
-
-    Returns
-    -------
-    QoSProfile
-        To subscribe with.
     """
     offers = list(offers)
     reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
@@ -88,20 +68,7 @@ def choose_qos(offers: Iterable[QoSProfile], requested: RequestedQos, history: b
 
 
 def incompatible(asked: QoSProfile, offered: QoSProfile) -> list[str]:
-    """What is requested and a publisher does not offer, in words.
-
-    Parameters
-    ----------
-    asked : QoSProfile
-        By the subscription.
-    offered : QoSProfile
-        By the publisher.
-
-    Returns
-    -------
-    list of str
-        One entry per policy.
-    """
+    """What is requested and a publisher does not offer, in words."""
     found = []
     if asked.reliability == ReliabilityPolicy.RELIABLE != offered.reliability:
         found.append("reliability: best effort is offered, reliable asked")
@@ -118,31 +85,11 @@ def _policies(qos: QoSProfile) -> tuple[Any, ...]:
 class MatchedSubscription:
     """Subscription to one topic whose QoS `look` compares with the graph.
 
-    Parameters
-    ----------
-    node : Node
-        The node.
-    topic : str
-        As in the model or on the command line; expanded and remapped by the node.
-    type_name : str
-        `pkg/msg/Type`.
-    message_class : type
-        Class of the type.
-    callback : callable
-        Takes the message, or its bytes when raw.
-    requested : RequestedQos, optional
-        What the user requests.
-    raw : bool, default False
-        Whether the callback takes bytes.
-
-    Attributes
-    ----------
-    received, lost, late : int
-        Messages received, those that the middleware reports as lost, and deadlines missed by publishers.
-    publishers : int
-        Publishers of this type that the graph knows.
-    problems : list of str
-        Publishers that cannot be heard and why, one sentence each.
+    `node`: the node; `topic`: as in the model or on the command line; expanded and remapped by the node; `type_name`:
+    `pkg/msg/Type`; `message_class`: class of the type; `callback`: takes the message, or its bytes when raw;
+    `requested`: what the user requests; `raw`: whether the callback takes bytes; `received, lost, late`: messages
+    received, those that the middleware reports as lost, and deadlines missed by publishers; `publishers`: publishers of
+    this type that the graph knows; `problems`: publishers that cannot be heard and why, one sentence each.
     """
 
     def __init__(

@@ -18,59 +18,25 @@ _hushed = False
 
 
 def hush(wanted: bool) -> None:
-    """Suppress messages to the terminal from here on, or allow them again.
-
-    Parameters
-    ----------
-    wanted : bool
-        Whether to suppress them.
-    """
+    """Suppress messages to the terminal from here on, or allow them again."""
     global _hushed
     _hushed = wanted
 
 
 def say(text: str) -> None:
-    """Remark to the person who waits, apart from the result.
-
-    Parameters
-    ----------
-    text : str
-        One line.
-    """
+    """Remark to the person who waits, apart from the result."""
     if not _hushed:
         print(text, file=sys.stderr, flush=True)
 
 
 def tell(text: str) -> None:
-    """Part of the result.
-
-    Parameters
-    ----------
-    text : str
-        One line.
-    """
+    """Part of the result."""
     if not _hushed:
         print(text, flush=True)
 
 
 def seconds(text: str) -> float:
-    """Parse an argument that is a time: a finite number, 0 or more.
-
-    Parameters
-    ----------
-    text : str
-        The argument.
-
-    Returns
-    -------
-    float
-        Seconds.
-
-    Raises
-    ------
-    ArgumentTypeError
-        It is not a time.
-    """
+    """Parse an argument that is a time: a finite number, 0 or more."""
     value = _number(text)
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is not a time; give seconds, 0 or more")
@@ -78,23 +44,7 @@ def seconds(text: str) -> float:
 
 
 def speed(text: str) -> float:
-    """Parse an argument that is a speed, times real time: a finite number above 0.
-
-    Parameters
-    ----------
-    text : str
-        The argument.
-
-    Returns
-    -------
-    float
-        The speed.
-
-    Raises
-    ------
-    ArgumentTypeError
-        It is not a speed.
-    """
+    """Parse an argument that is a speed, times real time: a finite number above 0."""
     value = _number(text)
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is not a speed; give a number above 0, such as 1 or 0.5")
@@ -116,13 +66,7 @@ class Progress:
         self._shown = 0.0
 
     def show(self, text: str) -> None:
-        """Show the text, at most five times a second.
-
-        Parameters
-        ----------
-        text : str
-            One line.
-        """
+        """Show the text, at most five times a second."""
         if self._terminal and time.monotonic() - self._shown > 0.2:
             self._shown = time.monotonic()
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)

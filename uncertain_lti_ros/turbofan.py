@@ -55,18 +55,7 @@ class Turbofan(Node):
 
 
 def run(life: Life) -> int:
-    """Simulate, wait for subscribers, publish, wait until all has been received.
-
-    Parameters
-    ----------
-    life : Life
-        Of a `Turbofan`.
-
-    Returns
-    -------
-    int
-        Exit status, as of `publish`.
-    """
+    """Simulate, wait for subscribers, publish, wait until all has been received."""
     node = life.node
     assert isinstance(node, Turbofan)
     start_ns = START_NS if node.simulated else node.get_clock().now().nanoseconds
@@ -75,18 +64,7 @@ def run(life: Life) -> int:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until its transient is over.
-
-    Parameters
-    ----------
-    args : list of str, optional
-        Words of the command line; None for those of the process.
-
-    Returns
-    -------
-    int
-        Exit status, as of `run_node`.
-    """
+    """Run the node until its transient is over."""
 
     def started(args: list[str]) -> int:
         with living(Turbofan, args) as life:

@@ -44,15 +44,7 @@ _why_not: dict[str, str] = {}
 
 
 def use_twin(module: dict[str, Any], names: Sequence[str]) -> None:
-    """Replace these names of a module by those of its compiled twin, if that can be used.
-
-    Parameters
-    ----------
-    module : dict
-        `globals()` of the module that calls, at its end.
-    names : sequence of str
-        What the twin provides in place of the module's own.
-    """
+    """Replace these names of a module by those of its compiled twin, if that can be used."""
     whole = module["__name__"]
     twin, reason = _twin(whole, Path(module["__file__"]))
     _why_not[whole] = reason
@@ -61,31 +53,14 @@ def use_twin(module: dict[str, Any], names: Sequence[str]) -> None:
 
 
 def why_not() -> str:
-    """What keeps the live chain from being compiled throughout, in words; empty if nothing does.
-
-    Returns
-    -------
-    str
-        The reason of the first module that is not compiled.
-    """
+    """What keeps the live chain from being compiled throughout, in words; empty if nothing does."""
     for name in MODULES:
         import_module(f"uncertain_lti.{name}")
     return next((f"{name.removeprefix('uncertain_lti.')}: {why}" for name, why in _why_not.items() if why), "")
 
 
 def uncompiled(name: str) -> ModuleType:
-    """A module of the package once more, without its twin, for comparison.
-
-    Parameters
-    ----------
-    name : str
-        One of `MODULES`.
-
-    Returns
-    -------
-    ModuleType
-        Its names are those of the module as it runs without a compiler.
-    """
+    """A module of the package once more, without its twin, for comparison."""
     found = import_module(f"uncertain_lti.{name}")
     spec = spec_from_file_location(f"{found.__name__}_uncompiled", found.__file__)
     assert spec is not None and spec.loader is not None

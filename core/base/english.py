@@ -19,20 +19,7 @@ LONGEST = 2000
 
 
 def printable(text: str, limit: int = LONGEST) -> str:
-    r"""A text that came from outside, for a terminal: one line, no control characters, not too long.
-
-    Parameters
-    ----------
-    text : str
-        Holds names out of files.
-    limit : int, default LONGEST
-        Letters that are shown; of a longer text the beginning and the end.
-
-    Returns
-    -------
-    str
-        Control characters and what is no letter at all are escaped, as `\x1b`.
-    """
+    r"""A text that came from outside, for a terminal: one line, no control characters, not too long."""
     text = _shortened(text, limit)
     if text.isprintable():
         return text
@@ -45,74 +32,22 @@ def _shortened(text: str, limit: int) -> str:
 
 
 def plural(count: object, word: str) -> str:
-    """A count and its noun: 1 state, 2 states, 0 states; 1 pass, 2 passes.
-
-    Parameters
-    ----------
-    count : object
-        What is counted; 1 takes the singular.
-    word : str
-        The noun in the singular; of several words the last is inflected.
-
-    Returns
-    -------
-    str
-        The count, a space and the noun.
-    """
+    """A count and its noun: 1 state, 2 states, 0 states; 1 pass, 2 passes."""
     return f"{count} {word}" if count == 1 else f"{count} {_several(word)}"
 
 
 def times(count: int) -> str:
-    """Once, or how many times.
-
-    Parameters
-    ----------
-    count : int
-        How often something happened.
-
-    Returns
-    -------
-    str
-        `once`, or `3 times`.
-    """
+    """Once, or how many times."""
     return "once" if count == 1 else f"{count} times"
 
 
 def shortlist(names: Sequence[str], limit: int) -> str:
-    """The first names, and how many more there are.
-
-    Parameters
-    ----------
-    names : sequence of str
-        All names, in the order in which they are shown.
-    limit : int
-        Names shown at most.
-
-    Returns
-    -------
-    str
-        The first names with commas between, and how many more there are.
-    """
+    """The first names, and how many more there are."""
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
 def meant(word: object, known: Iterable[str], most: int = 3) -> str:
-    """(is X meant?), with the known names that are near to a word, or nothing.
-
-    Parameters
-    ----------
-    word : object
-        What was written; compared as text, without regard to case.
-    known : iterable of str
-        The names that exist.
-    most : int, default 3
-        Names at most.
-
-    Returns
-    -------
-    str
-        ` (is X meant?)` with the names near to the word, or an empty text.
-    """
+    """(is X meant?), with the known names that are near to a word, or nothing."""
     names = {name.lower(): name for name in sorted(known)}
     near = difflib.get_close_matches(str(word).lower(), names, n=most, cutoff=0.65 if most == 1 else 0.7)
     return f" (is {' or '.join(names[n] for n in near)} meant?)" if near else ""

@@ -45,26 +45,7 @@ class FitError(UncertainLTIError):
 
 
 def refuse_other(value: object, kind: type | tuple[type, ...], what: str, instead: str, error: type[Exception]) -> None:
-    """Refuse a value of another type than the one asked for.
-
-    Parameters
-    ----------
-    value : object
-        What was given.
-    kind : type or tuple of type
-        What is asked for.
-    what : str
-        Name of the argument.
-    instead : str
-        What to give.
-    error : type
-        The error to raise.
-
-    Raises
-    ------
-    Exception
-        Of the type `error`; the value is of another type.
-    """
+    """Refuse a value of another type than the one asked for."""
     if not isinstance(value, kind):
         of = "None" if value is None else f"of type {type(value).__name__}"
         raise error(f"{what} is {of}; {instead}")

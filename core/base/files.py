@@ -32,21 +32,6 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     Whatever ends the block early, Ctrl-C included, leaves what was there before. What is no file, such as /dev/null
     or a pipe, is written to in place; a link keeps pointing where it does.
-
-    Parameters
-    ----------
-    path : path
-        The file to write.
-
-    Yields
-    ------
-    binary stream
-        Open for writing; a temporary file in the same folder, renamed to `path` at the end of the block.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
     """
     if os.path.exists(path) and not os.path.isfile(path):
         with open(path, "wb") as stream:
@@ -71,39 +56,12 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def natural(path: Path) -> tuple[tuple[int, str], ...]:
-    """Sort key that puts `bag_2` before `bag_10`.
-
-    Parameters
-    ----------
-    path : Path
-        A file.
-
-    Returns
-    -------
-    tuple of object
-        To be compared with that of another file.
-    """
+    """Sort key that puts `bag_2` before `bag_10`."""
     return tuple((int(text), "") if text.isdigit() else (-1, text) for text in re.split(r"(\d+)", path.name))
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
-    """Checksum of a file's content.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-
-    Returns
-    -------
-    str
-        The SHA-256 in hexadecimal digits.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    """
+    """Checksum of a file's content."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -112,18 +70,6 @@ def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
     """Whether nothing is lost at this path when a file is written there that has such words in its first 500 bytes.
 
     So it is where there is nothing yet, and where an older file of the same kind is; a folder is not looked at.
-
-    Parameters
-    ----------
-    path : path
-        The file that is to be written.
-    holds : bytes
-        Words that every file of the kind has in its first 500 bytes.
-
-    Returns
-    -------
-    bool
-        True where nothing can be read, and where an older file of the same kind is; False where any other file is.
     """
     try:
         with open(path, "rb") as stream:
@@ -135,27 +81,6 @@ def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
 
 def target(output: str | os.PathLike[str], *, holds: bytes, kind: str, example: str) -> Path:
     """Where a file of a kind goes, that holds such words (`may_replace`); an older one is replaced, and nothing else.
-
-    Parameters
-    ----------
-    output : path
-        The path that was asked for.
-    holds : bytes
-        Words that every file of the kind has in its first 500 bytes.
-    kind : str
-        Name of the kind, for the error.
-    example : str
-        File name that the error suggests when `output` is a folder.
-
-    Returns
-    -------
-    Path
-        The path asked for.
-
-    Raises
-    ------
-    BagError
-        Something else is there, or its folder is not.
     """
     path = Path(output)
     if not path.parent.is_dir():
@@ -168,19 +93,7 @@ def target(output: str | os.PathLike[str], *, holds: bytes, kind: str, example: 
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """What a file is by its first bytes, with an article: a recording, a model, signals; "" where that is not known.
-
-    Parameters
-    ----------
-    path : path
-        A file or a folder.
-
-    Returns
-    -------
-    str
-        `a folder`, `an MCAP recording`, `a recorded bag`, `a model file`, `a signals file`, or an empty text where the
-        kind is unknown.
-    """
+    """What a file is by its first bytes, with an article: a recording, a model, signals; "" where that is not known."""
     if os.path.isdir(path):
         return "a folder"
     try:

@@ -23,22 +23,6 @@ def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]
     """A plain table, which scrolls where it is wide; every text is escaped.
 
     The first column is aligned to the left, the others to the right.
-
-    Parameters
-    ----------
-    caption : str
-        Heading of the table, in bold.
-    header : sequence of str
-        Names of the columns.
-    rows : iterable of sequence of str
-        Cells of each row, as many as `header` has.
-    below : sequence of str, optional
-        Lines under the table, optional.
-
-    Returns
-    -------
-    str
-        HTML; every text in it is escaped.
     """
     head = "".join(f"<th style='{_style(i)}'>{escape(cell)}</th>" for i, cell in enumerate(header))
     body = "".join(
@@ -57,34 +41,10 @@ def _style(column: int) -> str:
 
 
 def number_text(value: float | None) -> str:
-    """Four digits; a dash where there is no finite number.
-
-    Parameters
-    ----------
-    value : float or None
-        The number; None where there is none.
-
-    Returns
-    -------
-    str
-        Four significant digits, or a dash.
-    """
+    """Four digits; a dash where there is no finite number."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.4g}"
 
 
 def name_with_unit(name: str, unit: str) -> str:
-    """`name [unit]`, or the name alone where there is no unit.
-
-    Parameters
-    ----------
-    name : str
-        Name of a signal.
-    unit : str
-        Its unit, or an empty text.
-
-    Returns
-    -------
-    str
-        `name [unit]`, or `name`.
-    """
+    """`name [unit]`, or the name alone where there is no unit."""
     return f"{name} [{unit}]" if unit else name

@@ -29,14 +29,7 @@ _LONGEST_LINE = 20_000  # letters of a result
 class CountedStep(str):
     """A line of progress that also holds which of how many steps it is about.
 
-    Parameters
-    ----------
-    text : str
-        The line.
-    number : int
-        Which step begins, from 1.
-    total : int
-        Number of steps.
+    `text`: the line; `number`: which step begins, from 1; `total`: number of steps.
     """
 
     def __new__(cls, text: str, number: int, total: int) -> CountedStep:  # noqa: D102
@@ -52,14 +45,8 @@ class Progress:
     `iterate` gives what `read_transients(progress=)` takes, `stage` what `fit(progress=)`, `validate(progress=)` and
     `fit_archive(progress=)` take. As a context it takes its bars away however the block ends.
 
-    Parameters
-    ----------
-    quiet : bool
-        Say nothing.
-    verbose : bool
-        Say every line that a stage is given, with the time since this object was made, also where no terminal is.
-    stream : text stream, optional
-        Default standard error.
+    `quiet`: say nothing; `verbose`: say every line that a stage is given, with the time since this object was made,
+    also where no terminal is; `stream`: default standard error.
     """
 
     def __init__(self, quiet: bool = False, verbose: bool = False, stream: TextIO | None = None) -> None:
@@ -82,24 +69,12 @@ class Progress:
         return not self.quiet and self._stream.isatty()
 
     def note(self, text: str) -> None:
-        """A remark that the reader should know, unless quiet.
-
-        Parameters
-        ----------
-        text : str
-            The remark, without `note:`.
-        """
+        """A remark that the reader should know, unless quiet."""
         if not self.quiet:
             self._write(f"note: {printable(text)}")
 
     def say(self, text: str) -> None:
-        """Part of the result, on standard output, unless quiet; a bar stays below it.
-
-        Parameters
-        ----------
-        text : str
-            Lines of the result.
-        """
+        """Part of the result, on standard output, unless quiet; a bar stays below it."""
         if self.quiet:
             return
         if any(not bar.disable for bar in self._bars):
@@ -110,31 +85,12 @@ class Progress:
             print(_coloured(_lines(text)))
 
     def detail(self, text: str) -> None:
-        """A line for who asked to see the work.
-
-        Parameters
-        ----------
-        text : str
-            The line, without its time.
-        """
+        """A line for who asked to see the work."""
         if self.verbose:
             self._write(f"{time.perf_counter() - self._began:8.2f} s  {printable(text)}")
 
     def iterate(self, what: str, unit: str = "messages") -> Callable[[Iterable[object], int], Iterable[object]] | None:
-        """Wrapper (iterable, total) -> iterable that shows how far it has come; None where nobody would see it.
-
-        Parameters
-        ----------
-        what : str
-            What is gone through, in front of the bar.
-        unit : str, default "messages"
-            What is counted, in the plural.
-
-        Returns
-        -------
-        callable or None
-            Wrapper, or None where nothing would show it.
-        """
+        """Wrapper (iterable, total) -> iterable that shows how far it has come; None where nobody would see it."""
 
         def wrap(items: Iterable[object], total: int) -> Iterator[object]:
             began = time.perf_counter()
@@ -148,18 +104,7 @@ class Progress:
 
     @contextmanager
     def stage(self, what: str) -> Iterator[Callable[[str], None]]:
-        """Yields a callable for one line of text per step; a `CountedStep` moves the bar there.
-
-        Parameters
-        ----------
-        what : str
-            Name of the stage, in front of every line.
-
-        Yields
-        ------
-        callable
-            Takes one line of text per step.
-        """
+        """Yields a callable for one line of text per step; a `CountedStep` moves the bar there."""
         began = drawn = time.perf_counter()
         with ExitStack() as stack:
             bar: Any = None

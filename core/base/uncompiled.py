@@ -35,22 +35,7 @@ locals = returns = exceptval = boundscheck = wraparound = cdivision = initialize
 
 
 def declare(type: Any = None, value: Any = None, **_: Any) -> Any:
-    """Declare a variable or an attribute.
-
-    Parameters
-    ----------
-    type : object, optional
-        Not looked at.
-    value : object, optional
-        The value.
-    **_ : object
-        Not looked at.
-
-    Returns
-    -------
-    object
-        The value as it was given.
-    """
+    """Declare a variable or an attribute."""
     return value
 
 

@@ -32,13 +32,7 @@ from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, co
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti check`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti check`."""
     add_model(parser, published=True)
     add_recordings(parser)
     add_rule_arguments(parser)
@@ -55,21 +49,6 @@ def run(options: argparse.Namespace) -> int:
     """Check each recording and return whether the alarm was raised.
 
     Of several recordings one that cannot be checked does not keep the others from it.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 1 if the alarm was raised, else 2 if a recording could not be checked, else 0.
-
-    Raises
-    ------
-    UncertainLTIError
-        The model or the only recording cannot be read, or a copy cannot be written.
     """
     from uncertain_lti.base.english import plural
     from uncertain_lti.recordings.formats import group_recordings

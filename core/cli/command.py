@@ -50,22 +50,11 @@ class Command:
     Each file of this room declares one as `COMMAND`, and `main.COMMANDS` lists the files. The file imports at its top
     nothing that takes time to load: every command is declared whenever one is run.
 
-    Parameters
-    ----------
-    name : str
-        The word on the command line.
-    help : str
-        What the command does, for the list of commands.
-    add_arguments : callable
-        Declares the arguments on a parser.
-    run : callable
-        Runs the command with the parsed options and returns the exit status. `options.progress` is a `Progress`.
-    quiet : str, default ""
-        What `--quiet` does, for the help; empty if the command has no such option.
-    verbose : str, default ""
-        What `--verbose` does, likewise.
-    deferred : bool
-        `add_arguments` imports what not every installation has: it is called for the chosen command alone.
+    `name`: the word on the command line; `help`: what the command does, for the list of commands; `add_arguments`:
+    declares the arguments on a parser; `run`: runs the command with the parsed options and returns the exit status.
+    `options.progress` is a `Progress`; `quiet`: what `--quiet` does, for the help; empty if the command has no such
+    option; `verbose`: what `--verbose` does, likewise; `deferred`: `add_arguments` imports what not every installation
+    has: it is called for the chosen command alone.
     """
 
     name: str
@@ -78,77 +67,31 @@ class Command:
 
 
 def print_summary(options: argparse.Namespace, text: str) -> None:
-    """Print part of the summary for a person, unless JSON is asked for or nothing at all.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `json` and `progress`.
-    text : str
-        Lines of the summary.
-    """
+    """Print part of the summary for a person, unless JSON is asked for or nothing at all."""
     if not options.json:
         options.progress.say(text)
 
 
 def complain(command: str, text: str) -> None:
-    """Print an error on standard error, if anybody listens.
-
-    Parameters
-    ----------
-    command : str
-        Name of the command; empty where there is none.
-    text : str
-        The sentence.
-    """
+    """Print an error on standard error, if anybody listens."""
     with suppress(OSError, AttributeError):
         print(f"uncertain-lti {command}: {printable(text)}".replace(" :", ":"), file=sys.stderr, flush=True)
 
 
 def print_json(data: Any) -> None:
-    """Print data for a program.
-
-    Parameters
-    ----------
-    data : object
-        Plain data without NaN.
-    """
+    """Print data for a program."""
     json.dump(data, sys.stdout, allow_nan=False, indent=1)
     sys.stdout.write("\n")
 
 
 def print_notes(options: argparse.Namespace, notes: Iterable[str]) -> None:
-    """Print remarks on standard error, unless quiet.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-    notes : iterable of str
-        A sentence each.
-    """
+    """Print remarks on standard error, unless quiet."""
     for note in notes:
         options.progress.note(note)
 
 
 def load_model(name: str) -> UncertainLTI:
-    """Load the model of a file, or the published one by its name.
-
-    Parameters
-    ----------
-    name : str
-        Path of a model file, or `leibov2006`.
-
-    Returns
-    -------
-    UncertainLTI
-        The model.
-
-    Raises
-    ------
-    ModelError
-        There is no such file, or it holds no model.
-    """
+    """Load the model of a file, or the published one by its name."""
     from uncertain_lti import UncertainLTI
     from uncertain_lti.base.english import meant
     from uncertain_lti.plants.leibov import leibov2006
@@ -162,15 +105,7 @@ def load_model(name: str) -> UncertainLTI:
 
 
 def add_model(parser: argparse.ArgumentParser, published: bool = False) -> None:
-    """Declare the model file that a command takes.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    published : bool, default False
-        Whether the published model may be named, too (`load_model`).
-    """
+    """Declare the model file that a command takes."""
     more = ", or leibov2006 for the published one" if published else ""
     parser.add_argument("model", metavar="MODEL", help=f"model file{more}")
 
@@ -178,45 +113,19 @@ def add_model(parser: argparse.ArgumentParser, published: bool = False) -> None:
 def add_recordings(
     parser: argparse.ArgumentParser, more: str = "", *, about: str = "", metavar: str = "BAG", required: bool = True
 ) -> None:
-    """Declare the recordings that a command takes, as `options.bags`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    more : str, default ""
-        What the help says of them besides what they may be.
-    about : str, default ""
-        The whole help, where there may be more than recordings.
-    metavar : str, default "BAG"
-        What the help calls each.
-    required : bool, default True
-        Whether at least one must be named.
-    """
+    """Declare the recordings that a command takes, as `options.bags`."""
     parser.add_argument("bags", metavar=metavar, nargs="+" if required else "*", help=about or f"{RECORDINGS}{more}")
 
 
 def add_signals(parser: argparse.ArgumentParser) -> None:
-    """Declare the signals file that a command needs.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the signals file that a command needs."""
     parser.add_argument(
         "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
     )
 
 
 def add_within(parser: argparse.ArgumentParser) -> None:
-    """Declare the time within which a fault shall be seen.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the time within which a fault shall be seen."""
     parser.add_argument(
         "--within",
         type=float,
@@ -226,49 +135,20 @@ def add_within(parser: argparse.ArgumentParser) -> None:
 
 
 def add_output(parser: argparse.ArgumentParser, required: bool) -> None:
-    """Declare the model file that a command writes, and `--force`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    required : bool
-        Whether it must be named.
-    """
+    """Declare the model file that a command writes, and `--force`."""
     parser.add_argument("--output", required=required, metavar="MODEL", help="model file to write (*.model.json)")
     add_force(parser)
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:
-    """Declare the option that lets `model_target` replace a model.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the option that lets `model_target` replace a model."""
     parser.add_argument("--force", action="store_true", help="write over a model that is there already")
 
 
 def read_labelled(
     options: argparse.Namespace, pairs: Iterable[tuple[str, str]], signals: SignalMap
 ) -> Iterator[tuple[str, Transient]]:
-    """Read recordings of known faults as a model has its signals.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-    pairs : iterable of (str, str)
-        Label, and path of a recording or a folder.
-    signals : SignalMap
-        Of the model.
-
-    Yields
-    ------
-    (str, Transient)
-        Label and recording; its notes are printed.
-    """
+    """Read recordings of known faults as a model has its signals."""
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.sampling.reading import read_as_fitted
 
@@ -280,25 +160,7 @@ def read_labelled(
 
 
 def model_target(path: str, force: bool) -> Path:
-    """Where a model file goes; with force an older one is replaced, and nothing else ever.
-
-    Parameters
-    ----------
-    path : str
-        What the user named.
-    force : bool
-        Whether a model that is there may be replaced.
-
-    Returns
-    -------
-    Path
-        The path.
-
-    Raises
-    ------
-    BagError
-        As `files.target`; or a model is there.
-    """
+    """Where a model file goes; with force an older one is replaced, and nothing else ever."""
     from uncertain_lti.base.errors import BagError
     from uncertain_lti.base.files import target
 

@@ -20,13 +20,7 @@ _FILES = {"BAG", "MODEL", "FILE"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti completion`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti completion`."""
     parser.add_argument(
         "shell",
         choices=("bash", "zsh"),
@@ -36,18 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the script of a shell.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `build_parser`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-    """
+    """Print the script of a shell."""
     import shtab  # type: ignore[import-not-found, import-untyped, unused-ignore]
 
     parser = options.build_parser(every=True)

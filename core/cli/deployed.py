@@ -26,13 +26,7 @@ if TYPE_CHECKING:
 
 
 def add_margin_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare another rule of containment than the model's.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare another rule of containment than the model's."""
     parser.add_argument(
         "--rules",
         metavar="FILE",
@@ -46,13 +40,7 @@ def add_margin_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the alarm rule, as the node has them as parameters.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the options of the alarm rule, as the node has them as parameters."""
     add_margin_arguments(parser)
     parser.add_argument(
         "--masked", default="", metavar="STATES", help="states, separated by commas, that never raise the alarm"
@@ -80,25 +68,7 @@ def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> DeployedMonitor:
-    """The monitor that the options of `add_rule_arguments` describe.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments.
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    DeployedMonitor
-        With a cleared alarm.
-
-    Raises
-    ------
-    ModelError
-        An option does not fit the model, or is out of range.
-    """
+    """The monitor that the options of `add_rule_arguments` describe."""
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.base.errors import ModelError
     from uncertain_lti.model.file import read_rules
@@ -121,33 +91,7 @@ def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> Deploy
 def check_recording(
     deployed: DeployedMonitor, recording: Recording, progress: Progress | None = None
 ) -> tuple[Verdicts, Decisions]:
-    """Read one recording and judge it as the node would.
-
-    Parameters
-    ----------
-    deployed : DeployedMonitor
-        Of `deployed_monitor`.
-    recording : Recording
-        The recording.
-    progress : Progress, optional
-        As in `read_transients`.
-
-    Returns
-    -------
-    Verdicts
-        Of every sample.
-    Decisions
-        Of every clock message.
-
-    Raises
-    ------
-    BagError
-        The recording cannot be read, or lacks a topic.
-    SignalError
-        The model or the condition does not fit the recording.
-    ModelError
-        No sample lies in the time asked for.
-    """
+    """Read one recording and judge it as the node would."""
     from uncertain_lti.sampling.reading import read_as_fitted_with_decisions, read_field
 
     signals = deployed.monitor.model.signals
@@ -161,31 +105,7 @@ def check_recording(
 def check_or_complain(
     command: str, deployed: DeployedMonitor, recording: Recording, several: bool, progress: Progress | None = None
 ) -> tuple[Verdicts, Decisions] | str:
-    """Read and judge one recording; of several, one that cannot be checked keeps none of the others from it.
-
-    Parameters
-    ----------
-    command : str
-        Name of the command, for the error.
-    deployed : DeployedMonitor
-        Of `deployed_monitor`.
-    recording : Recording
-        The recording.
-    several : bool
-        Whether there are others.
-    progress : Progress, optional
-        As in `read_transients`.
-
-    Returns
-    -------
-    (Verdicts, Decisions) or str
-        As of `check_recording`; or why it was not checked, which was printed.
-
-    Raises
-    ------
-    UncertainLTIError
-        As of `check_recording`, if there are no others.
-    """
+    """Read and judge one recording; of several, one that cannot be checked keeps none of the others from it."""
     from uncertain_lti.base.errors import BagError, SignalError
 
     try:
@@ -198,16 +118,6 @@ def check_or_complain(
 
 
 def complain_of_unchecked(command: str, unchecked: int, recordings: int) -> None:
-    """Say how many recordings were not checked, if any.
-
-    Parameters
-    ----------
-    command : str
-        Name of the command.
-    unchecked : int
-        Recordings that were not checked.
-    recordings : int
-        All recordings.
-    """
+    """Say how many recordings were not checked, if any."""
     if unchecked:
         complain(command, f"{unchecked} of {plural(recordings, 'recording')} not checked, as said above")

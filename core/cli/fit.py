@@ -36,13 +36,7 @@ from uncertain_lti.signals.additive import CHOICES
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti fit`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti fit`."""
     add_recordings(parser, "; parts of a split bag are one recording")
     add_signals(parser)
     add_output(parser, required=True)
@@ -99,25 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fit a model and write it.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    FitError
-        A number of workers is below 1, or no model can be fitted.
-    UncertainLTIError
-        A recording or the signals file cannot be read.
-    """
+    """Fit a model and write it."""
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
     from uncertain_lti.proposal.fitting import asked_for, horizons_asked_for, is_auto

@@ -17,13 +17,7 @@ from uncertain_lti.cli.command import DONE, Command, add_model, load_model, prin
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti info`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti info`."""
     add_model(parser, published=True)
     parser.add_argument(
         "--json",
@@ -33,23 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the model.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    ModelError
-        The model cannot be read.
-    """
+    """Print the model."""
     from uncertain_lti.reports.model_text import model_text
     from uncertain_lti.reports.plain_data import finite_data
     from uncertain_lti.reports.regimes import block_facts

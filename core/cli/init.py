@@ -20,13 +20,7 @@ from uncertain_lti.cli.command import DONE, Command, add_recordings, print_json,
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti init`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti init`."""
     add_recordings(parser, " of the same machine")
     parser.add_argument(
         "--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)"
@@ -49,25 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write or print the proposed signals file.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    SignalError
-        The output is there already, or cannot be written.
-    BagError
-        A recording cannot be read, or holds no state.
-    """
+    """Write or print the proposed signals file."""
     from uncertain_lti.base.english import shortlist
     from uncertain_lti.base.files import whole_file
     from uncertain_lti.proposal.init import propose

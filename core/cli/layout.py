@@ -17,13 +17,7 @@ from uncertain_lti.cli.command import DONE, Command, add_model, load_model, prin
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti layout`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti layout`."""
     add_model(parser, published=True)
     parser.add_argument("--foxglove", metavar="FILE.json", help="for Foxglove and Lichtblick")
     parser.add_argument("--plotjuggler", metavar="FILE.xml", help="for PlotJuggler")
@@ -32,23 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the layouts that are asked for.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    ModelError
-        The model cannot be read, or a layout cannot be written.
-    """
+    """Write the layouts that are asked for."""
     from uncertain_lti.reports.layouts import write_layouts
 
     written = write_layouts(load_model(options.model), options.foxglove, options.plotjuggler, options.topics)

@@ -78,20 +78,7 @@ _EXTRAS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Words of the command line; default those of the process.
-
-    Returns
-    -------
-    int
-        Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input (also a disk that is full or a folder that
-        cannot be written), 70 a fault of the program, 130 interrupted, 141 the reader of the output went away before
-        it was known whether there is an alarm.
-    """
+    """Run one command."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     command = next((a for a in given if not a.startswith("-")), "")
     for stream in (sys.stdout, sys.stderr):  # a name that the terminal has no letters for ends nothing
@@ -172,20 +159,7 @@ def _drop_output() -> None:
 
 
 def build_parser(chosen: str = "", every: bool = False) -> argparse.ArgumentParser:
-    """Declare the arguments of every command; those that need rclpy, only of the chosen one.
-
-    Parameters
-    ----------
-    chosen : str, default ""
-        Name of the command that will run, or empty.
-    every : bool, default False
-        Declare those that need rclpy too, where it is installed.
-
-    Returns
-    -------
-    argparse.ArgumentParser
-        Of the whole program.
-    """
+    """Declare the arguments of every command; those that need rclpy, only of the chosen one."""
     parser = _Parser(
         prog="uncertain-lti",
         description="Fit an uncertain linear model to recorded transients, and report when a machine leaves it.",

@@ -38,13 +38,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti plot`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti plot`."""
     add_recordings(
         parser,
         about="a model file (an image of its elements), recordings (their signals), or a model file and then "
@@ -63,25 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the plot.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 1 if recordings were checked and the alarm was raised, else 2 if one could not be checked, else 0.
-
-    Raises
-    ------
-    BagError
-        A recording cannot be read or drawn, or the plot cannot be written.
-    ModelError
-        The model cannot be read, or the options do not go with it.
-    """
+    """Write the plot."""
     from uncertain_lti.recordings.formats import group_recordings
 
     named = _names_model(options.bags[0])

@@ -18,13 +18,7 @@ from uncertain_lti.cli.command import FAULT, INTERRUPTED
 
 
 def main() -> int:
-    """Import the program and run it.
-
-    Returns
-    -------
-    int
-        Exit status, as of `uncertain_lti.cli.main.main`; 70 as well if something of the program cannot be imported.
-    """
+    """Import the program and run it."""
     try:
         from uncertain_lti.cli.main import main as run
     except KeyboardInterrupt:

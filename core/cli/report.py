@@ -30,13 +30,7 @@ from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, co
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti report`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti report`."""
     add_model(parser, published=True)
     add_recordings(parser, " to check against it")
     add_rule_arguments(parser)
@@ -45,23 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the page or print its facts, and return whether the alarm was raised.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 1 if the alarm was raised, else 2 if a recording could not be checked, else 0.
-
-    Raises
-    ------
-    UncertainLTIError
-        The model or a recording cannot be read, or the page cannot be written.
-    """
+    """Write the page or print its facts, and return whether the alarm was raised."""
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.findings import findings
     from uncertain_lti.reports.findings_text import findings_text

@@ -18,13 +18,7 @@ from uncertain_lti.cli.command import DONE, Command, print_json, print_summary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti reproduce`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti reproduce`."""
     parser.add_argument(
         "--output", default="reproduce-output", metavar="FOLDER", help="for figures, models and numbers"
     )
@@ -32,23 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the experiment into a folder.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    BagError
-        The folder cannot be written.
-    """
+    """Run the experiment into a folder."""
     from uncertain_lti.plants.reproduce import reproduce
 
     try:

@@ -31,13 +31,7 @@ from uncertain_lti.cli.deployed import add_margin_arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti signature`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti signature`."""
     add_model(parser)
     add_recordings(
         parser,
@@ -50,25 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Learn the signatures and write the model with them.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    ModelError
-        An argument is not LABEL=BAG, or a recording raises no alarm.
-    UncertainLTIError
-        The model or a recording cannot be read.
-    """
+    """Learn the signatures and write the model with them."""
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.reports.signature_text import signature_text
     from uncertain_lti.validation.signatures import learn_signatures

@@ -21,35 +21,13 @@ _LONGEST_LIST = 100_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti topics`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti topics`."""
     parser.add_argument("bag", metavar="BAG", help="recording (MCAP, .db3, .bag, table), or folder of one")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the topics of a recording and what each holds.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    BagError
-        The recording cannot be read.
-    """
+    """Print the topics of a recording and what each holds."""
     from uncertain_lti.recordings.formats import open_recording
     from uncertain_lti.reports.tables import number, table
 

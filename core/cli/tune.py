@@ -35,13 +35,7 @@ from uncertain_lti.cli.command import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti tune`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti tune`."""
     add_recordings(parser, " of the healthy machine; LABEL=BAG is one of a machine with the fault LABEL")
     add_signals(parser)
     parser.add_argument(
@@ -59,25 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Try the ways, print them, and write the model that was chosen.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    FitError
-        A number is out of range, or the recordings cannot be judged.
-    UncertainLTIError
-        A recording or the signals file cannot be read.
-    """
+    """Try the ways, print them, and write the model that was chosen."""
     from uncertain_lti import Transient, read_transients, tune
     from uncertain_lti.base.files import sha256, target
     from uncertain_lti.reports.tune_text import tune_text

@@ -32,13 +32,7 @@ from uncertain_lti.cli.command import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti validate`.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of the command.
-    """
+    """Declare the arguments of `uncertain-lti validate`."""
     add_model(parser)
     add_recordings(parser, " (default: those the model was fitted to)", required=False)
     parser.add_argument("--blocks", type=int, help="leave out blocks: their number per recording (a single one: 10)")
@@ -68,25 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Validate the model and write it with the result, if an output is named.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments, with `progress`.
-
-    Returns
-    -------
-    int
-        Exit status: 0.
-
-    Raises
-    ------
-    BagError
-        The model does not name its recordings, or one cannot be read.
-    FitError
-        The recordings do not give the model again, or no alarm rule keeps to the rate.
-    """
+    """Validate the model and write it with the result, if an output is named."""
     from uncertain_lti import UncertainLTI
     from uncertain_lti.model.alarm_rule import AlarmRule
     from uncertain_lti.recordings.formats import group_recordings

@@ -55,18 +55,8 @@ Recording = tuple[str, tuple[str, ...]]
 class Survey:
     """What resolving a signal map needs of one recording, by topic.
 
-    Parameters
-    ----------
-    types : dict of str to str
-        Message type.
-    stamped : dict of str to int
-        Messages with a stamp.
-    counted : dict of str to int
-        Messages.
-    header : dict of str to array
-        Stamps of those that have one, ns; state topics only.
-    log : dict of str to array
-        Log times, ns; state topics only.
+    `types`: message type; `stamped`: messages with a stamp; `counted`: messages; `header`: stamps of those that have
+    one, ns; state topics only; `log`: log times, ns; state topics only.
     """
 
     types: dict[str, str]
@@ -227,25 +217,7 @@ def _sampled(recording: Recording, signals: SignalMap) -> Transient:
 
 
 def survey(recording: Recording, signals: SignalMap) -> Survey:
-    """First look at one recording.
-
-    Parameters
-    ----------
-    recording : (str, tuple of str)
-        Path and files, as `open_recording` takes them.
-    signals : SignalMap
-        The map, not resolved.
-
-    Returns
-    -------
-    Survey
-        What `fit_archive` resolves the map with.
-
-    Raises
-    ------
-    BagError
-        The recording cannot be read, or a topic has no message.
-    """
+    """First look at one recording."""
     stream = read_stream(open_recording(recording[0], recording[1], indexed=True, layout=signals.table), signals)
     states = {s.topic for s in signals.states}
     types, stamped, counted = {}, {}, {}
@@ -284,22 +256,7 @@ def _resolve(surveys: Sequence[Survey], signals: SignalMap, recordings: Sequence
 
 
 def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
-    """The usable transitions of one recording, normalised.
-
-    Parameters
-    ----------
-    recording : (str, tuple of str)
-        Path and files, as `open_recording` takes them.
-    signals : SignalMap
-        Resolved.
-    columns : Columns
-        Terms that are unknown.
-
-    Returns
-    -------
-    Problem
-        Weights are ones; empty where no transition is usable.
-    """
+    """The usable transitions of one recording, normalised."""
     point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
     return replace(
         assemble([_sampled(recording, signals)], point, None, "none", empty=True, regimes=columns.regimes),
@@ -310,19 +267,7 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
 def repeats(recording: Recording, model: UncertainLTI) -> tuple[Found, Array]:
     """What one recording has of exact repeats, and its largest steps.
 
-    Parameters
-    ----------
-    recording : (str, tuple of str)
-        Path and files, as `open_recording` takes them.
-    model : UncertainLTI
-        Fitted to it and others.
-
-    Returns
-    -------
-    Found
-        As of `repeats_in`.
-    array (n,)
-        As of `largest_steps`.
+    Returns (n,): as of `largest_steps`.
     """
     transient = _sampled(recording, model.signals)
     return repeats_in(model, transient), largest_steps(model, [transient])

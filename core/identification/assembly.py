@@ -31,15 +31,7 @@ from uncertain_lti.signals.additive import Additive
 def is_constant(dt: Array) -> bool:
     """Whether all steps are equal to a part in 1e6 (an integer clock jitters by a nanosecond).
 
-    Parameters
-    ----------
-    dt : array (N,)
-        Steps, s.
-
-    Returns
-    -------
-    bool
-        True without a step.
+    `dt` (N,): steps, s.
     """
     if not dt.size or (dt == dt[0]).all():
         return True
@@ -49,15 +41,7 @@ def is_constant(dt: Array) -> bool:
 def median_step(dt: Array) -> float:
     """Median of Δt; without a sort where all steps are the same.
 
-    Parameters
-    ----------
-    dt : array (N,)
-        Steps, s; at least one.
-
-    Returns
-    -------
-    float
-        In s.
+    `dt` (N,): steps, s; at least one.
     """
     first = float(dt[0])
     return first if (dt == first).all() else float(np.median(dt))
@@ -75,35 +59,7 @@ def assemble(
 ) -> Problem:
     """Put the usable transitions of all recordings into one problem.
 
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    point : OperatingPoint
-        The normalisation.
-    weights : array (n,), (N, n), (N, n, n), or one of the latter two per transient, or None
-        W(t_{k+1}); N counts the steps of a transient (samples less one), usable or not. None for ones.
-    additive : Additive
-        Terms besides A and B.
-    empty : bool
-        No transition at all is no error.
-    transient_weights : sequence of float, optional
-        One factor per transient on all its weights.
-    count : {"sample", "transient"}
-        Every transition weighs the same, or every transient does, however long it is.
-    regimes : Regimes, optional
-        Of a scheduled model.
-
-    Returns
-    -------
-    Problem
-        Normalised.
-
-    Raises
-    ------
-    FitError
-        No transitions; values whose squares overflow; a mode that the schedule does not list; weights of a wrong shape,
-        not positive, not symmetric or not positive definite.
+    `weights` (n,): W(t_{k+1}); N counts the steps of a transient (samples less one), usable or not. None for ones.
     """
     n = len(point.x_s)
     steps = [t.transitions() for t in transients]
@@ -152,22 +108,7 @@ def assemble(
 
 
 def refuse_unlisted(problem: Problem, regimes: Regimes, transients: Sequence[Transient]) -> None:
-    """Refuse a mode that the schedule does not list.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    regimes : Regimes
-        The schedule.
-    transients : sequence of Transient
-        The recordings, by their position in `problem.source`.
-
-    Raises
-    ------
-    FitError
-        There is one; names the mode, the recording and the remedy.
-    """
+    """Refuse a mode that the schedule does not list."""
     vectors = regimes.vectors(problem.z_columns, problem.s_columns)
     for axis, values, row in zip(regimes.schedule.axes, vectors, regimes.positions, strict=True):
         unlisted = np.flatnonzero(~np.isin(values, axis.modes))
@@ -271,15 +212,7 @@ def scaled_eigenvalues(weights: Array) -> Array:
 
     The scales of the states are taken apart, as their squares may differ by more than arithmetic holds.
 
-    Parameters
-    ----------
-    weights : array (K, n, n)
-        Symmetric.
-
-    Returns
-    -------
-    array (K, n)
-        In rising order.
+    `weights` (K, n, n): symmetric; Returns (K, n): in rising order.
     """
     unit = 1.0 / np.sqrt(np.maximum(np.einsum("kii->ki", weights), 1e-300))
     return np.asarray(np.linalg.eigvalsh(weights * unit[:, :, None] * unit[:, None, :]))

@@ -36,22 +36,9 @@ class DiskPartition:
 
     Only one block is in memory at a time.
 
-    Parameters
-    ----------
-    folder : Path
-        Written by `CacheWriter`.
-    count : int
-        Number of transitions, N.
-    n : int
-        Number of states.
-    p : int
-        Number of states and controls.
-    weights : array (n,)
-        Constant in time.
-    columns : Columns
-        Terms that are unknown.
-    q : int, default 0
-        Number of further scheduling signals.
+    `folder`: written by `CacheWriter`; `count`: number of transitions, N; `n`: number of states; `p`: number of states
+    and controls; `weights` (n,): constant in time; `columns`: terms that are unknown; `q`: number of further scheduling
+    signals.
     """
 
     folder: Path
@@ -68,18 +55,7 @@ class DiskPartition:
         return self.count
 
     def blocks(self) -> Iterator[Block]:
-        """All transitions, in the blocks they were written in.
-
-        Yields
-        ------
-        Block
-            z, x_next and dt of up to BLOCK transitions.
-
-        Raises
-        ------
-        FitError
-            The file is shorter than its facts state.
-        """
+        """All transitions, in the blocks they were written in."""
         first = self.p + self.q
         lines = first + self.n + 1
         with open(self.folder / _DATA, "rb", buffering=0) as stream:
@@ -93,18 +69,7 @@ class DiskPartition:
                 yield Block(start, table[: self.p], table[first:-1], table[-1], self.weights, s)
 
     def with_columns(self, columns: Columns) -> DiskPartition:
-        """The same transitions with other unknown terms.
-
-        Parameters
-        ----------
-        columns : Columns
-            Terms that are unknown.
-
-        Returns
-        -------
-        DiskPartition
-            On the same files.
-        """
+        """The same transitions with other unknown terms."""
         return replace(self, columns=columns)
 
 
@@ -113,15 +78,7 @@ class CacheWriter:
 
     Use it as a context: left without an error, the folder is complete; else what was written is removed.
 
-    Parameters
-    ----------
-    folder : path
-        Made if it does not exist; a cache in it is replaced.
-
-    Raises
-    ------
-    FitError
-        The folder cannot be written, or holds something else.
+    `folder`: made if it does not exist; a cache in it is replaced.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -147,18 +104,7 @@ class CacheWriter:
         return self
 
     def add(self, problem: Problem) -> None:
-        """Append the transitions of a recording.
-
-        Parameters
-        ----------
-        problem : Problem
-            Transitions of one recording; the number of its signals is that of the first.
-
-        Raises
-        ------
-        FitError
-            Recordings differ in their numbers of signals, or the folder cannot be written.
-        """
+        """Append the transitions of a recording."""
         further = [] if problem.s_columns is None else [problem.s_columns]
         shape = (problem.n, problem.p, sum(map(len, further)))
         if self._shape not in (None, shape):
@@ -209,22 +155,7 @@ class CacheWriter:
     def partition(self, weights: Array, columns: Columns) -> DiskPartition:
         """What was written; to be asked when the context has ended.
 
-        Parameters
-        ----------
-        weights : array (n,)
-            Constant in time.
-        columns : Columns
-            Terms that are unknown.
-
-        Returns
-        -------
-        DiskPartition
-            All transitions.
-
-        Raises
-        ------
-        FitError
-            No usable transition was written.
+        `weights` (n,): constant in time.
         """
         if self._shape is None:
             raise FitError(f"{self.folder}: no usable transition was written")

@@ -27,81 +27,34 @@ class Whole:
     """Transitions of a model with one block, as they are; the sums of `Cells` for them."""
 
     def sort(self, block: Block) -> Block:
-        """As of `Cells`.
-
-        Parameters
-        ----------
-        block : Block
-            The transitions.
-
-        Returns
-        -------
-        Block
-            The same.
-        """
+        """As of `Cells`."""
         return block
 
     def spread(self, columns: Array) -> list[Array]:
         """As of `Cells`.
 
-        Parameters
-        ----------
-        columns : array (r, K)
-            Regressors.
-
-        Returns
-        -------
-        list of array (r, K)
-            All of them.
+        `columns` (r, K): regressors; Returns (r, K): all of them.
         """
         return [columns]
 
     def gram(self, a: list[Array], factor: Array | None = None) -> Array:
         """As of `Cells`.
 
-        Parameters
-        ----------
-        a : list of array
-            Of `spread`.
-        factor : array (K,), optional
-            Of each transition; default 1.
-
-        Returns
-        -------
-        array (r, r)
-            Sum.
+        `factor` (K,): of each transition; default 1; Returns (r, r): sum.
         """
         return gram_of(a[0] if factor is None else a[0] * factor, a[0])
 
     def against(self, a: list[Array], columns: Array) -> Array:
         """As of `Cells`.
 
-        Parameters
-        ----------
-        a : list of array
-            Of `spread`.
-        columns : array (s, K)
-            Others.
-
-        Returns
-        -------
-        array (r, s)
-            Sum.
+        `columns` (s, K): others; Returns (r, s): sum.
         """
         return gram_of(a[0], columns)
 
     def total(self, a: list[Array]) -> Array:
         """As of `Cells`.
 
-        Parameters
-        ----------
-        a : list of array
-            Of `spread`.
-
-        Returns
-        -------
-        array (r,)
-            Sum.
+        Returns (r,): sum.
         """
         total: Array = a[0].sum(axis=1)
         return total
@@ -109,15 +62,7 @@ class Whole:
     def visits(self, count: int) -> NDArray[np.intp]:
         """As of `Cells`.
 
-        Parameters
-        ----------
-        count : int
-            Number of transitions.
-
-        Returns
-        -------
-        array (1,) of int
-            The same.
+        Returns (1,): the same.
         """
         return np.array([count])
 
@@ -129,16 +74,8 @@ class Cells:
     Between knots two blocks of each scheduling signal hold, in a mode one: of w(s) ⊗ z, with w the weights of all
     blocks, the rest is zero, and is neither built nor multiplied.
 
-    Parameters
-    ----------
-    order : array (K,) of int
-        Where each transition was before they were sorted.
-    parts : tuple of (slice, array (C,) of int)
-        Transitions side by side, and the blocks that hold at them.
-    weights : array (C, K)
-        Of these blocks, sorted.
-    count : int
-        Number of all blocks, R.
+    `order` (K,): where each transition was before they were sorted; `parts` (C,): transitions side by side, and the
+    blocks that hold at them; `weights` (C, K): of these blocks, sorted; `count`: number of all blocks, R.
     """
 
     order: Index
@@ -148,20 +85,7 @@ class Cells:
 
     @classmethod
     def of(cls, regimes: Regimes, block: Block) -> Cells:
-        """Sort transitions.
-
-        Parameters
-        ----------
-        regimes : Regimes
-            The schedule.
-        block : Block
-            The transitions.
-
-        Returns
-        -------
-        Cells
-            Which blocks hold.
-        """
+        """Sort transitions."""
         places, weights = regimes.schedule.corners(regimes.vectors(block.z, block.s))
         first = places[0].astype(np.int16)  # the first block tells the others; short numbers are sorted by digits
         order = np.argsort(first, kind="stable")
@@ -178,34 +102,14 @@ class Cells:
         return len(self.order)
 
     def sort(self, block: Block) -> Block:
-        """The transitions in its order.
-
-        Parameters
-        ----------
-        block : Block
-            Those it was made of.
-
-        Returns
-        -------
-        Block
-            A copy.
-        """
+        """The transitions in its order."""
         return block.take(self.order)
 
     def before(self, chosen: Index) -> tuple[Index, Index]:
         """Where some transitions of several rows were before they were sorted.
 
-        Parameters
-        ----------
-        chosen : array (k,) of int
-            Row x K + position, sorted.
-
-        Returns
-        -------
-        array (k,) of int
-            Row x K + position before, in increasing order.
-        array (k,) of int
-            Which of `chosen` each of them is.
+        `chosen` (k,): row x K + position, sorted; Returns (k,): row x K + position before, in increasing order; Returns
+        (k,): which of `chosen` each of them is.
         """
         row, k = np.divmod(chosen, len(self))
         found = row * len(self) + self.order[k]
@@ -215,17 +119,8 @@ class Cells:
     def product(self, matrix: Array, columns: Array) -> Array:
         """matrix @ (w(s) ⊗ columns).
 
-        Parameters
-        ----------
-        matrix : array (s, R r)
-            Elements of all blocks, those of the first block first.
-        columns : array (r, K)
-            Regressors of one block, sorted.
-
-        Returns
-        -------
-        array (s, K)
-            Sorted.
+        `matrix` (s, R r): elements of all blocks, those of the first block first; `columns` (r, K): regressors of one
+        block, sorted; Returns (s, K): sorted.
         """
         rows, (r, count) = len(matrix), columns.shape
         elements = matrix.reshape(rows, self.count, r).transpose(1, 0, 2)
@@ -242,15 +137,7 @@ class Cells:
     def spread(self, columns: Array) -> list[Array]:
         """The part of w(s) ⊗ columns that is not zero.
 
-        Parameters
-        ----------
-        columns : array (r, K)
-            Regressors of one block, sorted.
-
-        Returns
-        -------
-        list of array (C r, k)
-            Of each part those of the blocks that hold.
+        `columns` (r, K): regressors of one block, sorted; Returns (C r, k): of each part those of the blocks that hold.
         """
         return [
             (self.weights[:, None, part] * columns[:, part]).reshape(-1, part.stop - part.start)
@@ -260,17 +147,8 @@ class Cells:
     def gram(self, a: list[Array], factor: Array | None = None) -> Array:
         """Sum over the transitions of the products of weighted columns.
 
-        Parameters
-        ----------
-        a : list of array
-            Of `spread`.
-        factor : array (K,), optional
-            Of each transition, sorted; default 1.
-
-        Returns
-        -------
-        array (R r, R r)
-            (w ⊗ columns)(w ⊗ columns)ᵀ, which is zero but for blocks that hold together.
+        `factor` (K,): of each transition, sorted; default 1; Returns (R r, R r): (w ⊗ columns)(w ⊗ columns)ᵀ, which is
+        zero but for blocks that hold together.
         """
         r, held = len(a[0]) // len(self.weights), len(self.weights)
         total = np.zeros((self.count, r, self.count, r))
@@ -282,17 +160,7 @@ class Cells:
     def against(self, a: list[Array], columns: Array) -> Array:
         """Sum over the transitions of the products of weighted columns with others.
 
-        Parameters
-        ----------
-        a : list of array
-            Of `spread`.
-        columns : array (s, K)
-            Sorted.
-
-        Returns
-        -------
-        array (R r, s)
-            (w ⊗ columns of a) columnsᵀ.
+        `columns` (s, K): sorted; Returns (R r, s): (w ⊗ columns of a) columnsᵀ.
         """
         r = len(a[0]) // len(self.weights)
         total = np.zeros((self.count, r, len(columns)))
@@ -303,15 +171,7 @@ class Cells:
     def total(self, a: list[Array]) -> Array:
         """Sum of weighted columns over the transitions.
 
-        Parameters
-        ----------
-        a : list of array
-            Of `spread`.
-
-        Returns
-        -------
-        array (R r,)
-            Σ w ⊗ columns.
+        Returns (R r,): Σ w ⊗ columns.
         """
         r = len(a[0]) // len(self.weights)
         total = np.zeros((self.count, r))
@@ -322,14 +182,7 @@ class Cells:
     def main_parts(self) -> Iterator[tuple[int, slice, NDArray[np.bool_]]]:
         """Where each block has the largest weight, of two alike the first.
 
-        Yields
-        ------
-        int
-            The block.
-        slice
-            Transitions at which it holds, sorted.
-        array (k,) of bool
-            Whether its weight is the largest there.
+        Yields (k,): whether its weight is the largest there.
         """
         for part, blocks in self.parts:
             largest = np.argmax(self.weights[:, part], axis=0)
@@ -339,15 +192,7 @@ class Cells:
     def visits(self, count: int) -> NDArray[np.intp]:
         """Of how many transitions each block has the largest weight.
 
-        Parameters
-        ----------
-        count : int
-            Number of transitions.
-
-        Returns
-        -------
-        array (R,) of int
-            They add up to that number.
+        Returns (R,): they add up to that number.
         """
         found = np.zeros(self.count, dtype=np.intp)
         for block, _, there in self.main_parts():

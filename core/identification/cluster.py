@@ -27,21 +27,8 @@ class DaskFleet(Fleet):
 
     A partition is the result of a pure task, so a worker that is lost costs the time to make its partitions again.
 
-    Parameters
-    ----------
-    client : distributed.Client
-        The cluster.
-    tasks : sequence of (callable, tuple)
-        Function and arguments; each makes one `Problem`.
-    done : callable, optional
-        Called with the number of those made so far.
-
-    Raises
-    ------
-    UncertainLTIError
-        What a task raised.
-    FitError
-        No recording has a usable transition.
+    `client`: the cluster; `tasks`: function and arguments; each makes one `Problem`; `done`: called with the number of
+    those made so far.
     """
 
     def __init__(
@@ -71,51 +58,11 @@ class DaskFleet(Fleet):
         tasks: Sequence[tuple[Callable[..., T], tuple[Any, ...]]],
         done: Callable[[int], None] | None = None,
     ) -> list[T]:
-        """Run tasks on the workers.
-
-        Parameters
-        ----------
-        client : distributed.Client
-            The cluster.
-        tasks : sequence of (callable, tuple)
-            Function and arguments.
-        done : callable, optional
-            Called with the number of results that are there.
-
-        Returns
-        -------
-        list of T
-            Results, in the order of the tasks.
-
-        Raises
-        ------
-        FitError
-            The cluster lost the task again and again.
-        UncertainLTIError
-            What a task raised.
-        """
+        """Run tasks on the workers."""
         return _gather(client, [client.submit(f, *arguments, pure=False, retries=3) for f, arguments in tasks], done)
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
-        """function(partition, *arguments) on the workers.
-
-        Parameters
-        ----------
-        function : callable
-            Takes a partition and its arguments.
-        arguments : sequence of tuple of object
-            One tuple per partition.
-
-        Returns
-        -------
-        list of T
-            Results, in the order of the partitions.
-
-        Raises
-        ------
-        FitError
-            The cluster lost the task again and again.
-        """
+        """function(partition, *arguments) on the workers."""
         futures = [
             self._client.submit(function, part, *args, pure=False, retries=3)
             for part, args in zip(self._parts, arguments, strict=True)

@@ -28,12 +28,7 @@ from uncertain_lti.signals.signal_map import SignalMap
 class Regimes:
     """A schedule, and where its signals are among those of a transition.
 
-    Parameters
-    ----------
-    schedule : Schedule
-        Knots and modes, normalised.
-    positions : tuple of int
-        Of each of its axes the row of [x; u; s].
+    `schedule`: knots and modes, normalised; `positions`: of each of its axes the row of [x; u; s].
     """
 
     schedule: Schedule
@@ -41,25 +36,7 @@ class Regimes:
 
     @classmethod
     def of(cls, schedule: Schedule, signals: SignalMap) -> Regimes:
-        """Where the signals of a schedule are.
-
-        Parameters
-        ----------
-        schedule : Schedule
-            The schedule.
-        signals : SignalMap
-            With its signals.
-
-        Returns
-        -------
-        Regimes
-            The schedule with positions.
-
-        Raises
-        ------
-        FitError
-            A signal is not there; names it.
-        """
+        """Where the signals of a schedule are."""
         try:
             return cls(schedule, schedule.positions([s.name for s in signals.signals]))
         except ModelError as error:
@@ -68,17 +45,8 @@ class Regimes:
     def vectors(self, z: Array, s: Array | None) -> Array:
         """Scheduling vectors.
 
-        Parameters
-        ----------
-        z : array (p, K)
-            [x; u].
-        s : array (q, K) or None
-            Further scheduling signals; None if there are none.
-
-        Returns
-        -------
-        array (axes, K)
-            Normalised.
+        `z` (p, K): [x; u]; `s` (q, K): further scheduling signals; None if there are none; Returns (axes, K):
+        normalised.
         """
         p = len(z)
         rows = [z[j] if j < p or s is None else s[j - p] for j in self.positions]
@@ -87,34 +55,16 @@ class Regimes:
     def weights(self, z: Array, s: Array | None) -> Array:
         """Weights of all blocks, w(s).
 
-        Parameters
-        ----------
-        z : array (p, K)
-            [x; u].
-        s : array (q, K) or None
-            Further scheduling signals; None if there are none.
-
-        Returns
-        -------
-        array (R, K)
-            Weights, which sum to 1.
+        `z` (p, K): [x; u]; `s` (q, K): further scheduling signals; None if there are none; Returns (R, K): weights,
+        which sum to 1.
         """
         return self.schedule.weights(self.vectors(z, s))
 
     def main_block(self, z: Array, s: Array | None) -> NDArray[np.intp]:
         """The block of the largest weight.
 
-        Parameters
-        ----------
-        z : array (p, K)
-            [x; u].
-        s : array (q, K) or None
-            Further scheduling signals; None if there are none.
-
-        Returns
-        -------
-        array of int (K,)
-            Numbers of blocks.
+        `z` (p, K): [x; u]; `s` (q, K): further scheduling signals; None if there are none; Returns (K,): numbers of
+        blocks.
         """
         return self.schedule.main_block(self.vectors(z, s))
 
@@ -125,12 +75,7 @@ class Columns:
 
     The unknowns of a row are those of the first block, then those of the second, and so on.
 
-    Parameters
-    ----------
-    names : frozenset of str
-        Of "c", "dc" and "v", those that are.
-    regimes : Regimes, optional
-        Of a scheduled model; None for one block.
+    `names`: of "c", "dc" and "v", those that are; `regimes`: of a scheduled model; None for one block.
     """
 
     names: frozenset[str] = frozenset()
@@ -169,68 +114,29 @@ class Columns:
     def phi(self, z: Array, s: Array | None) -> Array:
         """Regressors φ of the nominal row: z, and 1 for each additive term; of R blocks, each times its weight.
 
-        Parameters
-        ----------
-        z : array (p, K)
-            [x; u].
-        s : array (q, K) or None
-            Further scheduling signals; None if there are none.
-
-        Returns
-        -------
-        array (r, K)
-            φ / Δt.
+        `z` (p, K): [x; u]; `s` (q, K): further scheduling signals; None if there are none; Returns (r, K): φ / Δt.
         """
         return self._weighted(self.plain_phi(z), z, s)
 
     def plain_phi(self, z: Array) -> Array:
         """`phi` of one block, without its weight.
 
-        Parameters
-        ----------
-        z : array (p, K)
-            [x; u].
-
-        Returns
-        -------
-        array (r / R, K)
-            z, and 1 for each additive term.
+        `z` (p, K): [x; u]; Returns (r / R, K): z, and 1 for each additive term.
         """
         return np.vstack([z, np.ones((len(self.nominal), z.shape[1]))]) if self.nominal else z
 
     def psi(self, z: Array, dt: Array, s: Array | None) -> Array:
         """Regressors ψ of the half-width: |z|, and for each additive term 1 or, if Δt does not multiply it, 1/Δt.
 
-        Parameters
-        ----------
-        z : array (p, K)
-            [x; u].
-        dt : array (K,)
-            Δt, s.
-        s : array (q, K) or None
-            Further scheduling signals; None if there are none.
-
-        Returns
-        -------
-        array (q, K)
-            ψ / Δt; of R blocks, each times its weight.
+        `z` (p, K): [x; u]; `dt` (K,): Δt, s; `s` (q, K): further scheduling signals; None if there are none; Returns
+        (q, K): ψ / Δt; of R blocks, each times its weight.
         """
         return self._weighted(self.plain_psi(z, dt), z, s)
 
     def plain_psi(self, z: Array, dt: Array) -> Array:
         """`psi` of one block, without its weight.
 
-        Parameters
-        ----------
-        z : array (p, K)
-            [x; u].
-        dt : array (K,)
-            Δt, s.
-
-        Returns
-        -------
-        array (q / R, K)
-            |z|, and 1 or 1 / Δt for each additive term.
+        `z` (p, K): [x; u]; `dt` (K,): Δt, s; Returns (q / R, K): |z|, and 1 or 1 / Δt for each additive term.
         """
         p = len(z)
         psi = np.empty((p + len(self.half), z.shape[1]))
@@ -247,18 +153,7 @@ class Columns:
         return (weights[:, None] * base).reshape(-1, z.shape[1])
 
     def unknowns(self, p: int) -> int:
-        """Number of unknowns per row and block with p states and controls.
-
-        Parameters
-        ----------
-        p : int
-            Number of states and controls.
-
-        Returns
-        -------
-        int
-            Nominal elements and half-widths.
-        """
+        """Number of unknowns per row and block with p states and controls."""
         return 2 * p + len(self.names)
 
     @classmethod
@@ -269,25 +164,6 @@ class Columns:
         holds when another recording has another Δt. With a schedule c is unknown together with every
         additive term: it carries the steady state from knot to knot. Without such a term c is 0, as at rest its
         rounding would have no half-width to lie in.
-
-        Parameters
-        ----------
-        additive : Additive
-            The option of `fit`.
-        constant_dt : bool
-            Whether all steps are equal.
-        regimes : Regimes, optional
-            Of a scheduled model.
-
-        Returns
-        -------
-        Columns
-            Terms that are unknown.
-
-        Raises
-        ------
-        FitError
-            There is no such option.
         """
         if additive not in CHOICES:
             raise FitError(f"additive is {additive!r}; it must be {CHOICES_TEXT}")

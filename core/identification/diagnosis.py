@@ -48,20 +48,7 @@ WORTH = 1.3
 
 
 def too_few(transitions: int, unknowns: int) -> str:
-    """The sentence for fewer transitions than unknowns.
-
-    Parameters
-    ----------
-    transitions : int
-        Usable ones.
-    unknowns : int
-        Per row, nominal elements and half-widths.
-
-    Returns
-    -------
-    str
-        The sentence, with its remedy.
-    """
+    """The sentence for fewer transitions than unknowns."""
     return (
         f"{plural(transitions, 'usable transition')} for {unknowns} unknowns per row (nominal elements and "
         "half-widths); record "
@@ -70,23 +57,7 @@ def too_few(transitions: int, unknowns: int) -> str:
 
 
 def check_solvable(problem: Problem, transients: Sequence[Transient], names: Sequence[str]) -> None:
-    """Refuse data to which no envelope can be fitted.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    transients : sequence of Transient
-        The recordings, by their position in `problem.source`.
-    names : sequence of str
-        Of the states.
-
-    Raises
-    ------
-    FitError
-        Fewer transitions than unknowns per row, or a sample at rest (x = u = 0) with a moving successor and no
-        additive term: the width there is 0 whatever the matrices; names the sample and the remedy.
-    """
+    """Refuse data to which no envelope can be fitted."""
     columns = problem.columns
     unknowns = columns.unknowns(problem.p)
     if problem.N < unknowns:
@@ -157,31 +128,7 @@ def describe(
 ) -> tuple[int, list[str]]:
     """Rank, and messages to the user on a fitted model and the recordings it was fitted to.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model fitted.
-    problem : Problem
-        The data, or a part of it.
-    sums : Moments
-        Of all data.
-    mean_width : array (n,)
-        Normalised, per step.
-    max_width : array (n,)
-        Normalised, per step.
-    transients : sequence of Transient, optional
-        The recordings, for their names and for how many controls were stale.
-    few : Carriers, optional
-        Transitions that carry the width of a state.
-    discarded : int, optional
-        Transitions that were left out already; None where leaving out more takes long.
-
-    Returns
-    -------
-    int
-        Rank of the regressors.
-    list of str
-        Messages, a sentence or two each.
+    `mean_width` (n,): normalised, per step; `max_width` (n,): normalised, per step.
     """
     states = model.state_names
     names = [*states, *model.control_names]
@@ -497,22 +444,7 @@ def _wide(
 
 
 def remedies(messages: Sequence[str], additive: str, state: str) -> str:
-    """What of a fit's messages would narrow the bounds of a state; "" where they name nothing.
-
-    Parameters
-    ----------
-    messages : sequence of str
-        Of `describe`.
-    additive : str
-        The additive term of the fit.
-    state : str
-        Name of the state.
-
-    Returns
-    -------
-    str
-        Remedies, or an empty text.
-    """
+    """What of a fit's messages would narrow the bounds of a state; "" where they name nothing."""
     named = [m for m in messages if f"'{state}'" in m]
     if any(words in m for m in named for words in (sensors.STANDS_FOR_NONE, sensors.CHANGES_SIGN, sensors.WRAPS)):
         return "it jumps without moving, as said above"

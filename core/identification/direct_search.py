@@ -48,20 +48,8 @@ WIDER = 1.0 + 1e-9
 class Found:
     """Result of a direct search.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        Its one-step bounds contain every sample.
-    objective : float
-        Value of (10).
-    rows : array (n,)
-        Its part in each row.
-    rounds : int
-        Of all rows together.
-    evaluations : int
-        Of the objective of a row.
-    seconds : float
-        Wall-clock time, s.
+    `model`: its one-step bounds contain every sample; `objective`: value of (10); `rows` (n,): its part in each row;
+    `rounds`: of all rows together; `evaluations`: of the objective of a row; `seconds`: wall-clock time, s.
     """
 
     model: UncertainLTI
@@ -75,29 +63,7 @@ class Found:
 def direct_search(
     transients: Sequence[Transient], rounds: int = 200, improvement: float = 1e-4, tolerance: float = 1e-3
 ) -> Found:
-    """Minimise (10) by direct search from a least-squares start.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        With one SignalMap, whose operating point is used.
-    rounds : int, default 200
-        Largest number per row.
-    improvement : float, default 0.0001
-        A row ends when a round lowers it by less than this share.
-    tolerance : float, default 0.001
-        Relative, of each golden-section search.
-
-    Returns
-    -------
-    Found
-        The model, and what it took.
-
-    Raises
-    ------
-    FitError
-        The transients have no signals, or a sample at rest has a moving successor.
-    """
+    """Minimise (10) by direct search from a least-squares start."""
     signals = transients[0].signals
     if signals is None:
         raise FitError(f"{transients[0].name}: no signals, which give the operating point; read it with a signals file")

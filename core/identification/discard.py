@@ -39,30 +39,15 @@ LARGEST, MOST_ELEMENTS, LONGEST_ROW = 200_000, 300, 32
 class Carriers:
     """Few transitions that carry the width of the envelope.
 
-    Parameters
-    ----------
-    transitions : tuple of int
-        Positions in the problem.
-    factor : array (n,)
-        Mean width of each state with them, over its mean width without.
+    `transitions`: positions in the problem; `factor` (n,): mean width of each state with them, over its mean width
+    without.
     """
 
     transitions: tuple[int, ...]
     factor: Array
 
     def carry(self, state: int) -> bool:
-        """Whether they make the envelope of this state much wider.
-
-        Parameters
-        ----------
-        state : int
-            Position of the state.
-
-        Returns
-        -------
-        bool
-            True where the factor is at least MUCH.
-        """
+        """Whether they make the envelope of this state much wider."""
         return bool(self.factor[state] >= MUCH)
 
 
@@ -78,24 +63,6 @@ def choose_discards(
     Only a transition on the edge of some row's bounds can have an effect; each of them is tried by solving the rows
     it carries without it. A discarded transition need not be contained in any row. It stops early when none has an
     effect.
-
-    Parameters
-    ----------
-    problem : Problem
-        All transitions.
-    criterion : {"qp", "lp"}
-        The objective is the sum over rows of (10), or of δ of (11) relative to what it was.
-    structure : Structure or None
-        As in `fit`.
-    budget : int
-        Transitions at most.
-    progress : callable, optional
-        Called with one line of text per transition that is sought.
-
-    Returns
-    -------
-    list of (int, float)
-        Transition, and the share of the objective that it cost, in order of choice.
     """
     chosen: list[tuple[int, float]] = []
     if progress is not None:
@@ -115,18 +82,6 @@ def carriers(problem: Problem, structure: Structure | None) -> Carriers | None:
 
     By criterion (10), which is fast. None if there are none such, if the problem is large, or if
     its weights couple the rows.
-
-    Parameters
-    ----------
-    problem : Problem
-        All transitions.
-    structure : Structure or None
-        As in `fit`.
-
-    Returns
-    -------
-    Carriers or None
-        The carriers, or None.
     """
     budget = min(FEW, int(FEW_SHARE * problem.N))
     row = problem.p * problem.columns.count

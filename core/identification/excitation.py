@@ -37,26 +37,7 @@ FED_BACK = 0.9
 def collinear(
     problem: Problem, moments: Moments, names: Sequence[str], limit: float, past: Collection[int] = ()
 ) -> list[str]:
-    """Signals that nearly move together, and the recording that would separate them.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    moments : Moments
-        Of all data.
-    names : sequence of str
-        Of states and controls.
-    limit : float
-        Share of variance below which signals are one; those are named elsewhere.
-    past : collection of int, optional
-        Columns that are a state some samples earlier, which are like it by intention.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """Signals that nearly move together, and the recording that would separate them."""
     free = np.flatnonzero(moments.phi_scale[: problem.p] > 0)
     free = free[~np.isin(free, list(past))]
     unit = 1.0 / moments.phi_scale[free]
@@ -94,20 +75,7 @@ def collinear(
 
 
 def rare(problem: Problem, names: Sequence[str]) -> dict[int, str]:
-    """Controls, by column, that have one value in all but a few transitions.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    names : sequence of str
-        Of states and controls.
-
-    Returns
-    -------
-    dict of int to str
-        Column -> message.
-    """
+    """Controls, by column, that have one value in all but a few transitions."""
     messages = {}
     for j in range(problem.n, problem.p):
         values, counts = np.unique(problem.z[:, j], return_counts=True)
@@ -121,22 +89,7 @@ def rare(problem: Problem, names: Sequence[str]) -> dict[int, str]:
 
 
 def one_sided(problem: Problem, names: Sequence[str], known: Collection[int] = ()) -> list[str]:
-    """Controls that stay on one side of their steady value.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    names : sequence of str
-        Of states and controls.
-    known : collection of int, optional
-        Columns of which worse is known, which are left out.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """Controls that stay on one side of their steady value."""
     messages = []
     for j in range(problem.n, problem.p):
         if j in known:
@@ -156,22 +109,7 @@ def one_sided(problem: Problem, names: Sequence[str], known: Collection[int] = (
 
 
 def lost(problem: Problem, moments: Moments, known: Collection[int] = ()) -> dict[int, tuple[int, float]]:
-    """Controls whose effect on every state is lost in what one step leaves unexplained.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    moments : Moments
-        Of all data.
-    known : collection of int, optional
-        Columns of which worse is known, which are left out.
-
-    Returns
-    -------
-    dict of int to (int, float)
-        Column -> the state with the strongest effect, and that effect in standard errors.
-    """
+    """Controls whose effect on every state is lost in what one step leaves unexplained."""
     free = np.flatnonzero(moments.phi_scale > 0)
     centre, target = moments.centre[np.ix_(free, free)], moments.target[free]
     if not len(free) or moments.count <= len(free):
@@ -188,22 +126,7 @@ def lost(problem: Problem, moments: Moments, known: Collection[int] = ()) -> dic
 
 
 def certainty_of(problem: Problem, column: int, state: int) -> float:
-    """The effect of a column on a state, in standard errors of least squares.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    column : int
-        Of [x; u].
-    state : int
-        Position of the state.
-
-    Returns
-    -------
-    float
-        Its absolute value.
-    """
+    """The effect of a column on a state, in standard errors of least squares."""
     phi = np.column_stack([problem.z, np.ones(problem.N)])
     rate = (problem.x_next[:, state] - problem.z[:, state]) / problem.dt
     return float(_certainty(phi.T @ phi, (phi.T @ rate)[:, None], np.array([rate @ rate]), problem.N)[column, 0])
@@ -223,20 +146,6 @@ def fed_back(problem: Problem, names: Sequence[str], past: Collection[int] = ())
 
     u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} if a feedback sets u_k; an input that a person steps
     at will is not.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    names : sequence of str
-        Of states and controls.
-    past : collection of int, optional
-        Columns that are a state some samples earlier, which follow it by intention.
-
-    Returns
-    -------
-    list of str
-        Messages.
     """
     follows = successive(problem)
     if len(follows) <= 4 * problem.p:
@@ -267,19 +176,8 @@ def unexplained(gram: Array, cross: Array, total: Array) -> Array:
 
     Shares below 1e-11 are not distinguished, which no decision here needs.
 
-    Parameters
-    ----------
-    gram : array (..., b, b)
-        Products of the regressors with one another; leading axes are other choices of regressors.
-    cross : array (..., b, t)
-        Products of the regressors with the targets.
-    total : array (t,)
-        Sums of squares of the targets.
-
-    Returns
-    -------
-    array (..., t)
-        At least 1e-11 of `total`.
+    `gram` (..., b, b): products of the regressors with one another; leading axes are other choices of regressors;
+    `cross` (..., b, t): products of the regressors with the targets; `total` (t,): sums of squares of the targets.
     """
     size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
@@ -293,15 +191,8 @@ def unexplained(gram: Array, cross: Array, total: Array) -> Array:
 def triangle(columns: Array) -> Array:
     """A small matrix on which least squares is what it is on long columns, to the same digits.
 
-    Parameters
-    ----------
-    columns : array (c, N)
-        Regressors and targets.
-
-    Returns
-    -------
-    array (at most c, c)
-        R of the QR decomposition of `columns`ᵀ, so that any sum of products of two columns is that of R's columns.
+    `columns` (c, N): regressors and targets; Returns (at most c, c): R of the QR decomposition of `columns`ᵀ, so that
+    any sum of products of two columns is that of R's columns.
     """
     c, N = columns.shape
     width = max(500, 4 * c)  # stretches that stay in the cache
@@ -316,23 +207,8 @@ def triangle(columns: Array) -> Array:
 def least_squares(triangular: Array, regressors: Index, targets: Index, count: int) -> tuple[Array, int]:
     """Least squares on some columns, from the `triangle` of all.
 
-    Parameters
-    ----------
-    triangular : array (..., c)
-        Of `triangle`.
-    regressors : array (b,) of int
-        Columns.
-    targets : array (t,) of int
-        Columns.
-    count : int
-        Length of the columns, N: rounding grows with it.
-
-    Returns
-    -------
-    array (b, t)
-        Elements; the least ones where the regressors are dependent.
-    int
-        Rank of the regressors.
+    `regressors` (b,): columns; `targets` (t,): columns; Returns (b, t): elements; the least ones where the regressors
+    are dependent.
     """
     limit = float(np.finfo(np.float64).eps) * max(count, len(regressors))
     found, _, rank, _ = np.linalg.lstsq(triangular[:, regressors], triangular[:, targets], rcond=limit)
@@ -340,35 +216,13 @@ def least_squares(triangular: Array, regressors: Index, targets: Index, count: i
 
 
 def successive(problem: Problem) -> NDArray[np.intp]:
-    """Transitions that the next one in the problem continues: same recording, next sample.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-
-    Returns
-    -------
-    array of int
-        Positions, increasing.
-    """
+    """Transitions that the next one in the problem continues: same recording, next sample."""
     same = (problem.source[1:] == problem.source[:-1]) & (problem.k[1:] == problem.k[:-1] + 1)
     return np.flatnonzero(same)
 
 
 def quoted(names: Sequence[str]) -> str:
-    """'a', 'b' and 'c'; of many names the first ones, and how many others there are.
-
-    Parameters
-    ----------
-    names : sequence of str
-        At least one; a name that begins with `the` is not quoted.
-
-    Returns
-    -------
-    str
-        The list.
-    """
+    """'a', 'b' and 'c'; of many names the first ones, and how many others there are."""
     marked = [n if n.startswith("the ") else f"'{n}'" for n in names]
     if len(marked) > MOST_NAMES + 1:
         return f"{', '.join(marked[:MOST_NAMES])} and {len(marked) - MOST_NAMES} others"

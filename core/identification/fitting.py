@@ -73,55 +73,7 @@ def fit(
     alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> UncertainLTI:
-    """`uncertain_lti.fit` with a schedule that is known: nothing is chosen here by what is left out.
-
-    Parameters
-    ----------
-    transients : Transient or sequence of Transient
-        As in `uncertain_lti.fit`.
-    criterion : {"qp", "lp"}
-        As in `uncertain_lti.fit`.
-    weights : array, or list of array, optional
-        As in `uncertain_lti.fit`.
-    additive : {"none", "disturbance", "noise", "both"}, optional
-        As in `uncertain_lti.fit`.
-    operating_point : OperatingPoint, optional
-        As in `uncertain_lti.fit`.
-    transient_weights : sequence of float, optional
-        As in `uncertain_lti.fit`.
-    count : {"sample", "transient"}
-        As in `uncertain_lti.fit`.
-    structure : Structure, optional
-        As in `uncertain_lti.fit`.
-    schedule : Schedule or mapping, optional
-        As there, without "auto", which is refused.
-    horizons : sequence of int
-        Numbers of steps of further envelopes, each at least 2.
-    widths : {"growing", "constant"} or mapping
-        Half-widths of these that grow with |x| and |u|, or are the same everywhere; for all, or by the steps.
-    discard : int or float, default 0
-        As in `uncertain_lti.fit`.
-    method : {"working-set", "cvxpy"}
-        As in `uncertain_lti.fit`.
-    describe_data : bool, default True
-        As in `uncertain_lti.fit`.
-    seek_carriers : bool
-        As in `uncertain_lti.fit`.
-    alarm_rule : AlarmRule, optional
-        As in `uncertain_lti.fit`.
-    progress : callable, optional
-        As in `uncertain_lti.fit`.
-
-    Returns
-    -------
-    UncertainLTI
-        As of `uncertain_lti.fit`.
-
-    Raises
-    ------
-    FitError
-        The transients do not match, there are too few transitions, or no envelope exists (names the sample).
-    """
+    """`uncertain_lti.fit` with a schedule that is known: nothing is chosen here by what is left out."""
     transients = listed_transients(transients)
     if criterion not in ("qp", "lp"):
         raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
@@ -263,45 +215,7 @@ def fit_fleet(
     discarded: int = 0,
     seek_carriers: bool = False,
 ) -> UncertainLTI:
-    """`fit` on transitions that are already normalised, wherever they lie.
-
-    Parameters
-    ----------
-    fleet : Fleet
-        The transitions.
-    signals : SignalMap
-        With the operating point of the normalisation.
-    criterion : {"qp", "lp"}
-        As in `fit`.
-    structure : Structure, optional
-        As in `fit`.
-    method : {"working-set", "cvxpy"}, default "working-set"
-        As in `fit`; cvxpy takes a fleet of one `Problem`.
-    alarm_rule : AlarmRule, optional
-        As in `fit`.
-    progress : callable, optional
-        As in `fit`.
-    dt_median : float, optional
-        Median step for the model, s; without it no spectral radius is given.
-    describe_on : Problem, optional
-        What the messages in words are made from: the data, or a part of it.
-    transients : sequence of Transient
-        The recordings, for the same messages.
-    discarded : int
-        Transitions of them that were left out already, for the same messages.
-    seek_carriers : bool
-        As in `fit`.
-
-    Returns
-    -------
-    UncertainLTI
-        As of `fit`.
-
-    Raises
-    ------
-    FitError
-        As in `fit`; `InfeasibleError` where the structure contradicts a transition.
-    """
+    """`fit` on transitions that are already normalised, wherever they lie."""
     engine = WorkingSet(fleet, structure, progress=progress)
     sums = engine.sums
     n, low, high = fleet.n, sums.low, sums.high
@@ -399,22 +313,7 @@ def _contradiction(
 
 
 def contradiction_in(error: InfeasibleError, where: str, signals: SignalMap) -> FitError:
-    """The error for a transition that the structure cannot contain.
-
-    Parameters
-    ----------
-    error : InfeasibleError
-        What the working set found.
-    where : str
-        Names the transition.
-    signals : SignalMap
-        Names the state, and gives its scale.
-
-    Returns
-    -------
-    FitError
-        To be raised.
-    """
+    """The error for a transition that the structure cannot contain."""
     signal = signals.states[error.row]
     distance = f"{error.distance * float(signal.scale):.3g} {signal.unit}".rstrip()
     remedy = "free a half-width of this row, or use an additive term"

@@ -41,12 +41,8 @@ _COMPARED = 20_000
 class Fleet:
     """Partitions visited in this process, in turn or by threads; passes over all data as map and reduce.
 
-    Parameters
-    ----------
-    partitions : sequence of Partition
-        With the same columns, states and controls.
-    threads : int
-        How many partitions a pass visits at a time: numpy works outside the interpreter's lock.
+    `partitions`: with the same columns, states and controls; `threads`: how many partitions a pass visits at a time:
+    numpy works outside the interpreter's lock.
     """
 
     def __init__(self, partitions: Sequence[Partition], threads: int = 1) -> None:
@@ -56,18 +52,7 @@ class Fleet:
 
     @classmethod
     def of(cls, problem: Problem) -> Fleet:
-        """A problem in memory, in as many parts as there are cores if it is large.
-
-        Parameters
-        ----------
-        problem : Problem
-            The data.
-
-        Returns
-        -------
-        Fleet
-            Parts without a copy.
-        """
+        """A problem in memory, in as many parts as there are cores if it is large."""
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         count = min(cores, problem.N // _WORTH_A_THREAD)
         if count < 2:
@@ -88,20 +73,7 @@ class Fleet:
         return first if first.ndim == 1 else None
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
-        """function(partition, *arguments of that partition) for every partition.
-
-        Parameters
-        ----------
-        function : callable
-            Takes a partition and its arguments.
-        arguments : sequence of tuple of object
-            One tuple per partition.
-
-        Returns
-        -------
-        list of T
-            Results, in the order of the partitions.
-        """
+        """function(partition, *arguments of that partition) for every partition."""
         if self._threads == 1:
             return [function(part, *args) for part, args in zip(self.partitions, arguments, strict=True)]
         with ThreadPoolExecutor(self._threads) as pool:
@@ -112,20 +84,7 @@ class Fleet:
         return [arguments] * len(self.counts)
 
     def moments(self, stride: int) -> tuple[Moments, list[Samples]]:
-        """One pass for sums over all transitions, and a sample of them.
-
-        Parameters
-        ----------
-        stride : int
-            Every stride-th transition is sampled; 0 for none.
-
-        Returns
-        -------
-        Moments
-            Sums over all partitions.
-        list of Samples
-            One per row.
-        """
+        """One pass for sums over all transitions, and a sample of them."""
         results = self.map(passes.moments, [(offset, stride) for offset in self.offsets])
         total = results[0][0]
         for sums, _ in results[1:]:
@@ -135,17 +94,7 @@ class Fleet:
     def occupancy(self, low: Array, high: Array) -> Occupancy | None:
         """Combinations of two signals that the data hold; see `passes.occupied`.
 
-        Parameters
-        ----------
-        low : array (p,)
-            Least z.
-        high : array (p,)
-            Greatest z.
-
-        Returns
-        -------
-        Occupancy or None
-            None if the transitions are too few to state where there were none.
+        `low` (p,): least z; `high` (p,): greatest z.
         """
         cells, stride = cells_for(self.N), -(-self.N // _LOOKED_AT)
         if not cells:
@@ -153,18 +102,7 @@ class Fleet:
         return Occupancy.of(np.logical_or.reduce(self.map(passes.occupied, self._same(low, high, cells, stride))))
 
     def scan(self, candidate: Candidate) -> list[tuple[Samples, float]]:
-        """One pass for the samples of least slack; see `passes.scan`.
-
-        Parameters
-        ----------
-        candidate : Candidate
-            The solution to check.
-
-        Returns
-        -------
-        list of (Samples, float)
-            Per row of the candidate the samples, and the reach below which none is missing.
-        """
+        """One pass for the samples of least slack; see `passes.scan`."""
         results = self.map(passes.scan, [(candidate, offset) for offset in self.offsets])
         rows = []
         for i in range(len(candidate.rows)):
@@ -172,18 +110,7 @@ class Fleet:
         return rows
 
     def judge(self, model: Envelope) -> Judged:
-        """What the bounds of a model are on all transitions, by the verdict's own arithmetic.
-
-        Parameters
-        ----------
-        model : Envelope
-            The model, or a horizon.
-
-        Returns
-        -------
-        Judged
-            Over all partitions.
-        """
+        """What the bounds of a model are on all transitions, by the verdict's own arithmetic."""
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
 
@@ -193,19 +120,7 @@ class Fleet:
         With one covariance of the residual its spread is the same in all regimes, with one of the utilisation it is as
         the half-width; the form by which the transitions are likelier is taken.
 
-        Parameters
-        ----------
-        model : Envelope
-            Gives the centre and the half-width.
-
-        Returns
-        -------
-        Residuals
-            Over all partitions.
-        array (R, n)
-            Of each block the sum of the widths.
-        array (R, n)
-            Of each block the largest width.
+        Returns (R, n): of each block the sum of the widths; Returns (R, n): of each block the largest width.
         """
         results = self.map(passes.envelope_sums, self._same(model, max(1, self.N // _COMPARED)))
         left, half = (np.concatenate([r[i] for r in results]) for i in (4, 5))
@@ -221,37 +136,15 @@ class Fleet:
         return residuals, np.sum([r[2] for r in results], axis=0), np.max([r[3] for r in results], axis=0)
 
     def moving_from_rest(self) -> tuple[int, int, float]:
-        """Samples with x = u = 0 and a successor that is not 0.
-
-        Returns
-        -------
-        int
-            How many.
-        int
-            The state that moves most.
-        float
-            How far, normalised.
-        """
+        """Samples with x = u = 0 and a successor that is not 0."""
         results = self.map(passes.moving_from_rest, self._same())
         _, state, step = max(results, key=lambda r: r[2])
         return sum(r[0] for r in results), state, step
 
     def least_eigenvalue(self) -> float:
-        """Least eigenvalue of any full weight; see `passes.least_eigenvalue`.
-
-        Returns
-        -------
-        float
-            At most 1.
-        """
+        """Least eigenvalue of any full weight; see `passes.least_eigenvalue`."""
         return min(self.map(passes.least_eigenvalue, self._same()))
 
     def median_dt(self) -> float:
-        """Median step.
-
-        Returns
-        -------
-        float
-            Δt, s.
-        """
+        """Median step."""
         return float(np.median(np.concatenate(self.map(passes.steps, self._same()))))

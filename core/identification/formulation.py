@@ -23,30 +23,8 @@ from uncertain_lti.identification.problem import Problem
 def solve(problem: Problem, criterion: str, solver: str | None = None, **options: Any) -> tuple[Array, Array, Array]:
     """Solve (10), or (11) row by row, over all samples at once.
 
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    criterion : str
-        Eq. (10) or eq. (11).
-    solver : str, optional
-        A cvxpy solver; default OSQP (scaled, tight, polished) for (10) and HiGHS for (11).
-    **options : object
-        Passed to the solver.
-
-    Returns
-    -------
-    theta : array (r, n)
-        Nominal elements, one column per row of the model, 1/s.
-    d : array (q, n)
-        Half-widths of the same shape.
-    objective : array
-        (1,), the value of (10), or (n,), δ of every row of (11). Ties are not broken.
-
-    Raises
-    ------
-    FitError
-        The solver did not find an optimum.
+    Returns (r, n): nominal elements, one column per row of the model, 1/s; Returns (q, n): half-widths of the same
+    shape.
     """
     import cvxpy as cp
 

@@ -72,20 +72,7 @@ class _Envelope:
 
 
 def run_of(problem: Problem, structure: Structure | None = None) -> Run:
-    """The least squares of the elements of a model, one step ahead.
-
-    Parameters
-    ----------
-    problem : Problem
-        The transitions.
-    structure : Structure, optional
-        As in `fit`; an element beyond its bounds is put onto them.
-
-    Returns
-    -------
-    Run
-        With one block for each of the schedule.
-    """
+    """The least squares of the elements of a model, one step ahead."""
     return _as_run(problem, _started(problem, structure)[1])
 
 
@@ -115,24 +102,6 @@ def better_run(
     made of: its geometric mean over horizons and states. Of many transitions, pieces of the recordings are looked at.
     Least squares several steps ahead go without the correction: it would follow the largest errors, as the narrowest
     envelope does, and move the mean, which statistics look at, from 0. They have to be nearer by a third without it.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted to the transitions.
-    problem : Problem
-        The transitions.
-    steps : sequence of int
-        Lengths of the horizons.
-    structure : Structure or None
-        As in `fit`.
-
-    Returns
-    -------
-    Run or None
-        None where the nominal model stays nearest to the recordings.
-    bool
-        Whether its envelopes need a correction.
     """
     lengths = sorted(set(steps))
     order, signals = _in_order(problem)
@@ -195,39 +164,7 @@ def fit_horizons(
     progress: Callable[[str], None] | None = None,
     corrected: bool = True,
 ) -> tuple[tuple[Horizon, ...], list[dict[str, Any]], list[str]]:
-    """Envelopes of a fitted model over several steps.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted to the transitions, with what is run over the windows (`better_run`).
-    problem : Problem
-        The transitions; a window ends where one is missing, also by being discarded.
-    steps : sequence of int
-        Numbers of steps, each at least 2.
-    widths : {"growing", "constant"} or mapping
-        Half-widths that grow with |x| and |u|, or the noise term alone; for all, or by the steps.
-    criterion : {"qp", "lp"}
-        Eq. (10) or eq. (11).
-    progress : callable, optional
-        Called with one line of text per horizon.
-    corrected : bool, default True
-        Whether the centre has a linear correction besides what is run.
-
-    Returns
-    -------
-    tuple of Horizon
-        Those that there are windows for, with every window inside.
-    list of dict
-        Of each its steps, seconds, windows, widths and distance from the optimum.
-    list of str
-        What was dropped and why.
-
-    Raises
-    ------
-    FitError
-        No solver found an answer; names the horizon.
-    """
+    """Envelopes of a fitted model over several steps."""
     found: list[Horizon] = []
     facts: list[dict[str, Any]] = []
     messages: list[str] = []

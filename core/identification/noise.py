@@ -29,50 +29,24 @@ _OWN = 0.3
 class Memory:
     """How well a state's own past predicts its next sample.
 
-    Parameters
-    ----------
-    predicted : array (n,)
-        Share of variance that least squares on the sample before and its control predicts one sample ahead.
-    fastest : float
-        |1 - eigenvalue| of the fastest mode of the step that does not come from measurement noise; inf where too few
-        samples follow one another.
+    `predicted` (n,): share of variance that least squares on the sample before and its control predicts one sample
+    ahead; `fastest`: |1 - eigenvalue| of the fastest mode of the step that does not come from measurement noise; inf
+    where too few samples follow one another.
     """
 
     predicted: Array
     fastest: float
 
     def like_noise(self, state: int) -> bool:
-        """Whether the state moves like noise.
-
-        Parameters
-        ----------
-        state : int
-            Position of the state.
-
-        Returns
-        -------
-        bool
-            True where less than NOISE of its variance is predicted.
-        """
+        """Whether the state moves like noise."""
         return bool(self.predicted[state] < NOISE)
 
 
 def predicted(X: Array, U: Array, after: Array) -> Array:
     """Share of the variance that least squares on [X, U, 1] predicts.
 
-    Parameters
-    ----------
-    X : array (N, n)
-        Regressors.
-    U : array (N, m)
-        Further regressors.
-    after : array (N, k)
-        Targets.
-
-    Returns
-    -------
-    array (k,)
-        At most 1; without the share that any regressor explains by chance, so that it can be negative.
+    `X` (N, n): regressors; `U` (N, m): further regressors; `after` (N, k): targets; Returns (k,): at most 1; without
+    the share that any regressor explains by chance, so that it can be negative.
     """
     design = np.vstack([X.T, U.T, np.ones(len(X))])
     design /= np.maximum(np.abs(design).max(axis=1), 1e-300)[:, None]
@@ -92,16 +66,6 @@ def memory(problem: Problem) -> Memory:
     Noise on a measured state makes least squares believe that it decays within a step. The sample before, as an
     instrument, carries the state and none of that noise; a mode is fast if both ways agree for a state that is
     predicted at all.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-
-    Returns
-    -------
-    Memory
-        Of each state, and of the fastest mode.
     """
     n, p = problem.n, problem.p
     share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)

@@ -34,40 +34,7 @@ def optimum(
 ) -> tuple[E, Array, Judged, Array, float, Solution]:
     """The optimum of a criterion, lifted until the verdict's own arithmetic finds nothing outside.
 
-    Parameters
-    ----------
-    engine : WorkingSet
-        With the transitions.
-    criterion : {"qp", "lp"}
-        Eq. (10) or eq. (11).
-    build : callable
-        (theta (r, n), d (q, n)) -> what has the bounds.
-    names : sequence of str
-        Of the states, for errors.
-    method : {"working-set", "cvxpy"}, default "working-set"
-        As in `fit`.
-    sizes : array (n,), optional
-        As in `repair`.
-
-    Returns
-    -------
-    envelope : E
-        What `build` made.
-    d : array (q, n)
-        Its half-widths.
-    judged : Judged
-        Widths, with none outside.
-    objective : array (1,) or (n,)
-        Of (10), or δ of each row of (11).
-    gap : float
-        How far it is above a lower bound of the optimum at most, relative.
-    solution : Solution
-        Before the lift.
-
-    Raises
-    ------
-    FitError
-        As in `fit`.
+    `sizes` (n,): as in `repair`; Returns (q, n): its half-widths; Returns (1,): of (10), or δ of each row of (11).
     """
     fleet, sums = engine.fleet, engine.sums
     if method == "working-set":

@@ -40,23 +40,9 @@ def nearest_to_all(
 ) -> Array | None:
     """Elements of the least squared error over all samples of segments.
 
-    Parameters
-    ----------
-    problem : Problem
-        The transitions.
-    k : array of int (N,)
-        Numbers of their samples; where one does not follow the one before, segments end.
-    elements : Elements
-        What is unknown.
-    begins : sequence of array (blocks, q, n)
-        Elements to begin with: those whose run from the first sample of each segment is nearest.
-    longest : int
-        Steps of the longest horizon; segments are LONGER times as long.
-
-    Returns
-    -------
-    array (blocks, q, n) or None
-        Elements of [x; u] or [x; u; 1], one block after another; None if there are no segments, or nothing is gained.
+    `k` (N,): numbers of their samples; where one does not follow the one before, segments end; `begins` (blocks, q, n):
+    elements to begin with: those whose run from the first sample of each segment is nearest; Returns (blocks, q, n):
+    elements of [x; u] or [x; u; 1], one block after another; None if there are no segments, or nothing is gained.
     """
     found = segments(problem, k, LONGER * longest, _SAMPLES)
     if found is None:

@@ -31,34 +31,12 @@ from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of, utilis
 class Moments:
     """Sums over all transitions, which the objectives need whatever N is; they add up over partitions.
 
-    Parameters
-    ----------
-    plain_gram : array (q, q)
-        Σ (Δt ψ)(Δt ψ)ᵀ.
-    gram : array (n, q, q) or None
-        The same per row, weighted by w_ii; None where weights do not differ between samples.
-    coupled : array (n q, n q) or None
-        The same for full weights; None otherwise.
-    centre : array (r, r)
-        Σ (Δt φ)(Δt φ)ᵀ, the normal equations of the unweighted squared distance of the bounds' centre.
-    target : array (r, n)
-        Their right-hand sides, one per row of the model.
-    rate_square : array (n,)
-        Σ (x_next - x)².
-    width_sum : array (q,)
-        Σ Δt ψ.
-    low : array (p,)
-        Least z.
-    high : array (p,)
-        Greatest z.
-    dt_min : float
-        Shortest step, s.
-    dt_max : float
-        Longest step, s.
-    count : int
-        Number of transitions.
-    visits : array (R,) of int
-        Transitions of which each block has the largest weight.
+    `plain_gram` (q, q): Σ (Δt ψ)(Δt ψ)ᵀ; `gram` (n, q, q): the same per row, weighted by w_ii; None where weights do
+    not differ between samples; `coupled` (n q, n q): the same for full weights; None otherwise; `centre` (r, r): Σ (Δt
+    φ)(Δt φ)ᵀ, the normal equations of the unweighted squared distance of the bounds' centre; `target` (r, n): their
+    right-hand sides, one per row of the model; `rate_square` (n,): Σ (x_next - x)²; `width_sum` (q,): Σ Δt ψ; `low`
+    (p,): least z; `high` (p,): greatest z; `dt_min`: shortest step, s; `dt_max`: longest step, s; `count`: number of
+    transitions; `visits` (R,): transitions of which each block has the largest weight.
     """
 
     plain_gram: Array
@@ -96,13 +74,7 @@ class Moments:
         )
 
     def one_block(self) -> Moments:
-        """The sums of the same transitions with one block for all: the weights of a schedule add up to 1.
-
-        Returns
-        -------
-        Moments
-            Of [x; u] and the additive terms.
-        """
+        """The sums of the same transitions with one block for all: the weights of a schedule add up to 1."""
         count = len(self.visits)
         if count == 1:
             return self
@@ -203,23 +175,8 @@ def _pieces_as_sorted(part: Partition) -> Iterator[tuple[Block, Cells | None, Bl
 def occupied(partition: Partition, least: Array, greatest: Array, cells: int, stride: int) -> NDArray[np.bool_]:
     """Cells of every pair of signals that some of the transitions start in (`model.domain.Occupancy`).
 
-    Parameters
-    ----------
-    partition : Partition
-        The data.
-    least : array (p,)
-        Least z of all data.
-    greatest : array (p,)
-        Greatest z of all data.
-    cells : int
-        Cells per range.
-    stride : int
-        Every stride-th transition of a block counts.
-
-    Returns
-    -------
-    array (pairs, cells, cells) of bool
-        True if one lies in the cell.
+    `least` (p,): least z of all data; `greatest` (p,): greatest z of all data; Returns (pairs, cells, cells): true if
+    one lies in the cell.
     """
     first, second = pairs_of(partition.p)
     found = np.zeros((len(first), cells, cells), dtype=bool)
@@ -233,29 +190,7 @@ def occupied(partition: Partition, least: Array, greatest: Array, cells: int, st
 
 
 def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Samples]]:
-    """One pass for everything in `Moments`, and a sample of the transitions.
-
-    Parameters
-    ----------
-    part : Partition
-        The transitions.
-    offset : int, default 0
-        Number of transitions in the partitions before this one.
-    stride : int, default 0
-        Every stride-th transition of the whole is sampled; 0 for none.
-
-    Returns
-    -------
-    Moments
-        Sums.
-    list of Samples
-        One per row.
-
-    Raises
-    ------
-    ValueError
-        The partition has no transition.
-    """
+    """One pass for everything in `Moments`, and a sample of the transitions."""
     columns, n, p = part.columns, part.n, part.p
     q = columns.count * (p + len(columns.half))
     sums: Moments | None = None
@@ -331,20 +266,8 @@ def _joined(parts: Sequence[Array | None]) -> Array | None:
 class Samples:
     """Some transitions as one row sees them.
 
-    Parameters
-    ----------
-    index : array (K,) of int
-        Position among all transitions.
-    z : array (p, K)
-        [x; u].
-    rate : array (K,)
-        (x_next - x) / Δt of the row, 1/s.
-    dt : array (K,)
-        Δt, s.
-    root_weight : array (K,)
-        √w_ii.
-    s : array (q, K), optional
-        Scheduling signals that are neither state nor control.
+    `index` (K,): position among all transitions; `z` (p, K): [x; u]; `rate` (K,): (x_next - x) / Δt of the row, 1/s;
+    `dt` (K,): Δt, s; `root_weight` (K,): √w_ii; `s` (q, K): scheduling signals that are neither state nor control.
     """
 
     index: Index
@@ -369,20 +292,7 @@ class Samples:
 
     @classmethod
     def join(cls, parts: Sequence[Samples], p: int) -> Samples:
-        """All of them, in order of index, each index once.
-
-        Parameters
-        ----------
-        parts : sequence of Samples
-            Of one row.
-        p : int
-            Number of states and controls.
-
-        Returns
-        -------
-        Samples
-            In order of index, each index once.
-        """
+        """All of them, in order of index, each index once."""
         parts = [s for s in parts if len(s)]
         if not parts:
             nothing = np.empty(0)
@@ -405,26 +315,11 @@ class Samples:
 class Candidate:
     """A solution to check on all samples, and the units in which its slack is measured.
 
-    Parameters
-    ----------
-    theta : array (r, n)
-        Nominal elements, one column per row of the model, 1/s.
-    d : array (q, n)
-        Half-widths of the same shape.
-    size_unit : array (q,), or (q, n) of each row
-        The size of a sample is size_unit·ψ.
-    scale : array (n,)
-        Slack of row i is divided by size x scale_i.
-    limit : array (n,) or None
-        δ of (11); None for (10).
-    reach : array (n,)
-        Samples are wanted that have less slack than this from leaving the bounds.
-    room : array (n,)
-        And those that have less slack than this from being wider than the limit.
-    most : int
-        Samples per row at most.
-    rows : array of int
-        Rows of the model that are looked at; the arrays above have one element or column for each.
+    `theta` (r, n): nominal elements, one column per row of the model, 1/s; `d` (q, n): half-widths of the same shape;
+    `size_unit` (q,): the size of a sample is size_unit·ψ; `scale` (n,): slack of row i is divided by size x scale_i;
+    `limit` (n,): δ of (11); None for (10); `reach` (n,): samples are wanted that have less slack than this from leaving
+    the bounds; `room` (n,): and those that have less slack than this from being wider than the limit; `most`: samples
+    per row at most; `rows`: rows of the model that are looked at; the arrays above have one element or column for each.
     """
 
     theta: Array
@@ -444,20 +339,6 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     The slack of a sample is its distance from leaving the bounds (8)(9), or from being wider than (11) allows, in
     scaled units; negative if it is outside. If more than `most` samples of a row qualify, those of least slack
     are returned, and the reach is the least slack of the others.
-
-    Parameters
-    ----------
-    part : Partition
-        The transitions.
-    candidate : Candidate
-        The solution to check.
-    offset : int, default 0
-        Number of transitions in the partitions before this one.
-
-    Returns
-    -------
-    list of (Samples, float)
-        Per row of the candidate the samples, and the reach that held to the end.
     """
     columns, p = part.columns, part.p
     theta, d = np.ascontiguousarray(candidate.theta.T), np.ascontiguousarray(candidate.d.T)
@@ -597,14 +478,8 @@ def _least(near: _Near, rows: int, most: int, reach: Array) -> tuple[list[Index]
 class Judged:
     """What the bounds of a model are on transitions.
 
-    Parameters
-    ----------
-    outside : array (n,) of int
-        Transitions outside, by row.
-    largest : array (n,)
-        Largest width per step, normalised.
-    weighted : array (n,)
-        Largest √w_ii x width, normalised.
+    `outside` (n,): transitions outside, by row; `largest` (n,): largest width per step, normalised; `weighted` (n,):
+    largest √w_ii x width, normalised.
     """
 
     outside: NDArray[np.intp]
@@ -632,34 +507,13 @@ class Envelope(Protocol):
     ) -> None:
         """Centre and half-width of the bounds of samples in columns, into given arrays.
 
-        Parameters
-        ----------
-        z : array (n + m + q, K)
-            Normalised [x; u; s].
-        dt : array (K,)
-            s.
-        centre, half : array (n, K)
-            Take the result.
-        base : array (n, K), optional
-            What the rates are added to; default the states.
+        `z` (n + m + q, K): normalised [x; u; s]; `dt` (K,): s; `centre, half` (n, K): take the result; `base` (n, K):
+        what the rates are added to; default the states.
         """
 
 
 def judge(part: Partition, model: Envelope) -> Judged:
-    """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`.
-
-    Parameters
-    ----------
-    part : Partition
-        The transitions.
-    model : Envelope
-        The model, or a horizon.
-
-    Returns
-    -------
-    Judged
-        Outside is 0 where every transition is contained.
-    """
+    """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`."""
     zeros = np.zeros(part.n)
     total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
     for block, cells, some in _pieces_as_sorted(part):
@@ -701,20 +555,9 @@ def _centre_and_half(model: Envelope, block: Block) -> tuple[Array, Array]:
 class _Quick:
     """Bounds of some transitions by sums in another order than the verdict's, and how far they can be off.
 
-    Parameters
-    ----------
-    distance : array (n, K)
-        Centre less x_next.
-    half : array (n, K)
-        Half-width less the floor.
-    floor : array (n,)
-        Part of every half-width.
-    widest : array (n,)
-        No half-width less the floor is larger.
-    error : array (n,)
-        No distance is off by more.
-    relative : float
-        Rounding of the sums, relative to what they add.
+    `distance` (n, K): centre less x_next; `half` (n, K): half-width less the floor; `floor` (n,): part of every half-
+    width; `widest` (n,): no half-width less the floor is larger; `error` (n,): no distance is off by more; `relative`:
+    rounding of the sums, relative to what they add.
     """
 
     distance: Array
@@ -803,21 +646,7 @@ def _judged_in_doubt(block: Block, model: Envelope, known: Array, cells: Cells |
     verdict's arithmetic too; the others are judged by it. The bound is that of a sum of k products, k ε Σ |a b| (Higham
     2002, section 3.1), with room to spare.
 
-    Parameters
-    ----------
-    block : Block
-        The transitions, with weights that are constant in time.
-    model : Envelope
-        The model, or a horizon.
-    known : array (n,)
-        Widths that were found already; transitions that are narrower need not be judged.
-    cells : Cells or None
-        How they are sorted, where the model has a schedule.
-
-    Returns
-    -------
-    Judged or None
-        None where the doubt is not worth the trouble; widths are 0 where none is larger than what was known.
+    `known` (n,): widths that were found already; transitions that are narrower need not be judged.
     """
     quick = _Quick.of(block, model, cells)
     error, half, widest, floor = quick.error, quick.half, quick.widest, quick.floor
@@ -854,29 +683,9 @@ def envelope_sums(part: Partition, model: Envelope, stride: int) -> tuple[Array,
     That is the residual x_next - centre of every transition, the utilisation (x_next - centre) / half, their products,
     and the widths per step at the transitions of each block, those of which it has the largest weight.
 
-    Parameters
-    ----------
-    part : Partition
-        The transitions.
-    model : Envelope
-        Gives the centre and the half-width.
-    stride : int
-        Of every so many transitions, one is returned by itself.
-
-    Returns
-    -------
-    array (2, n)
-        Σ r of the utilisation, then of the residual.
-    array (2, n, n)
-        Σ r rᵀ of the same.
-    array (R, n)
-        Of each block of a schedule the sum of the widths, normalised.
-    array (R, n)
-        Of each block of a schedule the largest width.
-    array (K, n)
-        Some residuals.
-    array (K, n)
-        Their half-widths.
+    Returns (2, n): Σ r of the utilisation, then of the residual; Returns (2, n, n): Σ r rᵀ of the same; Returns (R, n):
+    of each block of a schedule the sum of the widths, normalised; Returns (R, n): of each block of a schedule the
+    largest width; Returns (K, n): some residuals; Returns (K, n): their half-widths.
     """
     columns, n = part.columns, part.n
     total, products = np.zeros((2, n)), np.zeros((2, n, n))
@@ -905,22 +714,7 @@ def envelope_sums(part: Partition, model: Envelope, stride: int) -> tuple[Array,
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:
-    """Samples with x = u = 0 and a successor that is not 0.
-
-    Parameters
-    ----------
-    part : Partition
-        The transitions.
-
-    Returns
-    -------
-    int
-        How many.
-    int
-        The state that moves most.
-    float
-        How far, normalised.
-    """
+    """Samples with x = u = 0 and a successor that is not 0."""
     count, state, step = 0, 0, 0.0
     for block in part.blocks():
         rest = ~block.z.any(axis=0)
@@ -935,30 +729,11 @@ def moving_from_rest(part: Partition) -> tuple[int, int, float]:
 def steps(part: Partition) -> Array:
     """Step of every transition.
 
-    Parameters
-    ----------
-    part : Partition
-        The transitions.
-
-    Returns
-    -------
-    array (N,)
-        Δt, s.
+    Returns (N,): Δt, s.
     """
     return np.concatenate([block.dt for block in part.blocks()])
 
 
 def least_eigenvalue(part: Partition) -> float:
-    """Least eigenvalue of any full weight, its diagonal scaled to ones.
-
-    Parameters
-    ----------
-    part : Partition
-        The transitions, with full weights.
-
-    Returns
-    -------
-    float
-        Positive, at most 1.
-    """
+    """Least eigenvalue of any full weight, its diagonal scaled to ones."""
     return min(float(scaled_eigenvalues(block.weights)[:, 0].min()) for block in part.blocks())

@@ -29,22 +29,9 @@ BLOCK = 16384
 class Block:
     """Some transitions in columns.
 
-    Parameters
-    ----------
-    start : int
-        Position of the first among those of the partition.
-    z : array (p, K)
-        [x; u].
-    x_next : array (n, K)
-        Next states.
-    dt : array (K,)
-        Δt, s.
-    weights : array (n,), (K, n) or (K, n, n)
-        W(t_{k+1}).
-    s : array (q, K), optional
-        Scheduling signals that are neither state nor control.
-    base : array (n, K), optional
-        What a step is counted from, over a horizon the run of the nominal model; default the states.
+    `start`: position of the first among those of the partition; `z` (p, K): [x; u]; `x_next` (n, K): next states; `dt`
+    (K,): Δt, s; `weights` (n,): W(t_{k+1}); `s` (q, K): scheduling signals that are neither state nor control; `base`
+    (n, K): what a step is counted from, over a horizon the run of the nominal model; default the states.
     """
 
     start: int
@@ -64,20 +51,7 @@ class Block:
         return len(self.x_next)
 
     def piece(self, start: int, stop: int) -> Block:
-        """Some consecutive transitions, without a copy.
-
-        Parameters
-        ----------
-        start : int
-            First transition.
-        stop : int
-            First transition after it.
-
-        Returns
-        -------
-        Block
-            Views.
-        """
+        """Some consecutive transitions, without a copy."""
         weights = self.weights if self.weights.ndim == 1 else self.weights[start:stop]
         part = slice(start, stop)
         s = None if self.s is None else self.s[:, part]
@@ -85,20 +59,7 @@ class Block:
         return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights, s, base)
 
     def every(self, first: int, stride: int) -> Block:
-        """A copy of every stride-th transition from the first.
-
-        Parameters
-        ----------
-        first : int
-            First transition.
-        stride : int
-            Distance of those taken.
-
-        Returns
-        -------
-        Block
-            A copy; its start is that of the block.
-        """
+        """A copy of every stride-th transition from the first."""
         weights = self.weights if self.weights.ndim == 1 else self.weights[first::stride].copy()
         part = slice(first, None, stride)
         s = None if self.s is None else self.s[:, part].copy()
@@ -110,15 +71,7 @@ class Block:
     def take(self, index: NDArray[np.intp]) -> Block:
         """A copy of some transitions.
 
-        Parameters
-        ----------
-        index : array of int (K,)
-            Positions in the block.
-
-        Returns
-        -------
-        Block
-            Its start is that of the block.
+        `index` (K,): positions in the block.
         """
         weights = self.weights if self.weights.ndim == 1 else self.weights[index]
         s = None if self.s is None else self.s[:, index]
@@ -133,10 +86,7 @@ class Block:
     def rate(self) -> Array:
         """(x_next - x) / Δt.
 
-        Returns
-        -------
-        array (n, K)
-            1/s.
+        Returns (n, K): 1/s.
         """
         rate = self.x_next - self.origin
         rate /= self.dt
@@ -150,40 +100,21 @@ class Block:
     def phi(self, columns: Columns) -> Array:
         """Regressors of the nominal row.
 
-        Parameters
-        ----------
-        columns : Columns
-            Terms that are unknown.
-
-        Returns
-        -------
-        array (r, K)
-            As of `Columns.phi`.
+        Returns (r, K): as of `Columns.phi`.
         """
         return columns.phi(self.z, self.s)
 
     def psi(self, columns: Columns) -> Array:
         """Regressors of the half-width.
 
-        Parameters
-        ----------
-        columns : Columns
-            Terms that are unknown.
-
-        Returns
-        -------
-        array (q, K)
-            As of `Columns.psi`.
+        Returns (q, K): as of `Columns.psi`.
         """
         return columns.psi(self.z, self.dt, self.s)
 
     def root_weights(self) -> Array:
         """Roots of the diagonal weights.
 
-        Returns
-        -------
-        array (n, K) or (n, 1)
-            √w_ii(t_{k+1}).
+        Returns (n, K): √w_ii(t_{k+1}).
         """
         if self.weights.ndim == 1:
             return np.sqrt(self.weights)[:, None]
@@ -228,13 +159,7 @@ class Partition(Protocol):
         ...
 
     def blocks(self) -> Iterator[Block]:
-        """All transitions, in blocks that stay in the cache.
-
-        Returns
-        -------
-        iterator of Block
-            In order.
-        """
+        """All transitions, in blocks that stay in the cache."""
         ...
 
 
@@ -242,26 +167,11 @@ class Partition(Protocol):
 class Problem:
     """A `Partition` in memory, of all recordings.
 
-    Parameters
-    ----------
-    z_columns : array (p, N)
-        [x; u], samples in columns.
-    next_columns : array (n, N)
-        Next states, samples in columns.
-    dt : array (N,)
-        Δt, s.
-    source : array (N,) of int
-        Transient that a transition comes from.
-    k : array (N,) of int
-        Its sample in that transient.
-    weights : array (n,), (N, n) or (N, n, n)
-        W(t_{k+1}).
-    columns : Columns
-        Terms that are unknown.
-    s_columns : array (q, N), optional
-        Scheduling signals that are neither state nor control, samples in columns.
-    base_columns : array (n, N), optional
-        What a step is counted from, over a horizon the run of the nominal model; default the states.
+    `z_columns` (p, N): [x; u], samples in columns; `next_columns` (n, N): next states, samples in columns; `dt` (N,):
+    Δt, s; `source` (N,): transient that a transition comes from; `k` (N,): its sample in that transient; `weights`
+    (n,): W(t_{k+1}); `columns`: terms that are unknown; `s_columns` (q, N): scheduling signals that are neither state
+    nor control, samples in columns; `base_columns` (n, N): what a step is counted from, over a horizon the run of the
+    nominal model; default the states.
     """
 
     z_columns: Array
@@ -301,18 +211,7 @@ class Problem:
         return self.next_columns.T
 
     def block(self, part: slice) -> Block:
-        """Transitions of a slice, without a copy.
-
-        Parameters
-        ----------
-        part : slice
-            With a step of 1.
-
-        Returns
-        -------
-        Block
-            Views.
-        """
+        """Transitions of a slice, without a copy."""
         weights = self.weights if self.weights.ndim == 1 else self.weights[part]
         s = None if self.s_columns is None else self.s_columns[:, part]
         base = None if self.base_columns is None else self.base_columns[:, part]
@@ -321,89 +220,40 @@ class Problem:
         )
 
     def blocks(self) -> Iterator[Block]:
-        """All transitions, in blocks that stay in the cache.
-
-        Yields
-        ------
-        Block
-            Up to BLOCK transitions.
-        """
+        """All transitions, in blocks that stay in the cache."""
         for start in range(0, self.N, BLOCK):
             yield self.block(slice(start, min(start + BLOCK, self.N)))
 
     def rate(self, part: slice = slice(None)) -> Array:
         """(x_next - x) / Δt with samples in rows.
 
-        Parameters
-        ----------
-        part : slice, optional
-            Transitions; default all.
-
-        Returns
-        -------
-        array (K, n)
-            1/s.
+        Returns (K, n): 1/s.
         """
         return self.block(part).rate().T
 
     def phi(self, part: slice = slice(None)) -> Array:
         """Regressors of the nominal row with samples in rows.
 
-        Parameters
-        ----------
-        part : slice, optional
-            Transitions; default all.
-
-        Returns
-        -------
-        array (K, r)
-            As of `Block.phi`.
+        Returns (K, r): as of `Block.phi`.
         """
         return self.block(part).phi(self.columns).T
 
     def psi(self, part: slice = slice(None)) -> Array:
         """Regressors of the half-width with samples in rows.
 
-        Parameters
-        ----------
-        part : slice, optional
-            Transitions; default all.
-
-        Returns
-        -------
-        array (K, q)
-            As of `Block.psi`.
+        Returns (K, q): as of `Block.psi`.
         """
         return self.block(part).psi(self.columns).T
 
     def row_weights(self, part: slice = slice(None)) -> Array:
         """Diagonal weights with samples in rows.
 
-        Parameters
-        ----------
-        part : slice, optional
-            Transitions; default all.
-
-        Returns
-        -------
-        array (K, n)
-            w_ii(t_{k+1}).
+        Returns (K, n): w_ii(t_{k+1}).
         """
         return np.broadcast_to(self.block(part).root_weights().T ** 2, (len(self.dt[part]), self.n))
 
     def subset(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Problem:
-        """The same problem on some transitions; a slice is no copy.
-
-        Parameters
-        ----------
-        index : array of int or bool, or slice
-            Transitions.
-
-        Returns
-        -------
-        Problem
-            With the same columns.
-        """
+        """The same problem on some transitions; a slice is no copy."""
         weights = self.weights if self.weights.ndim == 1 else self.weights[index]
         z, x_next = self.z_columns[:, index], self.next_columns[:, index]
         if not isinstance(index, slice):  # numpy would lay the copy out in rows
@@ -421,18 +271,7 @@ class Problem:
         )
 
     def without(self, index: NDArray[np.intp]) -> Problem:
-        """The same problem without some transitions.
-
-        Parameters
-        ----------
-        index : array of int
-            Transitions.
-
-        Returns
-        -------
-        Problem
-            A copy of the others.
-        """
+        """The same problem without some transitions."""
         keep = np.ones(self.N, dtype=bool)
         keep[index] = False
         return self.subset(keep)

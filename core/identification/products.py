@@ -28,17 +28,7 @@ def _stacked(columns: Array, width: int) -> Array:
 def gram_of(a: Array, b: Array) -> Array:
     """Sum of the products of two sets of columns, a bᵀ.
 
-    Parameters
-    ----------
-    a : array (r, K)
-        Columns.
-    b : array (s, K)
-        Columns.
-
-    Returns
-    -------
-    array (r, s)
-        The sum over the K.
+    `a` (r, K): columns; `b` (s, K): columns; Returns (r, s): the sum over the K.
     """
     count = a.shape[1]
     width = max(_SINGLE_THREADED // (len(a) * len(b)), 512)
@@ -52,17 +42,7 @@ def gram_of(a: Array, b: Array) -> Array:
 def product(matrix: Array, columns: Array) -> Array:
     """Product of a matrix with every column.
 
-    Parameters
-    ----------
-    matrix : array (s, r)
-        Narrow.
-    columns : array (r, K)
-        Many.
-
-    Returns
-    -------
-    array (s, K)
-        matrix @ columns.
+    `matrix` (s, r): narrow; `columns` (r, K): many; Returns (s, K): matrix @ columns.
     """
     count = columns.shape[1]
     width = max(_SINGLE_THREADED // matrix.size, 512)

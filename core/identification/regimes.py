@@ -41,10 +41,7 @@ RANK = 1e-12
 class Modes:
     """Modes of a discrete scheduling signal, each with a block of its own.
 
-    Parameters
-    ----------
-    values : sequence of float
-        In recorded units.
+    `values`: in recorded units.
     """
 
     values: Sequence[float]
@@ -61,20 +58,6 @@ def tied_blocks(sums: Moments, columns: Columns, p: int) -> list[int]:
     must move in as many independent ways as those of all blocks together. A block that lacks either is tied to the
     nearest that does not: the least number of knots away, of two the one with more transitions; to another mode only
     if no knot of its own mode will do. If every block lacks them, all are tied to the one with most transitions.
-
-    Parameters
-    ----------
-    sums : Moments
-        Of all data.
-    columns : Columns
-        With the schedule.
-    p : int
-        Number of states and controls.
-
-    Returns
-    -------
-    list of int
-        One per block; [0] of a model without a schedule.
     """
     if columns.regimes is None:
         return [0]
@@ -97,21 +80,8 @@ MOST = 10_000
 def lacking(gram: Array, visits: NDArray[np.intp], columns: Columns, p: int) -> list[str]:
     """What each block lacks for elements of its own.
 
-    Parameters
-    ----------
-    gram : array (R r, R r)
-        Of the regressors of the nominal row.
-    visits : array (R,) of int
-        Transitions of which each block has the largest weight.
-    columns : Columns
-        With the schedule.
-    p : int
-        Number of states and controls.
-
-    Returns
-    -------
-    list of str
-        One per block, in words; empty if it lacks nothing.
+    `gram` (R r, R r): of the regressors of the nominal row; `visits` (R,): transitions of which each block has the
+    largest weight.
     """
     assert columns.regimes is not None
     schedule, positions = columns.regimes.schedule, columns.regimes.positions
@@ -143,20 +113,7 @@ def _rank(gram: Array) -> int:
 
 
 def block_data(sums: Moments, tied: Sequence[int]) -> tuple[BlockData, ...]:
-    """Facts on each block, for the model file.
-
-    Parameters
-    ----------
-    sums : Moments
-        Of all data.
-    tied : sequence of int
-        Of `tied_blocks`.
-
-    Returns
-    -------
-    tuple of BlockData
-        One per block.
-    """
+    """Facts on each block, for the model file."""
     return tuple(
         BlockData(int(count), None if block == r else block)
         for r, (count, block) in enumerate(zip(sums.visits, tied, strict=True))
@@ -166,28 +123,7 @@ def block_data(sums: Moments, tied: Sequence[int]) -> tuple[BlockData, ...]:
 def tied_words(
     schedule: Schedule, sums: Moments, columns: Columns, p: int, tied: Sequence[int], signals: Sequence[Signal]
 ) -> list[str]:
-    """Which blocks share the elements of another, and why.
-
-    Parameters
-    ----------
-    schedule : Schedule
-        The schedule.
-    sums : Moments
-        Of all data.
-    columns : Columns
-        With the schedule.
-    p : int
-        Number of states and controls.
-    tied : sequence of int
-        Of `tied_blocks`.
-    signals : sequence of Signal
-        With the operating point.
-
-    Returns
-    -------
-    list of str
-        Messages, one per block that is tied.
-    """
+    """Which blocks share the elements of another, and why."""
     messages = []
     reasons = lacking(sums.centre, sums.visits, columns, p)
     for r, (reason, block) in enumerate(zip(reasons, tied, strict=True)):
@@ -204,41 +140,12 @@ def tied_words(
 
 
 def asked_by(signals: SignalMap) -> dict[str, Knots]:
-    """The schedule that a signals file asks for.
-
-    Parameters
-    ----------
-    signals : SignalMap
-        The signals.
-
-    Returns
-    -------
-    dict
-        Scheduling signals with their knots, "auto" as it is, or their modes; empty for one block.
-    """
+    """The schedule that a signals file asks for."""
     return {rule.signal: Modes(rule.modes) if rule.knots is None else rule.knots for rule in signals.schedule}
 
 
 def signals_of(schedule: Schedule | Mapping[str, Knots] | None, names: Sequence[str]) -> list[str]:
-    """The signals that a fit is scheduled on.
-
-    Parameters
-    ----------
-    schedule : Schedule or mapping
-        As `fit` takes it, but not None.
-    names : sequence of str
-        Names of all signals.
-
-    Returns
-    -------
-    list of str
-        Their names; without those that are to have one knot.
-
-    Raises
-    ------
-    FitError
-        There is no such signal.
-    """
+    """The signals that a fit is scheduled on."""
     if isinstance(schedule, Schedule):
         return [axis.signal for axis in schedule.axes]
     if not isinstance(schedule, Mapping):
@@ -252,20 +159,7 @@ def signals_of(schedule: Schedule | Mapping[str, Knots] | None, names: Sequence[
 
 
 def unused(further: Sequence[str], on: Sequence[str]) -> list[str]:
-    """What is noted of further scheduling signals that schedule nothing.
-
-    Parameters
-    ----------
-    further : sequence of str
-        Their names.
-    on : sequence of str
-        Signals that the fit is scheduled on, or that it was to choose knots for.
-
-    Returns
-    -------
-    list of str
-        A message for each.
-    """
+    """What is noted of further scheduling signals that schedule nothing."""
     return [
         f"scheduling signal '{name}' schedules nothing, and the model leaves it out; use it with --schedule {name}=auto"
         for name in further
@@ -274,20 +168,7 @@ def unused(further: Sequence[str], on: Sequence[str]) -> list[str]:
 
 
 def check_names(schedule: Iterable[str], names: Sequence[str]) -> None:
-    """Check that there are one or two scheduling signals at most, and that they exist.
-
-    Parameters
-    ----------
-    schedule : iterable of str
-        Their names.
-    names : sequence of str
-        Names of all signals.
-
-    Raises
-    ------
-    FitError
-        There are more, or there is no such signal; names those that are near.
-    """
+    """Check that there are one or two scheduling signals at most, and that they exist."""
     asked = list(schedule)
     if len(asked) > MOST_AXES:
         raise FitError(f"schedule: {plural(len(asked), 'scheduling signal')}; give one or two")
@@ -303,28 +184,7 @@ def scheduled_by(
     signals: SignalMap,
     data: Callable[[], Problem] | None = None,
 ) -> Schedule | None:
-    """What a fit is scheduled by.
-
-    Parameters
-    ----------
-    schedule : Schedule, mapping or None
-        As `fit` takes it; None for that of the signals file.
-    signals : SignalMap
-        With the operating point.
-    data : callable, optional
-        Gives the data, without a schedule, on which knots are placed if only their number is known; default none.
-
-    Returns
-    -------
-    Schedule or None
-        Normalised; None for one block.
-
-    Raises
-    ------
-    FitError
-        There is no such signal, knots do not increase or are none, or a signal that is to have several never moves;
-        names the signal.
-    """
+    """What a fit is scheduled by."""
     if schedule is None:
         schedule = asked_by(signals)
     if isinstance(schedule, Schedule):
@@ -426,17 +286,7 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
 def values_of(problem: Problem, row: int) -> Array:
     """A row of [x; u; s].
 
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    row : int
-        Its position.
-
-    Returns
-    -------
-    array (N,)
-        Normalised.
+    Returns (N,): normalised.
     """
     p = problem.p
     values: Array = problem.z_columns[row] if row < p or problem.s_columns is None else problem.s_columns[row - p]

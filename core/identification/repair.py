@@ -49,46 +49,12 @@ def repair(
     of |θ| + d for the products and sums and, for the state's own element, of 1 / Δt for the addition of x. What the
     structure fixes stays, to the bit; the other elements of the row cover its rounding.
 
-    Parameters
-    ----------
-    build : callable
-        (theta (r, n), d (q, n)) -> what has the bounds.
-    fleet : Fleet
-        The data of the fit.
-    sums : Moments
-        Of the fit.
-    theta : array (r, n)
-        Nominal elements, 1/s.
-    d : array (q, n)
-        Half-widths of the solver.
-    violation : array (n,)
-        Times the size of a sample, which is the sum of |ψ| over their root mean squares.
-    limits : pair of array (q, n)
-        Least and largest half-widths that the structure allows.
-    units : array (q, n)
-        The size of a sample is units·ψ, of each row; 0 where a column is all zero.
-    shared : array (q, n) of int, optional
-        Of each half-width the first that it shares its value with; default none but itself.
-    gentle : bool
-        Try lifts far below an ulp first: for an envelope so narrow that a few ulps are much of it.
-    names : sequence of str
-        Of the states, for errors.
-    sizes : array (n,), optional
-        Largest |x| that the rates are added to; default that of the states. What the step does not multiply covers it.
-
-    Returns
-    -------
-    model : E
-        With the lifted half-widths.
-    d : array (q, n)
-        Lifted.
-    judged : Judged
-        Widths, with none outside.
-
-    Raises
-    ------
-    FitError
-        Samples stay outside however far the half-widths are lifted.
+    `theta` (r, n): nominal elements, 1/s; `d` (q, n): half-widths of the solver; `violation` (n,): times the size of a
+    sample, which is the sum of |ψ| over their root mean squares; `limits` (q, n): least and largest half-widths that
+    the structure allows; `units` (q, n): the size of a sample is units·ψ, of each row; 0 where a column is all zero;
+    `shared` (q, n): of each half-width the first that it shares its value with; default none but itself; `sizes` (n,):
+    largest |x| that the rates are added to; default that of the states. What the step does not multiply covers it;
+    Returns (q, n): lifted.
     """
     n, p, columns = fleet.n, fleet.p, fleet.columns
     free = units > 0

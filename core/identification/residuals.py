@@ -47,14 +47,9 @@ OUTLYING = 10.0
 class Residuals:
     """What least squares on one sample leaves unexplained of each state's step.
 
-    Parameters
-    ----------
-    correlation : array (n, 2)
-        Autocorrelation at one and at two samples.
-    gain : array (n,)
-        Root mean square over that with the state's own value one sample earlier as well; ones if none is correlated.
-    curved : array (n,)
-        Root mean square over that with squares, products and magnitudes of the same sample as well; as above.
+    `correlation` (n, 2): autocorrelation at one and at two samples; `gain` (n,): root mean square over that with the
+    state's own value one sample earlier as well; ones if none is correlated; `curved` (n,): root mean square over that
+    with squares, products and magnitudes of the same sample as well; as above.
     """
 
     correlation: Array
@@ -62,18 +57,7 @@ class Residuals:
     curved: Array
 
     def follows(self, state: int) -> bool:
-        """Whether the next sample depends on more than these signals at one instant.
-
-        Parameters
-        ----------
-        state : int
-            Position of the state.
-
-        Returns
-        -------
-        bool
-            True if the residual is autocorrelated, one sample more reduces it, and no curve does as well.
-        """
+        """Whether the next sample depends on more than these signals at one instant."""
         correlated = _autocorrelated(*self.correlation[state].tolist())
         gain = float(self.gain[state])
         return bool(correlated and gain >= GAIN and self.curved[state] - 1.0 < CURVED * (gain - 1.0))
@@ -88,18 +72,7 @@ def _autocorrelated(one: float, two: float) -> bool:
 
 
 def residuals(problem: Problem) -> Residuals | None:
-    """Residuals of least squares, and what would explain them.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-
-    Returns
-    -------
-    Residuals or None
-        None if too few transitions follow one another.
-    """
+    """Residuals of least squares, and what would explain them."""
     n, p = problem.n, problem.p
     before = successive(problem)
     if len(before) < 40 * p:
@@ -160,41 +133,13 @@ def _correlation(problem: Problem, now: NDArray[np.intp]) -> Array:
 
 
 def lagged_states(signals: Sequence[Signal], n: int) -> set[int]:
-    """Controls that are a state some samples earlier, or follow from its earlier samples.
-
-    Parameters
-    ----------
-    signals : sequence of Signal
-        States, then controls.
-    n : int
-        Number of states.
-
-    Returns
-    -------
-    set of int
-        Their columns among [x; u].
-    """
+    """Controls that are a state some samples earlier, or follow from its earlier samples."""
     states = {(s.topic, s.inner) for s in signals[:n]}
     return {j for j, s in enumerate(signals) if j >= n and (s.delay > 0 or s.memory) and (s.topic, s.inner) in states}
 
 
 def missing(known: Residuals, signals: Sequence[Signal], states: Collection[int]) -> list[str]:
-    """The sentence for each state whose next sample depends on more than the signals at one instant.
-
-    Parameters
-    ----------
-    known : Residuals
-        Of `residuals`.
-    signals : sequence of Signal
-        States, then controls.
-    states : collection of int
-        That the message is about.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """The sentence for each state whose next sample depends on more than the signals at one instant."""
     messages = []
     for i in sorted(states):
         signal = signals[i]
@@ -217,20 +162,7 @@ def missing(known: Residuals, signals: Sequence[Signal], states: Collection[int]
 
 
 def dominating(problem: Problem, state: int) -> NDArray[np.intp]:
-    """The few transitions that hold most of what one step leaves unexplained of a state.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    state : int
-        Position of the state.
-
-    Returns
-    -------
-    array of int
-        Positions, the largest first; empty if no few do.
-    """
+    """The few transitions that hold most of what one step leaves unexplained of a state."""
     square = _least_squares(problem)[:, state] ** 2
     most = min(FEW, problem.N // 200)
     largest = np.argsort(square)[::-1][:most]
@@ -247,24 +179,7 @@ def weak(
     names: Sequence[str],
     place: Callable[[Sequence[int]], str],
 ) -> list[str]:
-    """The sentence for each control whose effect is lost: the few transitions that hide it, or its small amplitude.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    lost : mapping of int to (int, float)
-        Of `excitation.lost`.
-    names : sequence of str
-        Of states and controls.
-    place : callable
-        Says in words when transitions happened.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """The sentence for each control whose effect is lost: the few transitions that hide it, or its small amplitude."""
     messages = []
     hiding = {state: dominating(problem, state) for state in {state for state, _ in lost.values()}}
     for j, (state, certainty) in lost.items():

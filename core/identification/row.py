@@ -72,16 +72,8 @@ JOIN = 48  # samples that join a working set per round, at least; more if there 
 class InfeasibleError(FitError):
     """A row cannot contain a transition, whatever its elements within the structure.
 
-    Parameters
-    ----------
-    row : int
-        The row of the model.
-    index : int
-        Position of the transition.
-    distance : float
-        How far it stays outside at best, normalised.
-    together : int, default 0
-        How many other transitions it contradicts, if it could be contained without them.
+    `row`: the row of the model; `index`: position of the transition; `distance`: how far it stays outside at best,
+    normalised; `together`: how many other transitions it contradicts, if it could be contained without them.
     """
 
     def __init__(self, row: int, index: int, distance: float, together: int = 0) -> None:
@@ -93,12 +85,8 @@ class InfeasibleError(FitError):
 class Chosen:
     """Columns that are unknowns; several columns may be one unknown.
 
-    Parameters
-    ----------
-    first : array (u,) of int
-        The first column of each unknown.
-    members : array (size,) of int or None
-        Of each column its unknown, -1 for none; None where every unknown is one column.
+    `first` (u,): the first column of each unknown; `members` (size,): of each column its unknown, -1 for none; None
+    where every unknown is one column.
     """
 
     first: Index
@@ -108,17 +96,8 @@ class Chosen:
     def of(cls, wanted: NDArray[np.bool_], shared: Index | None) -> Chosen:
         """Unknowns for the columns that are wanted.
 
-        Parameters
-        ----------
-        wanted : array (size,) of bool
-            Alike for all that share.
-        shared : array (size,) of int or None
-            Of each column the first that it shares its element with; None where none shares.
-
-        Returns
-        -------
-        Chosen
-            The unknowns.
+        `wanted` (size,): alike for all that share; `shared` (size,): of each column the first that it shares its
+        element with; None where none shares.
         """
         if shared is None:
             return cls(np.flatnonzero(wanted), None)
@@ -137,30 +116,14 @@ class Chosen:
     def take(self, rows: Array) -> Array:
         """Rows of each unknown, summed.
 
-        Parameters
-        ----------
-        rows : array (size, ...)
-            One for each column.
-
-        Returns
-        -------
-        array (u, ...)
-            One for each unknown.
+        `rows` (size, ...): one for each column; Returns (u, ...): one for each unknown.
         """
         return rows[self.first] if self.members is None else self.matrix.T @ rows
 
     def square(self, gram: Array) -> Array:
         """A Gram matrix of the unknowns.
 
-        Parameters
-        ----------
-        gram : array (size, size)
-            Of the columns.
-
-        Returns
-        -------
-        array (u, u)
-            Of the unknowns.
+        `gram` (size, size): of the columns; Returns (u, u): of the unknowns.
         """
         if self.members is None:
             return gram[np.ix_(self.first, self.first)]
@@ -169,12 +132,7 @@ class Chosen:
     def put(self, elements: Array, values: Array | float) -> None:
         """Write the unknowns to all their columns.
 
-        Parameters
-        ----------
-        elements : array (size,)
-            Takes the result.
-        values : array (u,) or float
-            Of each unknown.
+        `elements` (size,): takes the result; `values` (u,): of each unknown.
         """
         if self.members is None:
             elements[self.first] = values
@@ -188,16 +146,8 @@ class Row:
 
     Elements that the structure fixes, and columns that are 0 in every sample, are no unknowns.
 
-    Parameters
-    ----------
-    i : int
-        Which row of the model.
-    sums : Moments
-        Of all data.
-    bounds : four arrays
-        Of `Structure.stacked`.
-    shared : pair of array (r,) and (q,) of int, optional
-        Of each nominal element and each half-width the first that it shares its value with; default none but itself.
+    `i`: which row of the model; `sums`: of all data; `bounds`: of `Structure.stacked`; `shared` (r,): of each nominal
+    element and each half-width the first that it shares its value with; default none but itself.
     """
 
     def __init__(
@@ -356,10 +306,7 @@ class Row:
     def scaled(self) -> tuple[Array, Array]:
         """Return the row's elements as differences from its fixed part, in scaled units.
 
-        Returns
-        -------
-        array (r,), array (q,)
-            Of the nominal elements, without the basis, and of the half-widths.
+        Returns (r,): of the nominal elements, without the basis, and of the half-widths.
         """
         theta, d = self.theta[self.free_phi], self.d[self.free_psi]
         if self.refined:
@@ -389,10 +336,7 @@ class Row:
     def store(self, answer: Array) -> None:
         """Take scaled unknowns as the row's elements.
 
-        Parameters
-        ----------
-        answer : array (r + q,)
-            Scaled unknowns ξ.
+        `answer` (r + q,): scaled unknowns ξ.
         """
         self._store_theta(answer[: self.r])
         d = np.maximum(answer[self.r :], np.maximum(self.lower[self.r :], 0.0))
@@ -415,15 +359,7 @@ class Row:
         self.phi_columns.put(self.theta, theta + self.fixed_theta[self.free_phi] if self.refined else theta)
 
     def hold(self, samples: Samples, columns: Columns) -> None:
-        """Hold these samples, and the working set so far.
-
-        Parameters
-        ----------
-        samples : Samples
-            Of the last pass.
-        columns : Columns
-            Terms that the fit has.
-        """
+        """Hold these samples, and the working set so far."""
         self._columns = columns
         p = len(samples.z)
         kept = self.samples[self.pool]
@@ -445,12 +381,7 @@ class Row:
     def slacks(self) -> tuple[Array, Array | None]:
         """Slack of every held sample.
 
-        Returns
-        -------
-        array (K,)
-            From leaving the bounds.
-        array (K,) or None
-            From being wider than (11) allows; None without a limit.
+        Returns (K,): from leaving the bounds; Returns (K,): from being wider than (11) allows; None without a limit.
         """
         theta, d = self.scaled()
         half = self.psi @ d + self.half
@@ -460,10 +391,7 @@ class Row:
     def slack(self) -> Array:
         """Slack of every held sample, the lesser of both; see `passes.scan`.
 
-        Returns
-        -------
-        array (K,)
-            Negative where the sample is violated.
+        Returns (K,): negative where the sample is violated.
         """
         inside, room = self.slacks()
         return inside if room is None else np.minimum(inside, room)
@@ -473,18 +401,6 @@ class Row:
 
         Where the widths of many samples are the largest one, which is so where noise alone makes them, only those
         that are too wide matter.
-
-        Parameters
-        ----------
-        share : float
-            Of all samples.
-
-        Returns
-        -------
-        float
-            Slack from leaving the bounds.
-        float
-            Slack from being too wide.
         """
         inside, room = self.slacks()
         least = 10 * self.tolerance
@@ -493,18 +409,7 @@ class Row:
         return wanted, min(width, wanted) if width > 1e-6 else 0.0
 
     def widen_pool(self, most: int | None = None) -> bool:
-        """Let the most violated held samples join the working set.
-
-        Parameters
-        ----------
-        most : int, optional
-            Samples at most; default twice the unknowns, or a fixed number if that is more.
-
-        Returns
-        -------
-        bool
-            False if there is none to join.
-        """
+        """Let the most violated held samples join the working set."""
         slack = self.slack()
         slack[self.pool] = np.inf
         outside = np.flatnonzero(slack < -self.tolerance)
@@ -517,17 +422,7 @@ class Row:
     def containment(self, pool: Index) -> tuple[Array, Array]:
         """Containment (8)(9) of some samples as G ξ >= h.
 
-        Parameters
-        ----------
-        pool : array of int
-            Positions among the held samples.
-
-        Returns
-        -------
-        array (2 K, r + q)
-            G.
-        array (2 K,)
-            h.
+        Returns (2 K, r + q): G; Returns (2 K,): h.
         """
         phi, psi = self.phi[pool], self.psi[pool]
         y, half = self.y[pool], self.half[pool]
@@ -536,23 +431,8 @@ class Row:
     def hessian(self, gram: Array, linear: Array, tie_break: float, ridge: float = 1e-10) -> tuple[Array, Array]:
         """Objective of squared widths, plus the tie-break on the centre.
 
-        Parameters
-        ----------
-        gram : array (q, q)
-            Quadratic term of the half-widths.
-        linear : array (q,)
-            Their linear term.
-        tie_break : float
-            Weight of the centre, relative to the least diagonal element of `gram`.
-        ridge : float, default 1e-10
-            Added to the centre's diagonal, for what moves together in every sample.
-
-        Returns
-        -------
-        array (r + q, r + q)
-            H.
-        array (r + q,)
-            f.
+        `gram` (q, q): quadratic term of the half-widths; `linear` (q,): their linear term; Returns (r + q, r + q): H;
+        Returns (r + q,): f.
         """
         H = np.zeros((self.r + self.q, self.r + self.q))
         diagonal = np.diagonal(gram)
@@ -609,18 +489,7 @@ class Row:
         return np.vstack([G, rows]), np.concatenate([h, self.asked_limits])
 
     def solve_quadratic(self) -> str:
-        """Solve (10) on the working set.
-
-        Returns
-        -------
-        str
-            Who found it.
-
-        Raises
-        ------
-        FitError
-            No solver found an answer.
-        """
+        """Solve (10) on the working set."""
         answer, solver = self._solve(
             "quadratic",
             lambda factor, ridge: self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge),
@@ -633,18 +502,7 @@ class Row:
         return solver
 
     def solve_regularised(self) -> str:
-        """Solve (11) with a little of the squared widths on the working set.
-
-        Returns
-        -------
-        str
-            Who found it.
-
-        Raises
-        ------
-        FitError
-            No solver found an answer.
-        """
+        """Solve (11) with a little of the squared widths on the working set."""
         size = self.r + self.q
 
         def objective(factor: float, ridge: float) -> tuple[Array, Array]:
@@ -664,18 +522,7 @@ class Row:
         return solver
 
     def solve_linear(self) -> str:
-        """Solve (11) on the working set, by the simplex method.
-
-        Returns
-        -------
-        str
-            Who found it.
-
-        Raises
-        ------
-        FitError
-            There is no optimum.
-        """
+        """Solve (11) on the working set, by the simplex method."""
         box = self.box
         if box is not None and self._simplex is None:
             self._unit = float(np.median(self.width[self.pool] if len(self.pool) else self.width))
@@ -762,18 +609,7 @@ class Row:
         return simplex
 
     def least_width(self) -> float:
-        """A lower bound of δ, in units of scale: the optimum of (11) on the samples that decide it, then on more.
-
-        Returns
-        -------
-        float
-            In units of scale.
-
-        Raises
-        ------
-        FitError
-            There is no optimum.
-        """
+        """A lower bound of δ, in units of scale: the optimum of (11) on the samples that decide it, then on more."""
         assert self.limit is not None
         inside, room = self.slacks()
         assert room is not None
@@ -802,11 +638,6 @@ class Row:
 
         The programme that is solved adds the tie-break and the ridge to the squared widths; both are bounded. inf
         where the columns are so collinear that the ridge is not.
-
-        Returns
-        -------
-        float
-            Relative.
         """
         theta, d = self.scaled()
         factor, ridge = self.attempt
@@ -842,12 +673,7 @@ class Row:
     def among(self, coupled: Array, widths: list[Array]) -> None:
         """Take the row's part of (10) with full weights, given the other rows, as its own.
 
-        Parameters
-        ----------
-        coupled : array (n q, n q)
-            Of `Moments`.
-        widths : list of array (q,)
-            Half-widths of all rows.
+        `coupled` (n q, n q): of `Moments`; `widths` (q,): half-widths of all rows.
         """
         q = len(self.d)
         mine = slice(self.i * q, (self.i + 1) * q)
@@ -864,16 +690,6 @@ class Row:
 
         If another row is wider by many orders of magnitude, what it weighs here is as many times steeper than the
         row's own part. Either this row follows it, and is solved in its units, or the row is as narrow as can be.
-
-        Returns
-        -------
-        str
-            The solver.
-
-        Raises
-        ------
-        FitError
-            No solver found an answer.
         """
         try:
             return self.solve_quadratic()
@@ -895,36 +711,16 @@ class Row:
     def value(self, d: Array) -> float:
         """Return half the mean of the squared half-widths of all samples, in scaled units.
 
-        Parameters
-        ----------
-        d : array (q,)
-            Scaled half-widths.
-
-        Returns
-        -------
-        float
-            The row's part of (10) but for a factor.
+        `d` (q,): scaled half-widths.
         """
         return max(float(0.5 * d @ self.gram @ d + self.linear @ d) + self.known, 0.0)
 
     def least_value(self) -> float:
-        """Return the `value` of an envelope so narrow that it is rounding.
-
-        Returns
-        -------
-        float
-            In the same units.
-        """
+        """Return the `value` of an envelope so narrow that it is rounding."""
         return 0.125 * (LEAST * self.rms_step / self.scale) ** 2
 
     def collinear(self) -> bool:
-        """Tell whether columns are so alike that the simplex method's tolerance is none on the envelope.
-
-        Returns
-        -------
-        bool
-            Never in refined coordinates.
-        """
+        """Tell whether columns are so alike that the simplex method's tolerance is none on the envelope."""
         return self.r > 0 and not self.refined and self._least_effect() < 1e-8
 
     @property
@@ -933,54 +729,27 @@ class Row:
         return float(self.sums.rate_scale[self.i])
 
     def outside(self) -> float:
-        """Return the largest violation of the samples held.
-
-        Returns
-        -------
-        float
-            In scaled units; 0 if none is violated.
-        """
+        """Return the largest violation of the samples held."""
         return max(0.0, -float(self.slack().min(initial=0.0)))
 
     def answer(self) -> tuple[Array, Array, float]:
         """Return what the row is now.
 
-        Returns
-        -------
-        array (r,), array (q,), float
-            Nominal elements, half-widths, and their largest violation in units of the size of a sample.
+        Returns (r,): nominal elements, half-widths, and their largest violation in units of the size of a sample.
         """
         return self.theta.copy(), self.d.copy(), self.outside() * self.scale
 
     def keep(self, answer: tuple[Array, Array, float]) -> None:
         """Return to an answer of before.
 
-        Parameters
-        ----------
-        answer : (array, array, float)
-            What `answer` returned.
+        `answer` (array, array, float): what `answer` returned.
         """
         self.theta, self.d, self.kept = answer
 
     def least_linear(self, cost: Array, most: Array | None = None) -> float:
         """Minimise costᵀ d over scaled half-widths that contain the working set.
 
-        Parameters
-        ----------
-        cost : array (q,)
-            Of the free half-widths.
-        most : array (q,), optional
-            They are no larger than this.
-
-        Returns
-        -------
-        float
-            The minimum.
-
-        Raises
-        ------
-        FitError
-            The simplex method found none.
+        `cost` (q,): of the free half-widths; `most` (q,): they are no larger than this.
         """
         upper = self.upper.copy()
         if most is not None:
@@ -994,11 +763,6 @@ class Row:
 
         (10) is convex, so its optimum is no less than its linearisation here at any elements that contain
         the working set. It needs neither multipliers nor a Hessian that can be inverted.
-
-        Returns
-        -------
-        float
-            Relative; inf if the simplex method found no bound.
         """
         _, d = self.scaled()
         slope = self.gram @ d + self.linear
@@ -1012,13 +776,7 @@ class Row:
         return max(float(slope @ d) - least, 0.0) / max(self.value(d), self.least_value())
 
     def lifted_loss(self) -> float:
-        """Estimate what lifting the half-widths over the violation that is left adds to the optimum.
-
-        Returns
-        -------
-        float
-            Relative.
-        """
+        """Estimate what lifting the half-widths over the violation that is left adds to the optimum."""
         _, d = self.scaled()
         outside = self.outside()
         if outside <= 0.0:
@@ -1041,18 +799,7 @@ class Row:
         )
 
     def solve_bounded(self) -> str:
-        """Least squared widths, then the centre, among the optima of (11).
-
-        Returns
-        -------
-        str
-            Who found it.
-
-        Raises
-        ------
-        FitError
-            There is no optimum.
-        """
+        """Least squared widths, then the centre, among the optima of (11)."""
         assert self.limit is not None and self._simplex is not None
         point, along = self._optima
         pool = self.pool
@@ -1163,19 +910,7 @@ class Row:
         self._store_theta(answer.xi)
 
     def contradiction(self) -> tuple[int, float, int] | None:
-        """A sample that no elements within the structure can contain, alone or with others.
-
-        Returns
-        -------
-        (int, float, int) or None
-            Index of the sample, its distance from the bounds at best, normalised, and how many others it contradicts:
-            0 if it could not be contained alone either. None if there is none.
-
-        Raises
-        ------
-        FitError
-            There is no optimum.
-        """
+        """A sample that no elements within the structure can contain, alone or with others."""
 
         def least(pool: Index) -> tuple[Array, Array, Array]:
             simplex = self._minimax()

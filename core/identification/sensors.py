@@ -48,22 +48,7 @@ STALE = 0.01
 
 
 def coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[str]:
-    """Signals in which a number means "no value".
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    sums : Moments
-        Of all data.
-    signals : sequence of Signal
-        States, then controls.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """Signals in which a number means "no value"."""
     messages = []
     for j, signal in enumerate(signals):
         if too_small(float(sums.low[j]), float(sums.high[j])):
@@ -83,22 +68,7 @@ def coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[st
 
 
 def flipped(problem: Problem, signals: Sequence[Signal], place: Callable[[Sequence[int]], str]) -> list[str]:
-    """Components of a quaternion that change sign together, and angles that wrap around.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    signals : sequence of Signal
-        States, then controls.
-    place : callable
-        Says in words when transitions happened.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """Components of a quaternion that change sign together, and angles that wrap around."""
     n = problem.n
     states = signals[:n]
     scale, steady = np.array([float(s.scale) for s in states]), np.array([float(s.steady) for s in states])
@@ -152,23 +122,6 @@ def jittering(problem: Problem, signals: Sequence[Signal], speed: float, clock: 
 
     Over the uneven steps, what a constant step explains is compared with what the stated one does. Of samples that are
     really uneven the stated one explains more.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    signals : sequence of Signal
-        States, then controls.
-    speed : float
-        |eigenvalue| x Δt of the fastest mode; from SLOW_STEP on a step hardly depends on its length, and nothing is
-        reported.
-    clock : str, optional
-        Topic whose stamps these are.
-
-    Returns
-    -------
-    list of str
-        Messages.
     """
     dt = problem.dt
     usual = float(np.median(dt))
@@ -197,20 +150,7 @@ def jittering(problem: Problem, signals: Sequence[Signal], speed: float, clock: 
 
 
 def quantised(problem: Problem, signals: Sequence[Signal]) -> list[str]:
-    """States recorded in steps that are not small against what they move by from sample to sample.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    signals : sequence of Signal
-        States, then controls.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """States recorded in steps that are not small against what they move by from sample to sample."""
     messages = []
     for i, signal in enumerate(signals[: problem.n]):
         x = problem.z[:, i]
@@ -238,20 +178,7 @@ def quantised(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 
 
 def held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
-    """States that repeat their last value between samples of a slower topic.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    signals : sequence of Signal
-        States, then controls.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """States that repeat their last value between samples of a slower topic."""
     messages = []
     follows = successive(problem)
     for i, signal in enumerate(signals[: problem.n]):
@@ -272,22 +199,7 @@ def held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 
 
 def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Transient]) -> list[str]:
-    """States that keep exactly one value for long while the other signals move.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    signals : sequence of Signal
-        States, then controls.
-    transients : sequence of Transient
-        The recordings, for their names.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """States that keep exactly one value for long while the other signals move."""
     messages = []
     spread = np.ptp(problem.z_columns, axis=1)
     for i, signal in enumerate(signals[: problem.n]):
@@ -320,24 +232,7 @@ def frozen(problem: Problem, signals: Sequence[Signal], transients: Sequence[Tra
 
 
 def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Sequence[Transient]) -> list[str]:
-    """Controls that were too old for many samples, or that ended long before the recording did.
-
-    Parameters
-    ----------
-    signals : sequence of Signal
-        States, then controls.
-    n : int
-        Number of states.
-    problem : Problem
-        The data.
-    transients : sequence of Transient
-        The recordings, with what the sampler counted.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """Controls that were too old for many samples, or that ended long before the recording did."""
     messages = []
     samples = sum(len(t) for t in transients)
     old: dict[tuple[int, float | None], list[str]] = {}
@@ -371,22 +266,7 @@ def stale(signals: Sequence[Signal], n: int, problem: Problem, transients: Seque
 
 
 def delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int] = ()) -> list[str]:
-    """Controls that explain the states better when taken some samples earlier.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    signals : sequence of Signal
-        States, then controls.
-    past : collection of int, optional
-        Columns that are a state some samples earlier, which are late by intention.
-
-    Returns
-    -------
-    list of str
-        Messages.
-    """
+    """Controls that explain the states better when taken some samples earlier."""
     messages = []
     for j, (best, share) in late_controls(problem, past).items():
         said = signals[problem.n + j].delay + best
@@ -399,20 +279,7 @@ def delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int] =
 
 
 def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tuple[int, float]]:
-    """Controls that explain the states clearly better when taken some samples earlier.
-
-    Parameters
-    ----------
-    problem : Problem
-        The data.
-    past : collection of int, optional
-        Columns that are a state some samples earlier, which are late by intention.
-
-    Returns
-    -------
-    dict of int to (int, float)
-        As of `lags`; empty where too few samples follow one another.
-    """
+    """Controls that explain the states clearly better when taken some samples earlier."""
     n, p = problem.n, problem.p
     follows = successive(problem)
     joined = np.zeros(problem.N, dtype=bool)
@@ -432,22 +299,8 @@ def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tup
 def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int, float]]:
     """Controls that explain the states clearly better some samples earlier.
 
-    Parameters
-    ----------
-    x : array (n, N)
-        States.
-    u : array (lags + 1, m, N)
-        Controls this many samples before.
-    increment : array (n, N)
-        What the states change by in a step.
-    dt : array (N,)
-        Step, s.
-
-    Returns
-    -------
-    dict of int to (int, float)
-        Control -> samples earlier, and the share by which less of an increment is left unexplained (root mean square).
-        A share below SURE_DELAY counts only if either half of the samples shows the same, within a sample.
+    `x` (n, N): states; `u` (lags + 1, m, N): controls this many samples before; `increment` (n, N): what the states
+    change by in a step; `dt` (N,): step, s.
     """
     found = _lags(x, u, increment, dt)
     if any(share < SURE_DELAY for _, share in found.values()):

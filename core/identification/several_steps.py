@@ -41,14 +41,7 @@ _DONE = 1e-3  # a smaller share of the squared error gained ends the rounds
 class Steps:
     """Transitions in a row, of K windows of one length at once: controls, weights of blocks, and Δt of each step.
 
-    Parameters
-    ----------
-    u : array (steps, K, m)
-        Normalised.
-    weights : array (steps, K, blocks)
-        Of the schedule; 1 without one.
-    dt : array (steps, K)
-        s.
+    `u` (steps, K, m): normalised; `weights` (steps, K, blocks): of the schedule; 1 without one; `dt` (steps, K): s.
     """
 
     u: Array
@@ -59,17 +52,7 @@ class Steps:
     def of(cls, problem: Problem, at: NDArray[np.intp]) -> Steps:
         """Of the transitions `at` (steps, K).
 
-        Parameters
-        ----------
-        problem : Problem
-            The transitions.
-        at : array (steps, K) of int
-            Their positions.
-
-        Returns
-        -------
-        Steps
-            What a run over them needs besides the elements.
+        `at` (steps, K): their positions.
         """
         regimes, z, s = problem.columns.regimes, problem.z_columns, problem.s_columns
         weights = np.ones((*at.shape, 1))
@@ -82,19 +65,8 @@ class Steps:
     def run(self, begin: Array, theta: Array) -> tuple[Array, list[Array]]:
         """States x̂ from `begin` on, and the regressors of each step, weighted.
 
-        Parameters
-        ----------
-        begin : array (K, n)
-            States before the first step.
-        theta : array (blocks, q, n)
-            Elements.
-
-        Returns
-        -------
-        array (steps + 1, K, n)
-            The states.
-        list of array (K, blocks, q)
-            Regressors.
+        `begin` (K, n): states before the first step; `theta` (blocks, q, n): elements; Returns (steps + 1, K, n): the
+        states; Returns (K, blocks, q): regressors.
         """
         x, used = [begin], []
         for u, w, dt in zip(self.u, self.weights, self.dt, strict=True):
@@ -106,17 +78,7 @@ class Steps:
     def transition(self, theta: Array, step: int) -> Array:
         """Derivative of the state after one step by that before it.
 
-        Parameters
-        ----------
-        theta : array (blocks, q, n)
-            Elements.
-        step : int
-            Which step.
-
-        Returns
-        -------
-        array (K, n, n)
-            I + Δt A, blended.
+        `theta` (blocks, q, n): elements; Returns (K, n, n): I + Δt A, blended.
         """
         n = theta.shape[2]
         blended = np.tensordot(self.weights[step], theta[:, :n].transpose(0, 2, 1), axes=1)
@@ -150,23 +112,8 @@ def _some(start: NDArray[np.intp], most: int) -> NDArray[np.intp]:
 def segments(problem: Problem, k: NDArray[np.intp], steps: int, samples: int) -> tuple[Steps, Array] | None:
     """Stretches of so many transitions in a row that do not overlap.
 
-    Parameters
-    ----------
-    problem : Problem
-        The transitions.
-    k : array of int (N,)
-        Numbers of their samples; where one does not follow the one before, a segment ends.
-    steps : int
-        Transitions of each.
-    samples : int
-        Of all together at most, about.
-
-    Returns
-    -------
-    Steps
-        Of K segments.
-    array (steps + 1, K, n)
-        The recorded states, normalised; None for both if there is no segment.
+    `k` (N,): numbers of their samples; where one does not follow the one before, a segment ends; Returns (steps + 1, K,
+    n): the recorded states, normalised; None for both if there is no segment.
     """
     start: list[int] = []
     for position in _starts(problem, k, steps).tolist():
@@ -192,12 +139,7 @@ def _windows(problem: Problem, k: NDArray[np.intp], steps: int) -> _Windows | No
 class Elements:
     """The unknown nominal elements of all rows as one vector, and what it means.
 
-    Parameters
-    ----------
-    rows : sequence of Row
-        With the elements by least squares of one step, and what is known of them.
-    blocks : int
-        Of the schedule.
+    `rows`: with the elements by least squares of one step, and what is known of them; `blocks`: of the schedule.
     """
 
     def __init__(self, rows: Sequence[Row], blocks: int) -> None:
@@ -219,15 +161,7 @@ class Elements:
     def theta(self, values: Array) -> Array:
         """Elements of values of the unknowns.
 
-        Parameters
-        ----------
-        values : array (size,)
-            The unknowns.
-
-        Returns
-        -------
-        array (blocks, q, n)
-            With those that are fixed.
+        `values` (size,): the unknowns; Returns (blocks, q, n): with those that are fixed.
         """
         parts = [values[a:b] for a, b in zip(self._at, self._at[1:], strict=False)]
         full = self._fixed + np.stack([v @ m for v, m in zip(parts, self._maps, strict=True)])
@@ -236,15 +170,7 @@ class Elements:
     def values(self, theta: Array) -> Array:
         """The unknowns of elements; what several blocks share is taken as their mean.
 
-        Parameters
-        ----------
-        theta : array (blocks, q, n)
-            Elements.
-
-        Returns
-        -------
-        array (size,)
-            The inverse of `theta`.
+        `theta` (blocks, q, n): elements; Returns (size,): the inverse of `theta`.
         """
         full = theta.reshape(-1, theta.shape[2]).T - self._fixed
         return np.concatenate([m @ row / m.sum(axis=1) for row, m in zip(full, self._maps, strict=True)])
@@ -252,12 +178,7 @@ class Elements:
     def add(self, by_unknowns: Array, regressors: Array) -> None:
         """Add to derivatives of states by the unknowns those of one step.
 
-        Parameters
-        ----------
-        by_unknowns : array (K, n, size)
-            Changed in place.
-        regressors : array (K, blocks q)
-            Of the step, weighted.
+        `by_unknowns` (K, n, size): changed in place; `regressors` (K, blocks q): of the step, weighted.
         """
         for i, (a, b, m) in enumerate(zip(self._at, self._at[1:], self._maps, strict=False)):
             by_unknowns[:, i, a:b] += regressors @ m.T
@@ -265,15 +186,7 @@ class Elements:
     def chosen(self, jacobian: Array) -> Array:
         """Derivatives by the unknowns, of those by the elements.
 
-        Parameters
-        ----------
-        jacobian : array (K, n, blocks q, n)
-            By the elements.
-
-        Returns
-        -------
-        array (K n, size)
-            By the unknowns.
+        `jacobian` (K, n, blocks q, n): by the elements; Returns (K n, size): by the unknowns.
         """
         columns = [jacobian[..., i] @ m.T for i, m in enumerate(self._maps)]
         return np.concatenate(columns, axis=2).reshape(-1, self.size)
@@ -300,22 +213,9 @@ def _jacobian(windows: _Windows, theta: Array, used: Sequence[Array]) -> Array:
 def runs_over_steps(problem: Problem, k: NDArray[np.intp], rows: Sequence[Row], longest: int) -> Iterator[Array]:
     """Elements by least squares 4, 8, 16... steps ahead, each from the one before, and as many as the longest window.
 
-    Parameters
-    ----------
-    problem : Problem
-        The transitions.
-    k : array of int (N,)
-        Numbers of their samples; where one does not follow the one before, windows end.
-    rows : sequence of Row
-        With the elements by least squares of one step, and what is known of them.
-    longest : int
-        Steps of the longest windows.
-
-    Yields
-    ------
-    array (blocks, q, n)
-        Elements θ of [x; u] or [x; u; 1], one block after another. Nothing where there are too many unknowns or no
-        windows, or no step makes the error smaller.
+    `k` (N,): numbers of their samples; where one does not follow the one before, windows end; Yields (blocks, q, n):
+    elements θ of [x; u] or [x; u; 1], one block after another. Nothing where there are too many unknowns or no windows,
+    or no step makes the error smaller.
     """
     elements = Elements(rows, problem.columns.count)
     if not 0 < elements.size <= MOST_UNKNOWNS:

@@ -31,15 +31,8 @@ FEASIBLE = 1e-9
 class Answer:
     """Minimiser ξ of a programme.
 
-    Parameters
-    ----------
-    xi : array (variables,)
-        ξ.
-    solver : str
-        Who found it.
-    active : array of int, or None
-        Of [bounds of ξ; rows of G]: 0 not active, 1 at the upper, 3 at the lower bound (DAQP's words); None where the
-        solver does not report it.
+    `xi` (variables,): ξ; `solver`: who found it; `active`: of [bounds of ξ; rows of G]: 0 not active, 1 at the upper, 3
+    at the lower bound (DAQP's words); None where the solver does not report it.
     """
 
     xi: Array
@@ -63,36 +56,8 @@ def solve_qp(
     H must be positive definite, everything scaled to order one. DAQP (dual active set, exact to rounding) first;
     PIQP if it gives up or returns what violates a row by more than `FEASIBLE`.
 
-    Parameters
-    ----------
-    H : array (v, v)
-        Positive definite.
-    f : array (v,)
-        Linear term.
-    G : array (K, v)
-        Rows of the constraints.
-    h : array (K,)
-        Their lower limits.
-    lower : array (v,)
-        Bounds of ξ; -inf for none.
-    upper : array (v,)
-        Bounds of ξ; inf for none.
-    active : array of int, optional
-        `Answer.active` of a programme like this one, to start from.
-    any_solver : bool
-        The others may try where DAQP gives up.
-    feasible : float
-        Largest violation, if no solver reaches `FEASIBLE`, of an answer that the caller will judge itself.
-
-    Returns
-    -------
-    Answer
-        The answer of least violation.
-
-    Raises
-    ------
-    FitError
-        No solver returned a feasible answer.
+    `H` (v, v): positive definite; `f` (v,): linear term; `G` (K, v): rows of the constraints; `h` (K,): their lower
+    limits; `lower` (v,): bounds of ξ; -inf for none; `upper` (v,): bounds of ξ; inf for none.
     """
     # a diagonal scaling makes a badly scaled Hessian harmless to every solver
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
@@ -161,27 +126,8 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
     least squares, in the units of the gradient and in those of L, of which either can be the better. -inf where
     there are none.
 
-    Parameters
-    ----------
-    H : array (v, v)
-        As in `solve_qp`.
-    f : array (v,)
-        As in `solve_qp`.
-    G : array (K, v)
-        As in `solve_qp`.
-    h : array (K,)
-        As in `solve_qp`.
-    lower : array (v,)
-        As in `solve_qp`.
-    upper : array (v,)
-        As in `solve_qp`.
-    xi : array (v,)
-        ξ, near the optimum.
-
-    Returns
-    -------
-    float
-        The bound, or -inf.
+    `H` (v, v): as in `solve_qp`; `f` (v,): as in `solve_qp`; `G` (K, v): as in `solve_qp`; `h` (K,): as in `solve_qp`;
+    `lower` (v,): as in `solve_qp`; `upper` (v,): as in `solve_qp`; `xi` (v,): ξ, near the optimum.
     """
     from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
@@ -224,14 +170,8 @@ _REMEDIES: tuple[dict[str, Any], ...] = (
 class Simplex:
     """A linear programme minimise costᵀξ, rows·ξ >= h, that grows by rows: HiGHS dual simplex, warm started.
 
-    Parameters
-    ----------
-    cost : array (variables,)
-        Linear objective.
-    lower : array (variables,)
-        Bounds of ξ; -inf for none.
-    upper : array (variables,)
-        Bounds of ξ; inf for none.
+    `cost` (variables,): linear objective; `lower` (variables,): bounds of ξ; -inf for none; `upper` (variables,):
+    bounds of ξ; inf for none.
     """
 
     def __init__(self, cost: Array, lower: Array, upper: Array) -> None:
@@ -260,12 +200,7 @@ class Simplex:
     def add(self, rows: Array, h: Array) -> None:
         """Add rows·ξ >= h.
 
-        Parameters
-        ----------
-        rows : array (K, variables)
-            Rows of the constraints.
-        h : array (K,)
-            Their lower limits.
+        `rows` (K, variables): rows of the constraints; `h` (K,): their lower limits.
         """
         count = len(rows)
         self._rows = np.vstack([self._rows, rows])
@@ -277,35 +212,21 @@ class Simplex:
         )
 
     def hold(self, rows: Iterable[int], h: Iterable[float]) -> None:
-        """Ask rows·ξ >= h of rows that are there already.
-
-        Parameters
-        ----------
-        rows : iterable of int
-            Numbers of the rows.
-        h : iterable of float
-            Their lower limits; -inf asks nothing.
-        """
+        """Ask rows·ξ >= h of rows that are there already."""
         for row, least in zip(rows, h, strict=True):
             self._highs.changeRowBounds(row, max(least, -self._infinity), self._infinity)
 
     def duals(self) -> Array:
         """What the optimum found last would rise by, per unit by which h rises.
 
-        Returns
-        -------
-        array (rows,)
-            One per row.
+        Returns (rows,): one per row.
         """
         return np.asarray(self._highs.getSolution().row_dual, dtype=np.float64)
 
     def drop(self, rows: Index) -> None:
         """Take rows out that the optimum found last does not rest on; it stays, and so does what it starts from.
 
-        Parameters
-        ----------
-        rows : array (K,) of int
-            Their numbers; those after them move up.
+        `rows` (K,): their numbers; those after them move up.
         """
         self._highs.deleteRows(len(rows), rows.astype(np.int32))
         self._rows, self._limits = np.delete(self._rows, rows, axis=0), np.delete(self._limits, rows)
@@ -313,15 +234,7 @@ class Simplex:
     def idle(self, most: int) -> Index:
         """Rows that the optimum found last is furthest from, of those that it does not rest on.
 
-        Parameters
-        ----------
-        most : int
-            So many are left.
-
-        Returns
-        -------
-        array (K,) of int
-            Their numbers; none if there are no more rows than that.
+        Returns (K,): their numbers; none if there are no more rows than that.
         """
         import highspy
 
@@ -337,10 +250,7 @@ class Simplex:
     def solution(self) -> Array:
         """The optimum found last.
 
-        Returns
-        -------
-        array (variables,)
-            ξ.
+        Returns (variables,): ξ.
         """
         return np.asarray(self._highs.getSolution().col_value, dtype=np.float64)
 
@@ -349,12 +259,7 @@ class Simplex:
 
         A row with a price, or an unknown with one, is at its limit in all of them.
 
-        Returns
-        -------
-        array (k,) of int
-            Numbers of rows.
-        array (l,) of int
-            Numbers of unknowns.
+        Returns (k,): numbers of rows; Returns (l,): numbers of unknowns.
         """
         prices = np.abs(self.duals())
         reduced = np.abs(np.asarray(self._highs.getSolution().col_dual, dtype=np.float64))
@@ -364,10 +269,7 @@ class Simplex:
     def carrying(self) -> Array:
         """What the optimum found last rests on, as rows.
 
-        Returns
-        -------
-        array (k, variables)
-            Rows as they were added, and unit vectors of unknowns.
+        Returns (k, variables): rows as they were added, and unit vectors of unknowns.
         """
         rows, unknowns = self.priced()
         return np.vstack([self._rows[rows], np.eye(self._size)[unknowns]])
@@ -375,15 +277,7 @@ class Simplex:
     def solve(self) -> Array:
         """Minimise.
 
-        Returns
-        -------
-        array (variables,)
-            Optimal ξ.
-
-        Raises
-        ------
-        FitError
-            There is no optimum.
+        Returns (variables,): optimal ξ.
         """
         self._highs.run()
         cycled = 0

@@ -28,18 +28,7 @@ _LIKELIER = 0.01
 def likelier_alone(residual: Array, half: Array) -> bool:
     """Whether one covariance of the residual describes it better than one of the utilisation.
 
-    Parameters
-    ----------
-    residual : array (K, n)
-        Of some transitions.
-    half : array (K, n)
-        Their half-widths.
-
-    Returns
-    -------
-    bool
-        False also where they do not differ, or where it cannot be said: a half-width is 0, or some state has no
-        residual of its own.
+    `residual` (K, n): of some transitions; `half` (K, n): their half-widths.
     """
     if not (half > 0.0).all() or len(residual) <= 2 * residual.shape[1]:
         return False

@@ -352,25 +352,7 @@ class Structure:
 def narrowed(
     bounds: tuple[Array, Array, Array, Array], shared: tuple[NDArray[np.intp], NDArray[np.intp]]
 ) -> tuple[Array, Array, Array, Array]:
-    """Bounds that hold for every element that is one with others.
-
-    Parameters
-    ----------
-    bounds : tuple of array
-        Of `Structure.stacked`.
-    shared : pair of array of int
-        Of `Structure.shared_elements`.
-
-    Returns
-    -------
-    tuple of array
-        As `bounds`: the greatest of their lower bounds, the least of their upper bounds.
-
-    Raises
-    ------
-    FitError
-        They leave nothing.
-    """
+    """Bounds that hold for every element that is one with others."""
     sides = []
     for low, high, same in zip(bounds[::2], bounds[1::2], shared, strict=True):
         rows = np.arange(low.shape[1])

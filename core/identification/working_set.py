@@ -50,26 +50,11 @@ _REMEDY = "a state may follow from the others exactly: leave it out, or fix its 
 class Solution:
     """Elements, one column per row of the model, and how they were found.
 
-    Parameters
-    ----------
-    theta : array (r, n)
-        Nominal elements, 1/s.
-    d : array (q, n)
-        Half-widths.
-    violation : array (n,)
-        Largest violation left, in units of the size of a sample.
-    delta : array (n,) or None, optional
-        Optimum of (11) on the working set, a lower bound of the optimum over all samples; None for (10).
-    rounds : int, default 0
-        Programmes solved on the working set.
-    passes : int, default 1
-        Passes over all transitions.
-    working : list of int, optional
-        Size of the working set of each row.
-    solvers : set of str, optional
-        Names of those that found it.
-    gap : float or None, optional
-        How far (10) is above a lower bound of its optimum at most, relative; inf if no bound was found, None for (11).
+    `theta` (r, n): nominal elements, 1/s; `d` (q, n): half-widths; `violation` (n,): largest violation left, in units
+    of the size of a sample; `delta` (n,): optimum of (11) on the working set, a lower bound of the optimum over all
+    samples; None for (10); `rounds`: programmes solved on the working set; `passes`: passes over all transitions;
+    `working`: size of the working set of each row; `solvers`: names of those that found it; `gap`: how far (10) is
+    above a lower bound of its optimum at most, relative; inf if no bound was found, None for (11).
     """
 
     theta: Array
@@ -90,16 +75,8 @@ class WorkingSet:
     unknowns change (the size of a sample is linear in |z|), so while they change less than the slack that was
     brought, no other sample can leave its bounds, and the proof of optimality needs no further pass.
 
-    Parameters
-    ----------
-    fleet : Fleet
-        The data.
-    structure : Structure, optional
-        As in `fit`.
-    excluded : array of int, optional
-        Transitions that need not be contained.
-    progress : callable, optional
-        Called with one line of text per pass.
+    `fleet`: the data; `structure`: as in `fit`; `excluded`: transitions that need not be contained; `progress`: called
+    with one line of text per pass.
     """
 
     def __init__(
@@ -136,18 +113,7 @@ class WorkingSet:
         self._least_eigenvalue: float | None = None  # of the full weights, once it is needed
 
     def quadratic(self) -> Solution:
-        """Solve (10).
-
-        Returns
-        -------
-        Solution
-            With its duality gap.
-
-        Raises
-        ------
-        FitError
-            No solver found an answer; `InfeasibleError` where the structure contradicts a transition.
-        """
+        """Solve (10)."""
         if self.sums.coupled is not None:
             return self._coupled_quadratic()
         self._start(self._settle_quadratic)
@@ -249,18 +215,7 @@ class WorkingSet:
             before = value
 
     def linear(self) -> Solution:
-        """Solve (11), then least sum of squared widths among its optima, then the centre.
-
-        Returns
-        -------
-        Solution
-            With the optimum of every row.
-
-        Raises
-        ------
-        FitError
-            No solver found an answer; `InfeasibleError` where the structure contradicts a transition.
-        """
+        """Solve (11), then least sum of squared widths among its optima, then the centre."""
         deltas = np.zeros(self.fleet.n)
 
         def settle(rows: list[Row]) -> None:
@@ -346,17 +301,8 @@ class WorkingSet:
     def violation(self, theta: Array, d: Array) -> Array:
         """Largest violation of given elements over all transitions: one pass.
 
-        Parameters
-        ----------
-        theta : array (r, n)
-            Nominal elements, 1/s.
-        d : array (q, n)
-            Half-widths.
-
-        Returns
-        -------
-        array (n,)
-            In scaled units; 0 where none is violated.
+        `theta` (r, n): nominal elements, 1/s; `d` (q, n): half-widths; Returns (n,): in scaled units; 0 where none is
+        violated.
         """
         for row in self.rows:
             row.theta, row.d, row.limit = theta[:, row.i], d[:, row.i], None

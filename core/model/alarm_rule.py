@@ -43,21 +43,8 @@ FADING = ("ewma", "cusum", "mewma")
 class AlarmRule:
     """Containment: the alarm is raised while `violations` of the last `window` verdicts are violations.
 
-    Parameters
-    ----------
-    violations : int, default 1
-        m of the rule.
-    window : int, default 1
-        n of the rule, in verdicts.
-    margin : float, default 1.0
-        Multiplies the half-widths of the bounds that are judged.
-    horizon : int, default 1
-        Steps of the bounds that are judged.
-
-    Raises
-    ------
-    ModelError
-        Not 1 <= violations <= window <= LONGEST_WINDOW, or the margin or the horizon is not positive.
+    `violations`: m of the rule; `window`: n of the rule, in verdicts; `margin`: multiplies the half-widths of the
+    bounds that are judged; `horizon`: steps of the bounds that are judged.
     """
 
     violations: int = 1
@@ -90,13 +77,7 @@ class AlarmRule:
         return f"at least {self.violations} of {self.window} verdicts violated{over}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The rule as the model file holds it.
-
-        Returns
-        -------
-        dict
-            Plain data.
-        """
+        """The rule as the model file holds it."""
         return {
             "kind": self.kind,
             "horizon": self.horizon,
@@ -126,23 +107,9 @@ class StatisticRule:
       :math:`s_k C` with :math:`s_k = (1 - λ_k)^2 s_{k-1} + λ_k^2`: at a constant step :math:`λ / (2 - λ)`, where it
       begins (Lowry et al., Technometrics 34, 1992).
 
-    Parameters
-    ----------
-    kind : {"energy", "mean", "ewma", "cusum", "chi2", "mewma"}
-        The statistic.
-    window_s : float
-        T, s; 0 for the last verdict alone, of every kind but ``cusum``.
-    threshold : float or sequence of float (n,)
-        What raises the alarm if it is exceeded: of every state, or of each.
-    horizon : int, default 1
-        Steps of the bounds whose utilisation it takes.
-    allowance : float, default 0.0
-        a of ``cusum``: the utilisation that adds nothing.
-
-    Raises
-    ------
-    ModelError
-        The kind is none of these, or a number is out of range.
+    `kind`: the statistic; `window_s`: T, s; 0 for the last verdict alone, of every kind but ``cusum``; `threshold`:
+    what raises the alarm if it is exceeded: of every state, or of each; `horizon`: steps of the bounds whose
+    utilisation it takes; `allowance`: a of ``cusum``: the utilisation that adds nothing.
     """
 
     kind: str
@@ -185,23 +152,7 @@ class StatisticRule:
             raise ModelError(f"alarm: allowance goes with cusum; leave it out of {self.kind}")
 
     def thresholds(self, n: int) -> tuple[float, ...]:
-        """The threshold of each state, or the one of a joint statistic.
-
-        Parameters
-        ----------
-        n : int
-            Number of states.
-
-        Returns
-        -------
-        tuple of float (n,), or (1,) of a joint statistic
-            Positive.
-
-        Raises
-        ------
-        ModelError
-            There are thresholds for another number of states.
-        """
+        """The threshold of each state, or the one of a joint statistic."""
         if self.kind in JOINT:
             return (float(self.threshold),)  # type: ignore[arg-type]  # checked above
         if not isinstance(self.threshold, tuple):
@@ -230,13 +181,7 @@ class StatisticRule:
         return f"{what} {span} above {low if low == high else f'{low} to {high}'}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The rule as the model file holds it.
-
-        Returns
-        -------
-        dict
-            Plain data.
-        """
+        """The rule as the model file holds it."""
         threshold = list(self.threshold) if isinstance(self.threshold, tuple) else self.threshold
         found = {"kind": self.kind, "horizon": self.horizon, "window_s": self.window_s, "threshold": threshold}
         return found | ({"allowance": self.allowance} if self.kind == "cusum" else {})
@@ -248,16 +193,6 @@ Rule = AlarmRule | StatisticRule
 
 def labels(rules: Sequence[Rule]) -> tuple[str, ...]:
     """What each rule is called: its kind, `@` its horizon if that is not 1, and `#2` if it is the second of that name.
-
-    Parameters
-    ----------
-    rules : sequence of Rule
-        Of one alarm.
-
-    Returns
-    -------
-    tuple of str
-        One per rule, all different.
     """
     found: list[str] = []
     seen: dict[str, int] = {}
@@ -269,58 +204,18 @@ def labels(rules: Sequence[Rule]) -> tuple[str, ...]:
 
 
 def containment(rules: Iterable[Rule]) -> AlarmRule | None:
-    """The rule that judges one-step bounds.
-
-    Parameters
-    ----------
-    rules : iterable of Rule
-        Of one alarm.
-
-    Returns
-    -------
-    AlarmRule or None
-        None if there is none.
-    """
+    """The rule that judges one-step bounds."""
     return next((rule for rule in rules if isinstance(rule, AlarmRule) and rule.horizon == 1), None)
 
 
 def with_containment(rules: Sequence[Rule], rule: AlarmRule) -> tuple[Rule, ...]:
-    """The rules with another one for one-step bounds.
-
-    Parameters
-    ----------
-    rules : sequence of Rule
-        Of one alarm.
-    rule : AlarmRule
-        In place of theirs; the first if there is none.
-
-    Returns
-    -------
-    tuple of Rule
-        As many, or one more.
-    """
+    """The rules with another one for one-step bounds."""
     before = containment(rules)
     return tuple(rule if r is before else r for r in rules) if before is not None else (rule, *rules)
 
 
 def checked_rules(rules: Sequence[Rule]) -> tuple[Rule, ...]:
-    """The rules of one alarm.
-
-    Parameters
-    ----------
-    rules : sequence of Rule
-        At most one of them judges one-step bounds.
-
-    Returns
-    -------
-    tuple of Rule
-        The same.
-
-    Raises
-    ------
-    ModelError
-        There is none, or too many.
-    """
+    """The rules of one alarm."""
     rules = tuple(rules)
     if not 1 <= len(rules) <= MOST_RULES:
         raise ModelError(f"alarm: {plural(len(rules), 'rule')}; an alarm has 1 to {MOST_RULES}")
@@ -330,25 +225,7 @@ def checked_rules(rules: Sequence[Rule]) -> tuple[Rule, ...]:
 
 
 def rule_from_dict(data: Any, name: str = "alarm.rules") -> Rule:
-    """A rule as the model file holds it.
-
-    Parameters
-    ----------
-    data : object
-        As JSON gives it.
-    name : str
-        What errors call it.
-
-    Returns
-    -------
-    Rule
-        The rule.
-
-    Raises
-    ------
-    ModelError
-        It is not of that form; names the field.
-    """
+    """A rule as the model file holds it."""
     data = object_of(data, name)
     kind = data.get("kind")
     if kind not in (CONTAINMENT, *KINDS):

@@ -48,22 +48,7 @@ from uncertain_lti.model.sums import blended, ordered_sum
 @cython.inline
 @cython.exceptval(check=False)
 def normalised(value: cython.double, steady: cython.double, scale: cython.double) -> cython.double:
-    """Deviation from the steady state, without dimension.
-
-    Parameters
-    ----------
-    value : float or array
-        Recorded units.
-    steady : float or array
-        Steady state.
-    scale : float or array
-        Positive scale.
-
-    Returns
-    -------
-    float or array
-        Without dimension.
-    """
+    """Deviation from the steady state, without dimension."""
     return (value - steady) / scale
 
 
@@ -71,22 +56,7 @@ def normalised(value: cython.double, steady: cython.double, scale: cython.double
 @cython.inline
 @cython.exceptval(check=False)
 def recorded(value: cython.double, steady: cython.double, scale: cython.double) -> cython.double:
-    """Deviation in recorded units: the inverse of `normalised`.
-
-    Parameters
-    ----------
-    value : float or array
-        Without dimension.
-    steady : float or array
-        Steady state.
-    scale : float or array
-        Positive scale.
-
-    Returns
-    -------
-    float or array
-        Recorded units.
-    """
+    """Deviation in recorded units: the inverse of `normalised`."""
     return steady + scale * value
 
 
@@ -94,22 +64,7 @@ def recorded(value: cython.double, steady: cython.double, scale: cython.double) 
 @cython.inline
 @cython.exceptval(check=False)
 def centre_of(x: cython.double, dt: cython.double, rate: cython.double) -> cython.double:
-    """Centre of the bounds one step after x, where Theta phi = rate.
-
-    Parameters
-    ----------
-    x : float or array
-        State at t_k, normalised.
-    dt : float or array
-        Δt_k, s.
-    rate : float or array
-        Θ φ, 1/s.
-
-    Returns
-    -------
-    float or array
-        Normalised.
-    """
+    """Centre of the bounds one step after x, where Theta phi = rate."""
     return rate * dt + x
 
 
@@ -117,22 +72,7 @@ def centre_of(x: cython.double, dt: cython.double, rate: cython.double) -> cytho
 @cython.inline
 @cython.exceptval(check=False)
 def half_of(dt: cython.double, spread: cython.double, v: cython.double) -> cython.double:
-    """Half-width of the bounds, where Delta psi = spread.
-
-    Parameters
-    ----------
-    dt : float or array
-        Δt_k, s.
-    spread : float or array
-        Δ ψ, 1/s.
-    v : float or array
-        Half-width that dt does not multiply.
-
-    Returns
-    -------
-    float or array
-        Normalised, at least 0.
-    """
+    """Half-width of the bounds, where Delta psi = spread."""
     return spread * dt + v
 
 
@@ -140,22 +80,7 @@ def half_of(dt: cython.double, spread: cython.double, v: cython.double) -> cytho
 @cython.inline
 @cython.exceptval(check=False)
 def lower_of(centre: cython.double, half: cython.double, margin: cython.double) -> cython.double:
-    """Eq. (6) with a margin.
-
-    Parameters
-    ----------
-    centre : float or array
-        Of the bounds.
-    half : float or array
-        Half-width.
-    margin : float
-        Multiplies the half-width.
-
-    Returns
-    -------
-    float or array
-        x_min at t_{k+1}.
-    """
+    """Eq. (6) with a margin."""
     return centre - half * margin
 
 
@@ -163,22 +88,7 @@ def lower_of(centre: cython.double, half: cython.double, margin: cython.double) 
 @cython.inline
 @cython.exceptval(check=False)
 def upper_of(centre: cython.double, half: cython.double, margin: cython.double) -> cython.double:
-    """Eq. (7) with a margin.
-
-    Parameters
-    ----------
-    centre : float or array
-        Of the bounds.
-    half : float or array
-        Half-width.
-    margin : float
-        Multiplies the half-width.
-
-    Returns
-    -------
-    float or array
-        x_max at t_{k+1}.
-    """
+    """Eq. (7) with a margin."""
     return centre + half * margin
 
 
@@ -186,22 +96,7 @@ def upper_of(centre: cython.double, half: cython.double, margin: cython.double) 
 @cython.inline
 @cython.exceptval(check=False)
 def contained(lower: cython.double, x_next: cython.double, upper: cython.double) -> cython.bint:
-    """Whether the sample lies within its bounds, Leibov (2006), eqs. (8)(9).
-
-    Parameters
-    ----------
-    lower : float or array
-        x_min at t_{k+1}.
-    x_next : float or array
-        Recorded state at t_{k+1}, normalised.
-    upper : float or array
-        x_max at t_{k+1}.
-
-    Returns
-    -------
-    bool or array of bool
-        On a bound is within; NaN is not.
-    """
+    """Whether the sample lies within its bounds, Leibov (2006), eqs. (8)(9)."""
     return (lower <= x_next) & (x_next <= upper)
 
 
@@ -209,22 +104,7 @@ def contained(lower: cython.double, x_next: cython.double, upper: cython.double)
 @cython.inline
 @cython.exceptval(check=False)
 def outside(z: cython.double, least: cython.double, greatest: cython.double) -> cython.bint:
-    """Whether a value lies outside the range that the fit saw.
-
-    Parameters
-    ----------
-    z : float or array
-        State or control, normalised.
-    least : float or array
-        Least value in the fit.
-    greatest : float or array
-        Greatest value in the fit.
-
-    Returns
-    -------
-    bool or array of bool
-        False within, and on either end.
-    """
+    """Whether a value lies outside the range that the fit saw."""
     return (z < least) | (z > greatest)
 
 
@@ -232,20 +112,7 @@ def outside(z: cython.double, least: cython.double, greatest: cython.double) -> 
 @cython.exceptval(check=False)
 @cython.cdivision(True)
 def utilisation_of(difference: cython.double, half: cython.double) -> cython.double:
-    """(x_next - centre) / half; where half is 0, 0 for no difference and otherwise infinite with its sign.
-
-    Parameters
-    ----------
-    difference : float or array
-        x_next less the centre.
-    half : float or array
-        Half-width, before the margin.
-
-    Returns
-    -------
-    float or array
-        -1 and 1 at the bounds.
-    """
+    """(x_next - centre) / half; where half is 0, 0 for no difference and otherwise infinite with its sign."""
     if cython.compiled:
         return 0.0 if difference == 0.0 else difference / half  # as C divides
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -256,20 +123,7 @@ def utilisation_of(difference: cython.double, half: cython.double) -> cython.dou
 @cython.inline
 @cython.exceptval(check=False)
 def settled(utilisation: cython.double, inside: cython.bint) -> cython.double:
-    """Utilisation whose size is at most 1 exactly where the sample is contained: on the edge rounding decides.
-
-    Parameters
-    ----------
-    utilisation : float or array
-        Of `utilisation_of`.
-    inside : bool or array of bool
-        Of `contained`, at margin 1.
-
-    Returns
-    -------
-    float or array
-        Moved by the rounding on the edge, if at all.
-    """
+    """Utilisation whose size is at most 1 exactly where the sample is contained: on the edge rounding decides."""
     above = 1.0000000000000002  # the next number after 1
     if cython.compiled:
         if inside:
@@ -283,24 +137,7 @@ def settled(utilisation: cython.double, inside: cython.bint) -> cython.double:
 @cython.inline
 @cython.exceptval(check=False)
 def cell_of(z: cython.double, least: cython.double, per_unit: cython.double, last: cython.int) -> cython.int:
-    """Cell of its range that a value lies in.
-
-    Parameters
-    ----------
-    z : double, or array
-        Normalised.
-    least : double, or array
-        Begin of the range.
-    per_unit : double, or array
-        Cells per unit; 0 where the range is empty.
-    last : int
-        Last cell; the first is 0.
-
-    Returns
-    -------
-    int, or array
-        0 to last.
-    """
+    """Cell of its range that a value lies in."""
     place = (z - least) * per_unit
     if cython.compiled:
         return 0 if not place > 0.0 else last if place > last else cython.cast(cython.int, place)
@@ -312,22 +149,7 @@ def cell_of(z: cython.double, least: cython.double, per_unit: cython.double, las
 @cython.exceptval(check=False)
 @cython.cdivision(True)
 def weight_between(s: cython.double, low: cython.double, high: cython.double) -> cython.double:
-    """Weight of the upper of two knots by linear interpolation; that of the lower one is 1 less it.
-
-    Parameters
-    ----------
-    s : float or array
-        Scheduling signal, normalised.
-    low : float or array
-        Lower knot.
-    high : float or array
-        Upper knot, above the lower one.
-
-    Returns
-    -------
-    float or array
-        0 to 1: beyond the two knots that of the nearer one.
-    """
+    """Weight of the upper of two knots by linear interpolation; that of the lower one is 1 less it."""
     weight = (s - low) / (high - low)
     if cython.compiled:
         return 0.0 if weight < 0.0 else 1.0 if weight > 1.0 else weight
@@ -337,15 +159,7 @@ def weight_between(s: cython.double, low: cython.double, high: cython.double) ->
 def pairs_of(size: int) -> tuple[Any, Any]:
     """Pairs of signals whose combinations a domain knows; of one signal alone, itself.
 
-    Parameters
-    ----------
-    size : int
-        Number of states and controls.
-
-    Returns
-    -------
-    first, second : int array (pairs,)
-        Their positions in [x; u].
+    Returns (pairs,): their positions in [x; u].
     """
     return np.triu_indices(size, 1) if size > 1 else (np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp))
 
@@ -353,19 +167,8 @@ def pairs_of(size: int) -> tuple[Any, Any]:
 def cells_per_unit(least: Any, greatest: Any, cells: int) -> Any:
     """Cells per normalised unit of each signal; 0 where it does not move.
 
-    Parameters
-    ----------
-    least : array (n + m,)
-        Begin of the range of each signal.
-    greatest : array (n + m,)
-        End of it.
-    cells : int
-        Cells per range.
-
-    Returns
-    -------
-    array (n + m,)
-        What `cell_of` takes.
+    `least` (n + m,): begin of the range of each signal; `greatest` (n + m,): end of it; Returns (n + m,): what
+    `cell_of` takes.
     """
     span = np.subtract(greatest, least)
     return np.divide(cells, span, out=np.zeros_like(span), where=(span > 0) & np.isfinite(span))
@@ -374,26 +177,8 @@ def cells_per_unit(least: Any, greatest: Any, cells: int) -> Any:
 def visited(z: Any, least: Any, greatest: Any, occupied: Any) -> Any:
     """Whether every pair of signals lies in an occupied cell.
 
-    Parameters
-    ----------
-    z : array (..., n + m)
-        Normalised [x; u].
-    least : array (n + m,)
-        Begin of the range of each signal.
-    greatest : array (n + m,)
-        End of it.
-    occupied : array (pairs, cells, cells) of bool
-        Of each pair of `pairs_of`.
-
-    Returns
-    -------
-    array (...) of bool
-        True if every one does.
-
-    Raises
-    ------
-    TypeError
-        This is the compiled module, which takes one sample after another.
+    `least` (n + m,): begin of the range of each signal; `greatest` (n + m,): end of it; `occupied` (pairs, cells,
+    cells): of each pair of `pairs_of`.
     """
     if cython.compiled:
         raise TypeError("compiled code takes one sample after another")
@@ -408,29 +193,11 @@ def centre_and_half(
 ) -> tuple[Any, Any]:
     """Centre and half-width of the bounds of K samples at once.
 
-    Parameters
-    ----------
-    theta, delta : array (n, p), or (R, n, p) with a schedule
-        Nominal elements and half-widths of the rates, 1/s.
-    v : array (n,), or (R, n)
-        Half-width that dt does not multiply.
-    phi : array (p, K)
-        Regressors, the states first.
-    dt : array (K,)
-        s.
-    places : array of int (C, K), optional
-        Blocks that hold at each sample, of a scheduled model.
-    weights : array (C, K), optional
-        Their weights.
-    base : array (n, K), optional
-        What the rates are added to, over a horizon the run of the nominal model; default the states.
-
-    Returns
-    -------
-    array (n, K)
-        Centre, normalised.
-    array (n, K)
-        Half-width, normalised.
+    `theta, delta` (n, p): nominal elements and half-widths of the rates, 1/s; `v` (n,): half-width that dt does not
+    multiply; `phi` (p, K): regressors, the states first; `dt` (K,): s; `places` (C, K): blocks that hold at each
+    sample, of a scheduled model; `weights` (C, K): their weights; `base` (n, K): what the rates are added to, over a
+    horizon the run of the nominal model; default the states; Returns (n, K): centre, normalised; Returns (n, K): half-
+    width, normalised.
     """
     columns = phi[:, None, :]
     theta, delta = theta.swapaxes(-1, -2), delta.swapaxes(-1, -2)  # (..., p, n)
@@ -454,12 +221,8 @@ _FEW = 8192  # runs that one numpy operation advances
 class _Elements:
     """Elements of one model, or of one of its horizons, and the sums of one sample in compiled code.
 
-    Parameters
-    ----------
-    theta, delta : array (n, p), or (R, n, p) with a schedule
-        Nominal elements and half-widths of the rates, 1/s.
-    v : array (n,), or (R, n)
-        Half-width that dt does not multiply.
+    `theta, delta` (n, p): nominal elements and half-widths of the rates, 1/s; `v` (n,): half-width that dt does not
+    multiply.
     """
 
     n: cython.Py_ssize_t
@@ -588,18 +351,8 @@ class _Elements:
 class Judgement:
     """What the bounds say of one transition.
 
-    Attributes
-    ----------
-    values : object
-        What `numbers` is computed from; compiled and uncompiled code keep different things.
-    contained : bool
-        As the attribute.
-    violation : bool
-        As the attribute.
-    outside_domain : bool
-        As the attribute.
-    unknown_regime : bool
-        As the attribute.
+    `values`: what `numbers` is computed from; compiled and uncompiled code keep different things; `contained`: as the
+    attribute; `violation`: as the attribute; `outside_domain`: as the attribute; `unknown_regime`: as the attribute.
     """
 
     contained = cython.declare(cython.bint, visibility="readonly")
@@ -617,16 +370,6 @@ class Judgement:
 
     def numbers(self, which: int) -> Any:
         """Bound (recorded units), utilisation, residual (normalised) or flag (0 contained, 1 violated) of each state.
-
-        Parameters
-        ----------
-        which : int
-            `LOWER`, `UPPER`, `UTILISATION`, `RESIDUAL` or `FLAGS`.
-
-        Returns
-        -------
-        buffer of doubles (n,)
-            One per state.
         """
         if cython.compiled:
             n = len(self._values) // 5
@@ -643,13 +386,7 @@ class Judgement:
         return np.subtract(1.0, inside, dtype=np.float64)
 
     def packed(self) -> bytes:
-        """All of it, one kind after another.
-
-        Returns
-        -------
-        bytes
-            Little-endian doubles, of `LOWER` first and of `UTILISATION` last.
-        """
+        """All of it, one kind after another."""
         if cython.compiled:
             return bytes(self._values.tobytes())
         return b"".join([self.numbers(which).tobytes() for which in range(UTILISATION + 1)])
@@ -659,39 +396,14 @@ class Judgement:
 class Judge:
     """Judges one transition after another by the bounds of one model.
 
-    Parameters
-    ----------
-    theta : array (n, p), or (R, n, p) with a schedule
-        Nominal elements of the rates, for φ = [x; u; 1] (`terms.tables`), 1/s.
-    delta : array (n, p), or (R, n, p)
-        Their half-widths, for ψ = |φ|, 1/s.
-    v : array (n,), or (R, n)
-        Half-width that dt does not multiply.
-    steady : array (n + m + q,)
-        Steady states of [x; u; s], with s the q further scheduling signals.
-    scale : array (n + m + q,)
-        Scales of [x; u; s].
-    least : array (n + m,)
-        Least normalised [x; u] that the fit saw.
-    greatest : array (n + m,)
-        Greatest normalised [x; u] that the fit saw.
-    margin : float
-        Multiplies the half-widths.
-    counted : array of bool (n,)
-        States whose violations count.
-    occupied : array (pairs, cells, cells) of bool, optional
-        Combinations of two signals that the fit saw (`domain.Occupancy`).
-    schedule : Schedule, optional
-        Weights of the blocks; None for one block.
-    positions : sequence of int, optional
-        Where its scheduling signals are in [x; u; s].
-    known : array of bool (R,), optional
-        Blocks that a recording visited; default all.
-
-    Raises
-    ------
-    ValueError
-        The arrays do not fit one another.
+    `theta` (n, p): nominal elements of the rates, for φ = [x; u; 1] (`terms.tables`), 1/s; `delta` (n, p): their half-
+    widths, for ψ = |φ|, 1/s; `v` (n,): half-width that dt does not multiply; `steady` (n + m + q,): steady states of
+    [x; u; s], with s the q further scheduling signals; `scale` (n + m + q,): scales of [x; u; s]; `least` (n + m,):
+    least normalised [x; u] that the fit saw; `greatest` (n + m,): greatest normalised [x; u] that the fit saw;
+    `margin`: multiplies the half-widths; `counted` (n,): states whose violations count; `occupied` (pairs, cells,
+    cells): combinations of two signals that the fit saw (`domain.Occupancy`); `schedule`: weights of the blocks; None
+    for one block; `positions`: where its scheduling signals are in [x; u; s]; `known` (R,): blocks that a recording
+    visited; default all.
     """
 
     n: cython.Py_ssize_t
@@ -800,27 +512,7 @@ class Judge:
             self._uncounted = ~np.asarray(counted, dtype=bool)
 
     def judge(self, before: Sequence[float], after: Sequence[float], dt: cython.double) -> Judgement | None:
-        """Judge one transition.
-
-        Parameters
-        ----------
-        before : sequence of float (n + m + q,)
-            x_k, u_k and the further scheduling signals, recorded units.
-        after : sequence of float (n,)
-            x_{k+1}, recorded units.
-        dt : float
-            Δt_k, s.
-
-        Returns
-        -------
-        Judgement or None
-            Against the bounds of this model; None for a mode that it does not list.
-
-        Raises
-        ------
-        ValueError
-            The numbers of values are not those of the model's signals.
-        """
+        """Judge one transition."""
         if len(before) != self.total or len(after) != self.n:
             raise ValueError(f"{len(before)} and {len(after)} values for {self.total} and {self.n} signals")
         if cython.compiled:
@@ -1007,27 +699,10 @@ class Judge:
 
         Of a transition at which a run may not go on, what is computed for that run has no meaning.
 
-        Parameters
-        ----------
-        x : array (n, N)
-            State of each run after a steps, normalised; takes the result.
-        time : array (N,)
-            Σ Δt of the steps so far, s; takes the result.
-        control : array (m, N)
-            Σ Δt u of the steps so far; takes the result.
-        z : array (n + m + q, N)
-            Normalised [x; u; s] of the transitions, in order of time.
-        dt : array (N,)
-            s.
-        begin : array of int64 (N,)
-            Of each transition the first of those that follow one another without a break up to it.
-        a, b : int
-            Steps done, and to be done.
-
-        Raises
-        ------
-        ValueError
-            The arrays do not fit one another.
+        `x` (n, N): state of each run after a steps, normalised; takes the result; `time` (N,): Σ Δt of the steps so
+        far, s; takes the result; `control` (m, N): Σ Δt u of the steps so far; takes the result; `z` (n + m + q, N):
+        normalised [x; u; s] of the transitions, in order of time; `dt` (N,): s; `begin` (N,): of each transition the
+        first of those that follow one another without a break up to it.
         """
         n, count = self.n, len(dt)
         fits = x.shape == (n, count) and z.shape == (self.total, count) and control.shape == (self.size - n, count)
@@ -1211,26 +886,10 @@ class Judge:
 class Runs:
     """Runs, one from each measured state, and what the horizons say of the states they lead to.
 
-    Parameters
-    ----------
-    judge : Judge
-        Of the model.
-    horizons : sequence of Horizon
-        Envelopes after a number of steps, the shortest first; at least one.
-    runner : Judge, optional
-        Of the elements that are run, with the same signals and schedule; default the nominal ones of the model.
-
-    Attributes
-    ----------
-    count : int
-        Number of horizons.
-    residuals : buffer of doubles (horizons n,)
-        x less the centre, normalised, where the last `push` gives the utilisation; the next one writes there.
-
-    Raises
-    ------
-    ValueError
-        The horizons or the runner do not fit the model, or the horizons are not in order.
+    `judge`: of the model; `horizons`: envelopes after a number of steps, the shortest first; at least one; `runner`: of
+    the elements that are run, with the same signals and schedule; default the nominal ones of the model; `count`:
+    number of horizons; `residuals`: x less the centre, normalised, where the last `push` gives the utilisation; the
+    next one writes there.
     """
 
     count = cython.declare(cython.Py_ssize_t, visibility="readonly")
@@ -1296,23 +955,7 @@ class Runs:
         self._newest = -1
 
     def push(self, before: Sequence[float], after: Sequence[float], dt: cython.double) -> Any:
-        """Begin a run, take all a step further, and compare those that have gone far enough with the state there.
-
-        Parameters
-        ----------
-        before : sequence of float (n + m + q,)
-            As of `Judge.judge`, which must have judged this transition just before.
-        after : sequence of float (n,)
-            As there.
-        dt : float
-            Δt_k, s.
-
-        Returns
-        -------
-        buffer of doubles (horizons n,)
-            Utilisation of each state by each horizon (`settled`), horizon after horizon; NaN where no run has gone so
-            far.
-        """
+        """Begin a run, take all a step further, and compare those that have gone far enough with the state there."""
         if cython.compiled:
             return self._one(after, dt)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -1361,25 +1004,7 @@ class Runs:
         return centre[:, 0], half[:, 0]
 
     def foresee(self, before: Sequence[float], dt: cython.double) -> Any:
-        """Bounds at the end of the longest horizon, if controls and further scheduling signals stay as they are.
-
-        Parameters
-        ----------
-        before : sequence of float (n + m + q,)
-            As of `Judge.judge`, which must judge a transition again before the next `push`.
-        dt : float
-            Each step, s.
-
-        Returns
-        -------
-        buffer of doubles (2 n,), or None
-            Lower and upper bound by the margin of the judge, recorded units; None for a mode that is not listed.
-
-        Raises
-        ------
-        ValueError
-            The number of values is not that of the model's signals.
-        """
+        """Bounds at the end of the longest horizon, if controls and further scheduling signals stay as they are."""
         if len(before) != self._judge.total:
             raise ValueError(f"{len(before)} values for {self._judge.total} signals")
         if cython.compiled:

@@ -31,28 +31,11 @@ from uncertain_lti.model.bounds import outside, pairs_of, visited
 class Sampling:
     """How samples were cut when the model was fitted, and what the steps were.
 
-    Parameters
-    ----------
-    clock : str, default ""
-        Topic whose messages define the sample instants; empty for arrays.
-    clock_type : str, default ""
-        Its message type.
-    time : mapping of str to {"header", "log"}, optional
-        Per topic, what its instant is.
-    dt_median : float or None, optional
-        Median step, s; None where nothing was fitted.
-    dt_min : float or None, optional
-        Shortest step, s; likewise.
-    dt_max : float or None, optional
-        Longest step, s; likewise.
-    max_gap : float or None, optional
-        Longest step that is a transition, s; None for no limit.
-    min_step : float, default 0.0
-        Shortest step, s; a message sooner than that is dropped.
-    max_skew : float or None, optional
-        Greatest age of a state from another topic than the clock, s; None for `max_gap`.
-    step : float or None, optional
-        Δt of every transition, s; None for that of the stamps.
+    `clock`: topic whose messages define the sample instants; empty for arrays; `clock_type`: its message type; `time`:
+    per topic, what its instant is; `dt_median`: median step, s; None where nothing was fitted; `dt_min`: shortest step,
+    s; likewise; `dt_max`: longest step, s; likewise; `max_gap`: longest step that is a transition, s; None for no
+    limit; `min_step`: shortest step, s; a message sooner than that is dropped; `max_skew`: greatest age of a state from
+    another topic than the clock, s; None for `max_gap`; `step`: Δt of every transition, s; None for that of the stamps.
     """
 
     clock: str = ""
@@ -79,18 +62,7 @@ _PER_CELL = 16
 
 
 def cells_for(count: int) -> int:
-    """How many cells each range is divided into; 0 if the samples are too few to say where there were none.
-
-    Parameters
-    ----------
-    count : int
-        Samples.
-
-    Returns
-    -------
-    int
-        0, or 4 to `MOST_CELLS`.
-    """
+    """How many cells each range is divided into; 0 if the samples are too few to say where there were none."""
     cells = min(MOST_CELLS, math.isqrt(count // _PER_CELL))
     return cells if cells >= 4 else 0
 
@@ -101,12 +73,8 @@ class Occupancy:
 
     A box holds every level between two that were fitted, and every jump from one level to another; a grid does not.
 
-    Parameters
-    ----------
-    cells : int
-        Cells per range.
-    occupied : array (pairs, cells, cells) of bool
-        Pairs as in `bounds.pairs_of`; a cell is true if a fitted sample lies in it or in one next to it.
+    `cells`: cells per range; `occupied` (pairs, cells, cells): pairs as in `bounds.pairs_of`; a cell is true if a
+    fitted sample lies in it or in one next to it.
     """
 
     cells: int
@@ -116,15 +84,7 @@ class Occupancy:
     def of(cls, visited: NDArray[np.bool_]) -> Occupancy:
         """From the cells that fitted samples lie in.
 
-        Parameters
-        ----------
-        visited : array (pairs, cells, cells) of bool
-            Without their neighbours.
-
-        Returns
-        -------
-        Occupancy
-            With their neighbours.
+        `visited` (pairs, cells, cells): without their neighbours.
         """
         wide = np.pad(visited, ((0, 0), (1, 1), (1, 1)))
         cells = visited.shape[1]
@@ -132,36 +92,12 @@ class Occupancy:
         return cls(cells, np.logical_or.reduce(near))
 
     def to_dict(self) -> dict[str, Any]:
-        """As it stands in a model file.
-
-        Returns
-        -------
-        dict
-            `cells`, and `occupied` as base64 of bits, pair after pair, row after row.
-        """
+        """As it stands in a model file."""
         return {"cells": self.cells, "occupied": b64encode(np.packbits(self.occupied).tobytes()).decode()}
 
     @classmethod
     def from_dict(cls, data: Any, size: int) -> Occupancy:
-        """From a model file.
-
-        Parameters
-        ----------
-        data : Any
-            What stands there.
-        size : int
-            Number of states and controls.
-
-        Returns
-        -------
-        Occupancy
-            What `to_dict` wrote.
-
-        Raises
-        ------
-        ModelError
-            It is not that; names the field.
-        """
+        """From a model file."""
         if not isinstance(data, dict) or set(data) != {"cells", "occupied"}:
             raise ModelError("field 'domain.measure' must be an object of 'cells' and 'occupied'")
         cells, text = data["cells"], data["occupied"]
@@ -192,20 +128,9 @@ class Occupancy:
 class Domain:
     """Normalised ranges seen in the fit, and the combinations in them; without end where nothing was fitted.
 
-    Parameters
-    ----------
-    x_min : array (n,)
-        Least states.
-    x_max : array (n,)
-        Greatest states.
-    u_min : array (m,)
-        Least controls.
-    u_max : array (m,)
-        Greatest controls.
-    measure : Occupancy, optional
-        Combinations within the box.
-    step_max : array (n,), optional
-        Largest change of each state in one step, normalised; default unknown.
+    `x_min` (n,): least states; `x_max` (n,): greatest states; `u_min` (m,): least controls; `u_max` (m,): greatest
+    controls; `measure`: combinations within the box; `step_max` (n,): largest change of each state in one step,
+    normalised; default unknown.
     """
 
     x_min: Array
@@ -226,20 +151,7 @@ class Domain:
         return np.concatenate((self.x_max, self.u_max))
 
     def outside(self, x: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
-        """Whether z = [x; u] leaves the box in some element, or is a combination that was not fitted.
-
-        Parameters
-        ----------
-        x : array (..., n)
-            Normalised states.
-        u : array (..., m)
-            Normalised controls.
-
-        Returns
-        -------
-        array (...) of bool
-            False where nothing was fitted.
-        """
+        """Whether z = [x; u] leaves the box in some element, or is a combination that was not fitted."""
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
         lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         z = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (x, u)], axis=-1)

@@ -50,18 +50,7 @@ _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 
 
 def structure(model: Any) -> dict[str, Any]:
-    """The structure of a model file, in the oldest format that holds the model.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    dict
-        Plain data for JSON; null for infinite ranges.
-    """
+    """The structure of a model file, in the oldest format that holds the model."""
     states = [_signal(s, _STATE) for s in model.signals.states]
     controls = [_signal(s, _CONTROL) for s in model.signals.controls]
     s = model.sampling
@@ -140,25 +129,7 @@ def _signal(signal: Signal, keys: Sequence[str]) -> dict[str, Any]:
 
 
 def arguments(data: Any, source: str) -> dict[str, Any]:
-    """What a model is made of, from the structure of its file.
-
-    Parameters
-    ----------
-    data : object
-        As JSON gives it.
-    source : str
-        What errors call it.
-
-    Returns
-    -------
-    dict
-        Arguments of `UncertainLTI`.
-
-    Raises
-    ------
-    ModelError
-        It is not of that form; names the field.
-    """
+    """What a model is made of, from the structure of its file."""
     if not isinstance(data, dict) or "format" not in data:
         raise ModelError(f"no field 'format'; is this a model file written by `uncertain-lti fit` ({FORMATS[0]})?")
     if data["format"] not in FORMATS:
@@ -275,20 +246,7 @@ def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[
 
 
 def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
-    """Write a model file; an existing file is replaced as a whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-    data : mapping
-        From `structure`.
-
-    Raises
-    ------
-    ModelError
-        It holds what JSON cannot, or the file cannot be written.
-    """
+    """Write a model file; an existing file is replaced as a whole or not at all."""
     refuse_other(path, (str, os.PathLike), "the model file", "give its path", ModelError)
     try:
         text = _layout(data).encode()
@@ -302,23 +260,7 @@ def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
 
 
 def read(path: str | os.PathLike[str]) -> Any:
-    """Read the structure of a model file.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-
-    Returns
-    -------
-    Any
-        What JSON holds there, for `arguments`.
-
-    Raises
-    ------
-    ModelError
-        The file is missing, too large, or is not JSON.
-    """
+    """Read the structure of a model file."""
     refuse_other(path, (str, os.PathLike), "the model file", "give its path", ModelError)
     if (kind := kind_of(path)) and kind != "a model file":
         cure = {
@@ -341,23 +283,7 @@ def read(path: str | os.PathLike[str]) -> Any:
 
 
 def read_rules(path: str | os.PathLike[str]) -> tuple[Rule, ...]:
-    """Read the rules of an alarm from a file.
-
-    Parameters
-    ----------
-    path : path
-        A model file, or JSON as its field `alarm` has it: `{"rules": [{"kind": "energy", "window_s": 2.0, ...}, ...]}`.
-
-    Returns
-    -------
-    tuple of Rule
-        At least one.
-
-    Raises
-    ------
-    ModelError
-        The file cannot be read, or holds no rules; names file and field.
-    """
+    """Read the rules of an alarm from a file."""
     data = read(path)
     if isinstance(data, dict):
         data = data.get("alarm", data)

@@ -29,17 +29,7 @@ LONGEST_RECURSION = 400
 def simulated(model: Any, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLike | None = None) -> Array:
     """`UncertainLTI.simulate`.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-    x0, u, dt, s : array
-        As there.
-
-    Returns
-    -------
-    array (N+1, n)
-        Normalised states.
+    Returns (N+1, n): normalised states.
     """
     u = np.asarray(u, dtype=np.float64)
     dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(u),))
@@ -77,22 +67,7 @@ def _recall(model: Any, recalled: Recalled, z: Array, k: int, dt: Array) -> None
 def free_run(model: Any, transient: Transient) -> Array:
     """States of the run over each usable stretch of a recording.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-    transient : Transient
-        In recorded units.
-
-    Returns
-    -------
-    array (N+1, n)
-        Normalised; NaN where there is no run.
-
-    Raises
-    ------
-    ModelError
-        The transient has other numbers of signals than the model.
+    Returns (N+1, n): normalised; NaN where there is no run.
     """
     refuse_other(transient, Transient, "the recording", "give a Transient", ModelError)
     transient = transient.scheduled_on([s.name for s in model.signals.scheduling])
@@ -116,26 +91,7 @@ def free_run(model: Any, transient: Transient) -> Array:
 def discrepancy(model: Any, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
     """`UncertainLTI.discrepancy`: (4) and (5).
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-    transient : Transient
-        In recorded units.
-    W : array, optional
-        As there.
-
-    Returns
-    -------
-    float
-        Eq. (4).
-    array (n,)
-        Eq. (5).
-
-    Raises
-    ------
-    ModelError
-        W has another shape.
+    Returns (n,): eq. (5).
     """
     error = (free_run(model, transient) - model.operating_point.normalise_x(transient.x))[1:]
     usable = transient.usable
@@ -160,17 +116,7 @@ def discrepancy(model: Any, transient: Transient, W: ArrayLike | None = None) ->
 def recursion(model: Any, dt: float) -> Array:
     """Matrix that takes [x_k; x_{k-1}; ...] to the next, as far back as the model remembers its states.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-    dt : float
-        Δt, s.
-
-    Returns
-    -------
-    array (N, N), or (R, N, N) with a schedule
-        I + Δt A without a memory.
+    Returns (N, N): I + Δt A without a memory.
     """
     n, scale = model.n, model.operating_point.scale
     step: Array = np.eye(n) + dt * model.A

@@ -51,18 +51,9 @@ _PRODUCTS = 65536  # per block: they stay in the cache
 class Windows:
     """Transitions in a row without a break, as many as a horizon has steps, and the run over them.
 
-    Parameters
-    ----------
-    steps : int
-        Transitions of each.
-    start : array of int (K,)
-        Position of the first of them among all transitions.
-    z : array (n + m + axes, K)
-        State at the begin, mean control, and scheduling vector at the begin, [x_k; ū; s_k], normalised.
-    run : array (n, K)
-        x̂, normalised.
-    time : array (K,)
-        T, s.
+    `steps`: transitions of each; `start` (K,): position of the first of them among all transitions; `z` (n + m + axes,
+    K): state at the begin, mean control, and scheduling vector at the begin, [x_k; ū; s_k], normalised; `run` (n, K):
+    x̂, normalised; `time` (K,): T, s.
     """
 
     steps: int
@@ -83,19 +74,7 @@ class Run:
     The centre of the narrowest envelope of one step may be unstable in a block whose ends few samples visit; over many
     steps the least squares of the same elements often stay nearer to the machine.
 
-    Parameters
-    ----------
-    A : array (n, n), or (R, n, n) with a schedule, and so for those that follow
-        1/s.
-    B : array (n, m)
-        1/s.
-    c : array (n,)
-        Drift, 1/s.
-
-    Raises
-    ------
-    ModelError
-        Shapes do not fit one another, or a number is not finite.
+    `A` (n, n): 1/s; `B` (n, m): 1/s; `c` (n,): drift, 1/s.
     """
 
     def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike) -> None:
@@ -123,13 +102,7 @@ class Run:
         return tables({"A": self.A, "B": self.B, "c": self.c, **still})
 
     def to_dict(self) -> dict[str, Any]:
-        """As it is in a model file.
-
-        Returns
-        -------
-        dict
-            The arrays of each block.
-        """
+        """As it is in a model file."""
         arrays = {name: getattr(self, name) for name in _OF_RUN}
         if self.A.ndim == 2:
             arrays = {name: value[None] for name, value in arrays.items()}
@@ -139,29 +112,7 @@ class Run:
 
     @classmethod
     def from_dict(cls, data: Any, n: int, m: int, blocks: int | None) -> Run:
-        """From a model file.
-
-        Parameters
-        ----------
-        data : Any
-            What `to_dict` gives.
-        n : int
-            Number of states.
-        m : int
-            Number of controls.
-        blocks : int or None
-            Number of blocks of the schedule; None without one.
-
-        Returns
-        -------
-        Run
-            As listed.
-
-        Raises
-        ------
-        ModelError
-            It is not that; names the field.
-        """
+        """From a model file."""
         parts = object_of(data, "run", ("blocks",), ("blocks",))["blocks"]
         return cls(**blocks_of(parts, "run.blocks", n, m, blocks, _OF_RUN, _OF_RUN))
 
@@ -169,19 +120,8 @@ class Run:
 def unbroken_over(k: NDArray[np.intp], vectors: Array, schedule: Schedule | None) -> NDArray[np.int64]:
     """Of each transition the first of those that follow one another without a break, in the same modes, up to it.
 
-    Parameters
-    ----------
-    k : array of int (N,)
-        Sample that each begins with; recordings one after the other leave one out in between.
-    vectors : array (axes, N)
-        Scheduling vectors, normalised.
-    schedule : Schedule or None
-        None for one block.
-
-    Returns
-    -------
-    array of int64 (N,)
-        Positions.
+    `k` (N,): sample that each begins with; recordings one after the other leave one out in between; `vectors` (axes,
+    N): scheduling vectors, normalised; Returns (N,): positions.
     """
     position = np.arange(len(k), dtype=np.int64)
     broken = np.diff(k, prepend=k[:1] - 2) != 1
@@ -196,29 +136,8 @@ def windows_of(
 ) -> Iterator[Windows]:
     """Windows of several lengths over the same transitions.
 
-    Parameters
-    ----------
-    judge : Judge
-        Of the elements that are run.
-    z : array (n + m + q, N)
-        Normalised [x; u; s] of the transitions, in order of time.
-    vectors : array (axes, N)
-        Scheduling vectors, normalised.
-    dt : array (N,)
-        s.
-    begin : array of int64 (N,)
-        Of `unbroken_over`.
-    steps : sequence of int
-        Lengths, increasing.
-    n : int
-        Number of states.
-    m : int
-        Number of controls.
-
-    Yields
-    ------
-    Windows
-        Of each length; good until the next one is asked for.
+    `z` (n + m + q, N): normalised [x; u; s] of the transitions, in order of time; `vectors` (axes, N): scheduling
+    vectors, normalised; `dt` (N,): s; `begin` (N,): of `unbroken_over`.
     """
     run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
     done, kept, by_transition = 0, None, np.asfortranarray(z)  # as `advance` reads them
@@ -245,33 +164,10 @@ def windows_of(
 class Horizon:
     """Elements of the envelope after a number of steps.
 
-    Parameters
-    ----------
-    steps : int
-        h, at least 2.
-    A : array (n, n), or (R, n, n) with a schedule, and so for those that follow
-        Correction of the centre, A', 1/s.
-    B : array (n, m)
-        B', 1/s.
-    dA : array (n, n)
-        Half-widths on |x_k|, 1/s.
-    dB : array (n, m)
-        Half-widths on |ū|, 1/s.
-    c : array (n,), optional
-        c', 1/s; 0 by default.
-    dc : array (n,), optional
-        Half-width, 1/s; 0 by default.
-    v : array (n,), optional
-        Half-width that T does not multiply, normalised; 0 by default.
-    widths : {"growing", "constant"}, default "growing"
-        Constant if dA, dB and dc are 0.
-    residuals : Residuals, optional
-        Of the windows of the fit; default unknown.
-
-    Raises
-    ------
-    ModelError
-        The steps or the widths are not such, shapes do not fit, a number is not finite, or a half-width is negative.
+    `steps`: h, at least 2; `A` (n, n): correction of the centre, A', 1/s; `B` (n, m): B', 1/s; `dA` (n, n): half-widths
+    on |x_k|, 1/s; `dB` (n, m): half-widths on |ū|, 1/s; `c` (n,): c', 1/s; 0 by default; `dc` (n,): half-width, 1/s; 0
+    by default; `v` (n,): half-width that T does not multiply, normalised; 0 by default; `widths`: constant if dA, dB
+    and dc are 0; `residuals`: of the windows of the fit; default unknown.
     """
 
     def __init__(
@@ -334,18 +230,7 @@ class Horizon:
         return tables({name: getattr(self, name) for name in ARRAYS})
 
     def with_residuals(self, residuals: Residuals | None) -> Horizon:
-        """The same envelope with other residuals.
-
-        Parameters
-        ----------
-        residuals : Residuals or None
-            Of its windows.
-
-        Returns
-        -------
-        Horizon
-            Of the same bits.
-        """
+        """The same envelope with other residuals."""
         arrays = {name: getattr(self, name) for name in ARRAYS}
         return Horizon(self.steps, **arrays, widths=self.widths, residuals=residuals)
 
@@ -354,18 +239,8 @@ class Horizon:
     ) -> None:
         """Centre and half-width of the envelope at the end of windows, into given arrays.
 
-        Parameters
-        ----------
-        z : array (n + m + axes, K)
-            State at the begin, mean control and scheduling vector at the begin, normalised.
-        time : array (K,)
-            T, s.
-        centre, half : array (n, K)
-            Take the result, normalised.
-        base : array (n, K)
-            x̂, normalised.
-        schedule : Schedule, optional
-            That of the model.
+        `z` (n + m + axes, K): state at the begin, mean control and scheduling vector at the begin, normalised; `time`
+        (K,): T, s; `centre, half` (n, K): take the result, normalised; `base` (n, K): x̂, normalised.
         """
         n, columns = self.tables[0].shape[-2:]
         m = columns - n - 1
@@ -380,13 +255,7 @@ class Horizon:
                 )
 
     def to_dict(self) -> dict[str, Any]:
-        """As it is in a model file.
-
-        Returns
-        -------
-        dict
-            Steps, widths, the arrays of each block, and the residuals if they are known.
-        """
+        """As it is in a model file."""
         arrays = {name: getattr(self, name) for name in ARRAYS}
         if not self.lead:
             arrays = {name: value[None] for name, value in arrays.items()}
@@ -396,29 +265,7 @@ class Horizon:
 
     @classmethod
     def list_from(cls, data: Any, n: int, m: int, blocks: int | None) -> tuple[Horizon, ...]:
-        """From a model file.
-
-        Parameters
-        ----------
-        data : Any
-            A list of what `to_dict` gives.
-        n : int
-            Number of states.
-        m : int
-            Number of controls.
-        blocks : int or None
-            Number of blocks of the schedule; None without one.
-
-        Returns
-        -------
-        tuple of Horizon
-            As listed.
-
-        Raises
-        ------
-        ModelError
-            It is not that; names the field.
-        """
+        """From a model file."""
         if not isinstance(data, list):
             raise ModelError("field 'horizons' is not a list of horizons")
         found = []
@@ -438,27 +285,7 @@ class Horizon:
 
 
 def checked_horizons(horizons: Sequence[Horizon], shape: tuple[int, ...], m: int) -> tuple[Horizon, ...]:
-    """Horizons of one model, the shortest first.
-
-    Parameters
-    ----------
-    horizons : sequence of Horizon
-        In any order.
-    shape : tuple of int
-        Of the model's A.
-    m : int
-        Number of controls.
-
-    Returns
-    -------
-    tuple of Horizon
-        Sorted by their steps.
-
-    Raises
-    ------
-    ModelError
-        Two have as many steps, or one does not fit the model.
-    """
+    """Horizons of one model, the shortest first."""
     ordered = tuple(sorted(horizons, key=lambda horizon: horizon.steps))
     steps = [horizon.steps for horizon in ordered]
     if len(set(steps)) < len(steps):

@@ -26,17 +26,7 @@ _BLOCK = 1 << 11  # transitions that are looked at together: they stay in the ca
 def largest_steps(model: Any, transients: Iterable[Any]) -> Array:
     """The largest change of each state in one transition of recordings.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        Its scales normalise.
-    transients : iterable of Transient
-        The recordings.
-
-    Returns
-    -------
-    array (n,)
-        Normalised.
+    Returns (n,): normalised.
     """
     largest = np.zeros(model.n)
     for transient in transients:
@@ -53,19 +43,7 @@ def largest_steps(model: Any, transients: Iterable[Any]) -> Array:
 def jumps(model: Any, before: ArrayLike, after: ArrayLike) -> tuple[Array, Array]:
     """How far states moved in one step, where that is farther than ever in the fit.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        Knows the largest steps, or does not.
-    before, after : array (..., n)
-        The states at the ends of a transition, recorded units.
-
-    Returns
-    -------
-    array (..., n)
-        The change, recorded units; 0 where it is none larger than in the fit.
-    array (n,)
-        The largest of the fit, recorded units; infinite where that is not known.
+    Returns (n,): the largest of the fit, recorded units; infinite where that is not known.
     """
     known = model.domain.step_max
     limit = np.full(model.n, np.inf) if known is None else known * model.operating_point.X
@@ -76,44 +54,12 @@ def jumps(model: Any, before: ArrayLike, after: ArrayLike) -> tuple[Array, Array
 
 
 def jump_words(name: str, change: float, largest: float) -> str:
-    """What is said of a jump.
-
-    Parameters
-    ----------
-    name : str
-        Of the state.
-    change : float
-        By how much it moved in one step.
-    largest : float
-        The largest in one step of the fit.
-
-    Returns
-    -------
-    str
-        Without a full stop.
-    """
+    """What is said of a jump."""
     return f"{name} jumped by {change:.3g} in one step (at most {largest:.3g} in the fit)"
 
 
 def jumps_in_words(model: Any, before: Sequence[float], after: Sequence[float], flags: Sequence[float]) -> list[str]:
-    """What is said of the states that jumped out of their bounds.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Knows the largest steps, or does not.
-    before : sequence of float, at least (n,)
-        The states at the begin of a transition, and what follows them, recorded units.
-    after : sequence of float (n,)
-        Those at its end.
-    flags : sequence of float (n,)
-        1 for a state that left its bounds.
-
-    Returns
-    -------
-    list of str
-        One for each; empty if the largest steps are not known.
-    """
+    """What is said of the states that jumped out of their bounds."""
     if model.domain.step_max is None:
         return []
     change, limit = jumps(model, before[: model.n], after)

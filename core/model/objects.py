@@ -21,31 +21,7 @@ from uncertain_lti.base.errors import ModelError
 def object_of(
     data: Any, name: str, known: Collection[str] | None = None, needed: Collection[str] = (), remedy: str = ""
 ) -> dict[str, Any]:
-    """An object of a model file, its fields checked.
-
-    Parameters
-    ----------
-    data : Any
-        As JSON gives it.
-    name : str
-        Of the object in the file, for errors; empty for the file itself.
-    known : collection of str, optional
-        Fields that it may have; default any.
-    needed : collection of str, optional
-        Fields that it must have.
-    remedy : str, optional
-        What is said of a field that is missing; default to fit the model again.
-
-    Returns
-    -------
-    dict
-        Its fields.
-
-    Raises
-    ------
-    ModelError
-        It is no object, or has other fields; names the field.
-    """
+    """An object of a model file, its fields checked."""
     if not isinstance(data, Mapping):
         raise ModelError(f"field '{name}' is not an object")
     within = f"{name}." if name else ""

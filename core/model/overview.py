@@ -21,18 +21,7 @@ from uncertain_lti.model.schedule import Schedule
 
 
 def overview(model: Any) -> str:
-    """Nominal elements with their half-widths, or the blocks of a schedule, and the widths that the fit reached.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Nominal elements with their half-widths, or the blocks of a schedule, and the widths that the fit reached."""
     header, rows = _elements(model) if model.schedule is None else _blocks(model, model.schedule)
     facts, below = model.fit_summary, []
     if facts.get("mean_width_recorded") is not None:

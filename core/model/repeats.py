@@ -144,22 +144,10 @@ class Repeats:
 class Moved(NamedTuple):
     """One repeat so far.
 
-    Parameters
-    ----------
-    state : int
-        Number of the state.
-    seconds : float
-        Since the last fresh sample, s.
-    run : float
-        How far the nominal model ran, in half-widths.
-    sum : float
-        Sum of its one-step movements, in half-widths, likewise without a sign.
-    start : sequence of float (n,)
-        The states at the last fresh sample, recorded units.
-    steps : int
-        Transitions of the repeat.
-    activity : float
-        Range of the rates at which the nominal model would move it, in half-widths.
+    `state`: number of the state; `seconds`: since the last fresh sample, s; `run`: how far the nominal model ran, in
+    half-widths; `sum`: sum of its one-step movements, in half-widths, likewise without a sign; `start`: the states at
+    the last fresh sample, recorded units; `steps`: transitions of the repeat; `activity`: range of the rates at which
+    the nominal model would move it, in half-widths.
     """
 
     state: int
@@ -174,12 +162,7 @@ class Moved(NamedTuple):
 class Repeating:
     """Follows the repeats of every state, one transition after another.
 
-    Parameters
-    ----------
-    n : int
-        Number of states.
-    margin : float, default 1.0
-        Of the bounds that it will be given.
+    `n`: number of states; `margin`: of the bounds that it will be given.
     """
 
     __slots__ = ("_margin", "_of")
@@ -204,26 +187,7 @@ class Repeating:
         upper: Sequence[float],
         own: Sequence[float],
     ) -> list[Moved]:
-        """Take one transition in which some state repeats; after one in which none does, `forget`.
-
-        Parameters
-        ----------
-        t_ns : int
-            Instant of its arrival, ns.
-        dt : float
-            Δt, s.
-        before, after : sequence of float (n,), of which `before` may be longer
-            States at its ends, recorded units.
-        lower, upper : sequence of float (n,)
-            Its bounds, recorded units.
-        own : sequence of float (n,)
-            The elements a_ii of the nominal model there, 1/s.
-
-        Returns
-        -------
-        list of Moved
-            One for each state that repeats.
-        """
+        """Take one transition in which some state repeats; after one in which none does, `forget`."""
         found = []
         for i, value in enumerate(after):
             if value != before[i]:
@@ -253,34 +217,16 @@ def _over(size: float, half: float) -> float:
 
 
 def repeats_of(model: Any, transients: Iterable[Any]) -> Repeats:
-    """What recordings of a healthy machine have of exact repeats.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted to them; its nominal part is what runs over the repeats.
-    transients : iterable of Transient
-        The recordings.
-
-    Returns
-    -------
-    Repeats
-        Over all of them.
-    """
+    """What recordings of a healthy machine have of exact repeats."""
     return together(model.n, [repeats_in(model, transient) for transient in transients])
 
 
 class Found(NamedTuple):
     """What one recording has of exact repeats.
 
-    Parameters
-    ----------
-    most : array (4, n)
-        Of each state the longest repeat, the farthest run, the largest sum and the greatest activity of a repeat.
-    windows : array (windows, n)
-        Activity in each window of WINDOW_S; NaN for a state that repeats in half of it or more.
-    noisy : array (n,)
-        Steps that show noise; -1 for a state of which values came twice.
+    `most` (4, n): of each state the longest repeat, the farthest run, the largest sum and the greatest activity of a
+    repeat; `windows` (windows, n): activity in each window of WINDOW_S; NaN for a state that repeats in half of it or
+    more; `noisy` (n,): steps that show noise; -1 for a state of which values came twice.
     """
 
     most: Array
@@ -289,20 +235,7 @@ class Found(NamedTuple):
 
 
 def repeats_in(model: Any, transient: Any) -> Found:
-    """What one recording has of them.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        As for `repeats_of`.
-    transient : Transient
-        The recording.
-
-    Returns
-    -------
-    Found
-        In it.
-    """
+    """What one recording has of them."""
     longest, run, total, active = most = np.zeros((4, model.n))
     point, steps = model.operating_point, transient.transitions()
     windows, noisy = _activity(model, transient, steps)
@@ -334,20 +267,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
 
 
 def together(n: int, found: Sequence[Found]) -> Repeats:
-    """What recordings have of exact repeats, from what each of them has.
-
-    Parameters
-    ----------
-    n : int
-        Number of states.
-    found : sequence of Found
-        Of `repeats_in`.
-
-    Returns
-    -------
-    Repeats
-        Over all of them.
-    """
+    """What recordings have of exact repeats, from what each of them has."""
     longest, run, total, active = np.max([np.zeros((4, n)), *(one.most for one in found)], axis=0)
     windows = np.concatenate([np.zeros((0, n)), *(one.windows for one in found)])
     usual = _usual(windows, np.where(longest < WINDOW_S, ACTIVE, ACTIVE / 2))

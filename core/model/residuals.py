@@ -36,19 +36,8 @@ class Residuals:
     the readings is the same everywhere, and then one of the residual itself, x_{k+1} - centre_k, normalised, does. The
     fit takes the likelier one.
 
-    Parameters
-    ----------
-    mean : array (n,)
-        Mean of each state.
-    covariance : array (n, n)
-        Symmetric, with no negative eigenvalue but by rounding.
-    relative : bool, default True
-        Of the utilisation; False: of the residual itself.
-
-    Raises
-    ------
-    ModelError
-        The shapes do not fit, a number is not finite, or the covariance is none.
+    `mean` (n,): mean of each state; `covariance` (n, n): symmetric, with no negative eigenvalue but by rounding;
+    `relative`: of the utilisation; False: of the residual itself.
     """
 
     def __init__(self, mean: ArrayLike, covariance: ArrayLike, relative: bool = True) -> None:
@@ -74,15 +63,8 @@ class Residuals:
 
         A state whose residual is exactly 0, or follows from those before it, adds nothing: its row is 0.
 
-        Parameters
-        ----------
-        counted : array of bool (n,)
-            States that count.
-
-        Returns
-        -------
-        array (n, n)
-            Lower triangular; rows and columns of states that do not count are 0.
+        `counted` (n,): states that count; Returns (n, n): lower triangular; rows and columns of states that do not
+        count are 0.
         """
         n, C = len(self.mean), self.covariance
         inverse = np.zeros((n, n))
@@ -99,37 +81,13 @@ class Residuals:
         return inverse
 
     def to_dict(self) -> dict[str, Any]:
-        """The form of the model file.
-
-        Returns
-        -------
-        dict
-            Plain data.
-        """
+        """The form of the model file."""
         found = {"mean": self.mean.tolist(), "covariance": self.covariance.tolist()}
         return found | ({_RELATIVE: True} if self.relative else {})
 
     @classmethod
     def from_dict(cls, data: Any, name: str = "residuals") -> Residuals:
-        """From a model file.
-
-        Parameters
-        ----------
-        data : Any
-            What `to_dict` gives; without `relative` of the residual itself, as files of before have it.
-        name : str
-            Field, for errors.
-
-        Returns
-        -------
-        Residuals
-            As listed.
-
-        Raises
-        ------
-        ModelError
-            It is not that; names the field.
-        """
+        """From a model file."""
         data = object_of(data, name, known=(*_KEYS, _RELATIVE), needed=_KEYS)
         relative = data.get(_RELATIVE, False)
         if not isinstance(relative, bool):

@@ -130,12 +130,8 @@ class Axis:
 class BlockData:
     """What the fit knows of one block.
 
-    Parameters
-    ----------
-    transitions : int or None, optional
-        Fitted transitions of which this block has the largest weight; None where it is not known.
-    tied_to : int or None, optional
-        Block whose elements it shares, because it has too few of its own.
+    `transitions`: fitted transitions of which this block has the largest weight; None where it is not known; `tied_to`:
+    block whose elements it shares, because it has too few of its own.
     """
 
     transitions: int | None = None

@@ -114,25 +114,7 @@ class Signature:
 
 
 def checked_signatures(signatures: Sequence[Signature], n: int) -> tuple[Signature, ...]:
-    """The signatures of one model.
-
-    Parameters
-    ----------
-    signatures : sequence of Signature
-        Each with another label.
-    n : int
-        Number of states.
-
-    Returns
-    -------
-    tuple of Signature
-        The same.
-
-    Raises
-    ------
-    ModelError
-        Two have one label, there are too many, or one has another number of states.
-    """
+    """The signatures of one model."""
     labels = [signature.label for signature in signatures]
     if len(set(labels)) < len(labels) or len(labels) > MOST_SIGNATURES:
         raise ModelError(f"field 'signatures' must have different labels, at most {MOST_SIGNATURES}")
@@ -143,19 +125,7 @@ def checked_signatures(signatures: Sequence[Signature], n: int) -> tuple[Signatu
 
 
 def closeness(a: Signature, b: Signature) -> float:
-    """How alike two signatures are.
-
-    Parameters
-    ----------
-    a, b : Signature
-        Of one model.
-
-    Returns
-    -------
-    float
-        Mean over their common horizons of the cosine between the matrices: 1 for the same pattern, whatever its size
-        and sign, 0 for patterns in different states; 0 without a common horizon.
-    """
+    """How alike two signatures are."""
     common = [
         (a.moments[i], b.moments[b.steps.index(h)])
         for i, h in enumerate(a.steps)

@@ -23,15 +23,7 @@ def ordered_sum(weights: Any, values: Any) -> Any:
 
     No BLAS, whose order depends on shapes. Compiled code has the same sum in `bounds`.
 
-    Parameters
-    ----------
-    weights, values : array (p, ...)
-        That can be multiplied with each other.
-
-    Returns
-    -------
-    array (...)
-        The sum.
+    `weights, values` (p, ...): that can be multiplied with each other.
     """
     products = np.multiply(weights, values, order="C")  # the layout decides the order of the sum
     return _sum_of_rows(products.shape)(products)
@@ -68,19 +60,8 @@ def blended(blocks: Any, places: Any, weights: Any) -> Any:
 
     Compiled code has the same sum in `bounds`.
 
-    Parameters
-    ----------
-    blocks : array (R, ...)
-        Elements of each block.
-    places : array of int (C, K)
-        Blocks that hold at each sample (`Schedule.corners`).
-    weights : array (C, K)
-        Their weights.
-
-    Returns
-    -------
-    array (..., K)
-        Elements at each sample.
+    `blocks` (R, ...): elements of each block; `places` (C, K): blocks that hold at each sample (`Schedule.corners`);
+    `weights` (C, K): their weights.
     """
     last = np.ascontiguousarray(np.moveaxis(blocks, 0, -1))
     total = np.take(last, places[0], axis=-1)

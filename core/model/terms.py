@@ -37,22 +37,11 @@ from uncertain_lti.model.objects import object_of
 class Term:
     """One term: nominal elements and half-widths on one regressor.
 
-    Parameters
-    ----------
-    nominal : str
-        Name of the nominal elements; empty if there are none.
-    half : str
-        Name of their half-widths, all >= 0.
-    regressor : {"x", "u", "1"}
-        What the elements multiply: the state, the control, or 1. The half-widths multiply its absolute value.
-    times_dt : bool
-        Whether the term is a rate (1/s), which the step multiplies.
-    required : bool
-        Whether a model must state it; otherwise it is 0 by default.
-    meaning : str
-        In words.
-    word : str
-        What rules of a signals file and reports call an additive term; empty for the others.
+    `nominal`: name of the nominal elements; empty if there are none; `half`: name of their half-widths, all >= 0;
+    `regressor`: what the elements multiply: the state, the control, or 1. The half-widths multiply its absolute value;
+    `times_dt`: whether the term is a rate (1/s), which the step multiplies; `required`: whether a model must state it;
+    otherwise it is 0 by default; `meaning`: in words; `word`: what rules of a signals file and reports call an additive
+    term; empty for the others.
     """
 
     nominal: str
@@ -69,20 +58,7 @@ class Term:
         return (self.nominal, self.half) if self.nominal else (self.half,)
 
     def shape(self, n: int, m: int) -> tuple[int, ...]:
-        """Shape of its arrays.
-
-        Parameters
-        ----------
-        n : int
-            Number of states.
-        m : int
-            Number of controls.
-
-        Returns
-        -------
-        tuple of int
-            (n, n), (n, m) or (n,).
-        """
+        """Shape of its arrays."""
         return {"x": (n, n), "u": (n, m), "1": (n,)}[self.regressor]
 
 
@@ -110,17 +86,8 @@ SHAPES = {name: term for term in TERMS for name in term.names}
 def regressors(x: Array, u: Array) -> Array:
     """phi of the terms that the step multiplies: [x; u; 1].
 
-    Parameters
-    ----------
-    x : array (n, ...)
-        Normalised states.
-    u : array (m, ...)
-        Normalised controls.
-
-    Returns
-    -------
-    array (n + m + 1, ...)
-        φ; ψ is its absolute value.
+    `x` (n, ...): normalised states; `u` (m, ...): normalised controls; Returns (n + m + 1, ...): φ; ψ is its absolute
+    value.
     """
     one = np.ones((1, *x.shape[1:]))
     return np.concatenate([{"x": x, "u": u, "1": one}[term.regressor] for term in _RATES])
@@ -129,17 +96,8 @@ def regressors(x: Array, u: Array) -> Array:
 def tables(arrays: dict[str, Array]) -> tuple[Array, Array, Array]:
     """Nominal elements and half-widths of the rates side by side, and what dt does not multiply.
 
-    Parameters
-    ----------
-    arrays : dict
-        Of each of `ARRAYS` its values.
-
-    Returns
-    -------
-    nominal, half : array (n, n + m + 1), or (R, n, n + m + 1) of R blocks
-        One column for each of `regressors`.
-    noise : array (n,), or (R, n)
-        Sum of the half-widths of the other terms.
+    Returns (n, n + m + 1): one column for each of `regressors`; Returns (n,): sum of the half-widths of the other
+    terms.
     """
 
     def side_by_side(which: str) -> Array:
@@ -152,29 +110,7 @@ def tables(arrays: dict[str, Array]) -> tuple[Array, Array, Array]:
 
 
 def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_width: bool = False) -> Array:
-    """An array of a model, held to its shape.
-
-    Parameters
-    ----------
-    value : array
-        Numbers.
-    name : str
-        What errors call it.
-    shape : tuple of int or None
-        None for any.
-    half_width : bool, default False
-        Whether it must not be negative.
-
-    Returns
-    -------
-    array
-        A copy.
-
-    Raises
-    ------
-    ModelError
-        It is not an array of finite numbers, has another shape, or is negative; names it.
-    """
+    """An array of a model, held to its shape."""
     try:
         if isinstance(value, Sequence) and not _numbers_only(value):
             raise TypeError
@@ -211,37 +147,7 @@ def blocks_of(
     needed: Collection[str] = REQUIRED,
     also: Collection[str] = (),
 ) -> dict[str, Array]:
-    """The arrays of the blocks of a schedule, or of the only one, of a model file.
-
-    Parameters
-    ----------
-    data : Any
-        A list of objects as JSON gives it.
-    name : str
-        Of the list in the file, for errors.
-    n : int
-        Number of states.
-    m : int
-        Number of controls.
-    blocks : int or None
-        Number of blocks; None without a schedule.
-    names : sequence of str, optional
-        Arrays of a block, of `ARRAYS`.
-    needed : collection of str, optional
-        Those that must be there; the others are 0 where they are not.
-    also : collection of str, optional
-        Further fields that a block may have.
-
-    Returns
-    -------
-    dict of str to array
-        Of each name; with a schedule one axis more, the first, over the blocks.
-
-    Raises
-    ------
-    ModelError
-        It is no such list, or an array is missing or none of its shape; names the field.
-    """
+    """The arrays of the blocks of a schedule, or of the only one, of a model file."""
     if not isinstance(data, list) or len(data) != (blocks or 1):
         one_each = "" if blocks is None else ", one per knot or mode"
         raise ModelError(f"field '{name}' must be a list of {plural(blocks or 1, 'block')}{one_each}")

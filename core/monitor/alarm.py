@@ -33,18 +33,9 @@ EVERY_STATE = "joint"
 class Raised:
     """One reason for the alarm.
 
-    Parameters
-    ----------
-    label : str
-        Of the rule, as of `alarm_rule.labels`.
-    kind : str
-        Of the rule.
-    horizon : int
-        Of the rule, in steps.
-    state : str
-        The state; empty for all together, and where no state of this verdict is to blame.
-    value : float
-        The statistic over its threshold, with its sign; 1 of containment.
+    `label`: of the rule, as of `alarm_rule.labels`; `kind`: of the rule; `horizon`: of the rule, in steps; `state`: the
+    state; empty for all together, and where no state of this verdict is to blame; `value`: the statistic over its
+    threshold, with its sign; 1 of containment.
     """
 
     label: str
@@ -66,14 +57,8 @@ class Raised:
 class Nearest(NamedTuple):
     """The statistic of a rule that is nearest to its threshold.
 
-    Parameters
-    ----------
-    state : str
-        Of which it is; `EVERY_STATE` for all together.
-    value : float
-        The statistic.
-    threshold : float
-        What raises the alarm if it is exceeded.
+    `state`: of which it is; `EVERY_STATE` for all together; `value`: the statistic; `threshold`: what raises the alarm
+    if it is exceeded.
     """
 
     state: str
@@ -97,51 +82,22 @@ class AlarmStatistic(Protocol):
     def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
         """Take many verdicts; after each what `Alarm.push` gives.
 
-        Parameters
-        ----------
-        dt : array (K,)
-            Steps, s.
-        violated : array of bool (K,)
-            As for `Alarm.push`.
-        table : array (K, rows, n)
-            As for `Alarm.push`.
-
-        Returns
-        -------
-        array of bool (K,)
-            The alarm after each.
-        array (K, values)
-            The numbers of `values` after each.
+        `dt` (K,): steps, s; `violated` (K,): as for `Alarm.push`; `table` (K, rows, n): as for `Alarm.push`; Returns
+        (K,): the alarm after each; Returns (K, values): the numbers of `values` after each.
         """
         ...
 
     def values(self) -> Any:
-        """The statistic over its threshold.
-
-        Returns
-        -------
-        array of doubles
-            One per state or one for all; none of containment.
-        """
+        """The statistic over its threshold."""
         ...
 
 
 class AlarmWindow:
     """Containment: the last verdicts and the alarm that they raise, one verdict after another.
 
-    Parameters
-    ----------
-    rule : AlarmRule
-        m, n; for a horizon of several steps its margin, too.
-    places : sequence of int, optional
-        For such a horizon, where the utilisation of each state that counts is in the table.
-
-    Attributes
-    ----------
-    rule : AlarmRule
-        As given.
-    alarm : bool
-        `violations` of the last `window` verdicts are violations.
+    `rule`: m, n; for a horizon of several steps its margin, too; `places`: for such a horizon, where the utilisation of
+    each state that counts is in the table; `rule`: as given; `alarm`: `violations` of the last `window` verdicts are
+    violations.
     """
 
     __slots__ = ("_margin", "_needed", "_places", "_recent", "_violations", "alarm", "rule")
@@ -164,22 +120,7 @@ class AlarmWindow:
         return tuple(self._recent)
 
     def push(self, dt: float, violated: bool, table: Any) -> bool:
-        """Take one verdict.
-
-        Parameters
-        ----------
-        dt : float
-            Step that it ends, s.
-        violated : bool
-            Whether it is a violation that counts.
-        table : buffer of doubles
-            As of `Alarm.push`; looked at for a horizon of several steps. If all of it is NaN there is no verdict.
-
-        Returns
-        -------
-        bool
-            The alarm after it.
-        """
+        """Take one verdict."""
         if self._places:
             beyond = some_beyond(table, self._places, self._margin)
             if beyond < 0:
@@ -196,21 +137,8 @@ class AlarmWindow:
     def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
         """As `AlarmStatistic`, from a cleared alarm.
 
-        Parameters
-        ----------
-        dt : array (K,)
-            Steps, s.
-        violated : array of bool (K,)
-            As for `push`.
-        table : array (K, rows, n)
-            As of `Alarm.push`.
-
-        Returns
-        -------
-        array of bool (K,)
-            The alarm after each.
-        array (K, 0)
-            Nothing.
+        `dt` (K,): steps, s; `violated` (K,): as for `push`; `table` (K, rows, n): as of `Alarm.push`; Returns (K,): the
+        alarm after each; Returns (K, 0): nothing.
         """
         assert isinstance(self.rule, AlarmRule)
         given: NDArray[np.bool_] = np.ones(len(violated), dtype=bool)
@@ -222,36 +150,15 @@ class AlarmWindow:
         return after[np.cumsum(given)], np.zeros((len(violated), 0))
 
     def values(self) -> Any:
-        """As `AlarmStatistic`.
-
-        Returns
-        -------
-        array of doubles
-            None.
-        """
+        """As `AlarmStatistic`."""
         return array("d")
 
 
 class AlarmOverThreshold:
     """A statistic over a window, and whether it is over its threshold.
 
-    Parameters
-    ----------
-    rule : StatisticRule
-        The statistic.
-    model : UncertainLTI
-        Gives mean and covariance of joint statistics.
-    counted : array of bool (n,)
-        States that count.
-
-    Attributes
-    ----------
-    rule : StatisticRule
-        As given.
-    statistic : Statistic
-        Its arithmetic.
-    begin : int
-        Where its numbers begin in the table of `Alarm.push`.
+    `rule`: the statistic; `model`: gives mean and covariance of joint statistics; `counted` (n,): states that count;
+    `rule`: as given; `statistic`: its arithmetic; `begin`: where its numbers begin in the table of `Alarm.push`.
     """
 
     def __init__(self, rule: StatisticRule, model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
@@ -282,21 +189,8 @@ class AlarmOverThreshold:
     def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
         """As `AlarmStatistic`.
 
-        Parameters
-        ----------
-        dt : array (K,)
-            Steps, s.
-        violated : array of bool (K,)
-            Not looked at.
-        table : array (K, rows, n)
-            As of `Alarm.push`.
-
-        Returns
-        -------
-        array of bool (K,)
-            The alarm after each.
-        array (K, n), or (K, 1) of a joint statistic
-            `values` after each.
+        `dt` (K,): steps, s; `violated` (K,): not looked at; `table` (K, rows, n): as of `Alarm.push`; Returns (K,): the
+        alarm after each; Returns (K, n): `values` after each.
         """
         after, values = self.statistic.push_all(dt, table[:, self._row])
         return after, values
@@ -304,79 +198,31 @@ class AlarmOverThreshold:
     def values(self) -> Any:
         """The statistic over its threshold.
 
-        Returns
-        -------
-        array of doubles (n,), or (1,) of a joint statistic
-            NaN before the first verdict.
+        Returns (n,): naN before the first verdict.
         """
         return self.statistic.values()
 
 
 def row_of(rule: Rule, model: UncertainLTI) -> int:
-    """Row of the table that a rule looks at.
-
-    Parameters
-    ----------
-    rule : Rule
-        Of the model.
-    model : UncertainLTI
-        Its horizons follow one step, and the residuals follow them: joint statistics of a model file of before take
-        those (`Residuals.relative`).
-
-    Returns
-    -------
-    int
-        0 for the utilisation of one step.
-    """
+    """Row of the table that a rule looks at."""
     place = 0 if rule.horizon == 1 else 1 + model.steps.index(rule.horizon)
     own = rule.kind in JOINT and not model.residuals_at(rule.horizon).relative
     return residual_row(model) + place if own else place
 
 
 def residual_row(model: UncertainLTI) -> int:
-    """Row of the table at which the residuals begin: those of one step, then those of each horizon.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Its horizons are in the rows before.
-
-    Returns
-    -------
-    int
-        Half of the number of rows.
-    """
+    """Row of the table at which the residuals begin: those of one step, then those of each horizon."""
     return 1 + len(model.horizons)
 
 
 class Alarm:
     """All rules of one alarm.
 
-    Parameters
-    ----------
-    rules : sequence of Rule
-        At least one.
-    model : UncertainLTI
-        What they judge by.
-    counted : array of bool (n,)
-        States that count.
-
-    Attributes
-    ----------
-    rules : tuple of Rule
-        As given.
-    labels : tuple of str
-        What each is called.
-    parts : tuple of AlarmStatistic
-        What each makes of the verdicts.
-    names : tuple of str
-        Of the statistics, `energy/fan_speed` for example; empty if every rule is containment.
-    needs_table : bool
-        Whether some rule looks at more than the one-step violation.
-    needs_residual : bool
-        Whether some rule looks at residuals, which follow the utilisation in the table.
-    alarm : bool
-        Whether some rule raises the alarm.
+    `rules`: at least one; `model`: what they judge by; `counted` (n,): states that count; `rules`: as given; `labels`:
+    what each is called; `parts`: what each makes of the verdicts; `names`: of the statistics, `energy/fan_speed` for
+    example; empty if every rule is containment; `needs_table`: whether some rule looks at more than the one-step
+    violation; `needs_residual`: whether some rule looks at residuals, which follow the utilisation in the table;
+    `alarm`: whether some rule raises the alarm.
     """
 
     def __init__(self, rules: Sequence[Rule], model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
@@ -407,23 +253,7 @@ class Alarm:
         self.alarm = False
 
     def push(self, dt: float, violated: bool, table: Any = None) -> bool:
-        """Take one verdict.
-
-        Parameters
-        ----------
-        dt : float
-            Step that it ends, s.
-        violated : bool
-            Whether the one-step bounds are violated by a state that counts.
-        table : buffer of doubles, optional
-            If `needs_table`: rows of n, the utilisation for one step and for each horizon, and if `needs_residual` the
-            residuals likewise (`residual_row`).
-
-        Returns
-        -------
-        bool
-            The alarm after it.
-        """
+        """Take one verdict."""
         if self._only is not None:
             self.alarm = self._only.push(dt, violated, table)
             return self.alarm
@@ -434,28 +264,11 @@ class Alarm:
         return alarm
 
     def values(self) -> Any:
-        """Each statistic over its threshold, 1 and -1 being the threshold, in the order of `names`.
-
-        Returns
-        -------
-        array of doubles
-            A copy; NaN before the first verdict.
-        """
+        """Each statistic over its threshold, 1 and -1 being the threshold, in the order of `names`."""
         return self._statistics.values()
 
     def nearest(self, values: Sequence[float]) -> dict[str, Nearest]:
-        """Of each rule with a statistic the one that is nearest to its threshold.
-
-        Parameters
-        ----------
-        values : sequence of float
-            Of `values`.
-
-        Returns
-        -------
-        dict of str to Nearest
-            By the label of the rule; none of a rule of which all is NaN.
-        """
+        """Of each rule with a statistic the one that is nearest to its threshold."""
         found, n = {}, self._model.n
         for rule, label, begin in zip(self.rules, self.labels, self._begins, strict=True):
             if isinstance(rule, AlarmRule):
@@ -469,33 +282,14 @@ class Alarm:
         return found
 
     def raised(self) -> tuple[int, ...]:
-        """Rules that raise the alarm.
-
-        Returns
-        -------
-        tuple of int
-            Their places in `rules`.
-        """
+        """Rules that raise the alarm."""
         return tuple(i for i, part in enumerate(self.parts) if part.alarm) if self.alarm else ()
 
     def reasons(self, rules: Sequence[int], values: Sequence[float], sizes: Array, flags: Array) -> tuple[Raised, ...]:
         """Why the alarm is raised at a verdict.
 
-        Parameters
-        ----------
-        rules : sequence of int
-            Of `raised` there.
-        values : sequence of float
-            Of `values` there.
-        sizes : array (H, n)
-            Utilisation there, for one step and for each horizon.
-        flags : array (n,)
-            1 for a state that violates its one-step bounds there.
-
-        Returns
-        -------
-        tuple of Raised
-            Each state that a rule blames; of a rule that blames none now, one without a state.
+        `sizes` (H, n): utilisation there, for one step and for each horizon; `flags` (n,): 1 for a state that violates
+        its one-step bounds there.
         """
         found = []
         names = self._model.state_names
@@ -520,23 +314,8 @@ class Alarm:
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
         """Many verdicts from a cleared alarm; after each what `push` gives.
 
-        Parameters
-        ----------
-        dt : array (K,)
-            Steps, s.
-        violated : array of bool (K,)
-            As for `push`.
-        table : array (K, rows, n)
-            As for `push`.
-
-        Returns
-        -------
-        array of bool (K,)
-            The alarm after each.
-        array of bool (K, rules)
-            Which rules raise it.
-        array (K, statistics)
-            `values` after each.
+        `dt` (K,): steps, s; `violated` (K,): as for `push`; `table` (K, rows, n): as for `push`; Returns (K,): the
+        alarm after each; Returns (K, rules): which rules raise it; Returns (K, statistics): `values` after each.
         """
         self.reset()
         found = [part.push_all(dt, violated, table) for part in self.parts]
@@ -548,17 +327,7 @@ class Alarm:
 def raised(violated: NDArray[np.bool_], rule: AlarmRule) -> NDArray[np.bool_]:
     """The alarm of `AlarmWindow` after each of many verdicts, from a cleared alarm.
 
-    Parameters
-    ----------
-    violated : array of bool (K,)
-        Whether each verdict is a violation that counts.
-    rule : AlarmRule
-        m and n.
-
-    Returns
-    -------
-    array of bool (K,)
-        The alarm after each.
+    `violated` (K,): whether each verdict is a violation that counts; Returns (K,): the alarm after each.
     """
     total = np.concatenate([[0], np.cumsum(violated)])
     ends = np.arange(1, len(total))

@@ -34,16 +34,8 @@ _WORDS = {"true": 1.0, "false": 0.0}
 class Condition:
     """`TOPIC FIELD OPERATOR NUMBER`, for example `/engine/mode data == 3` or `/engine/state position[fan] > 0.2`.
 
-    Parameters
-    ----------
-    topic : str
-        Topic of the field.
-    field : FieldPath
-        The field.
-    operator : str
-        One of == != < <= > >=.
-    value : float
-        What the field is compared with.
+    `topic`: topic of the field; `field`: the field; `operator`: one of == != < <= > >=; `value`: what the field is
+    compared with.
     """
 
     topic: str
@@ -53,23 +45,7 @@ class Condition:
 
     @classmethod
     def parse(cls, text: str) -> Condition | None:
-        """Read a condition.
-
-        Parameters
-        ----------
-        text : str
-            `TOPIC FIELD OPERATOR NUMBER`.
-
-        Returns
-        -------
-        Condition or None
-            None for an empty text.
-
-        Raises
-        ------
-        ModelError
-            The text is no condition.
-        """
+        """Read a condition."""
         if not text.strip():
             return None
         match = _TEXT.fullmatch(text)
@@ -90,18 +66,7 @@ class Condition:
         return cls(match["topic"], path, match["operator"], value)
 
     def holds(self, value: float) -> bool | None:
-        """Whether it holds; None if the value is not a number.
-
-        Parameters
-        ----------
-        value : float
-            Of the field.
-
-        Returns
-        -------
-        bool or None
-            None where the value is NaN.
-        """
+        """Whether it holds; None if the value is not a number."""
         return _OPERATORS[self.operator](value, self.value) if value == value else None
 
     def __str__(self) -> str:
@@ -111,12 +76,8 @@ class Condition:
 class Armed(NamedTuple):
     """Which samples of a recording may raise the alarm.
 
-    Parameters
-    ----------
-    counts : array (N+1,) of bool
-        Whether the verdict on the sample counts; otherwise there is no alarm after it.
-    cleared : array (N+1,) of bool
-        Whether the alarm starts over before the verdict on the sample.
+    `counts` (N+1,): whether the verdict on the sample counts; otherwise there is no alarm after it; `cleared` (N+1,):
+    whether the alarm starts over before the verdict on the sample.
     """
 
     counts: NDArray[np.bool_]
@@ -126,23 +87,10 @@ class Armed(NamedTuple):
 class Arming:
     """Whether a verdict may raise the alarm.
 
-    Parameters
-    ----------
-    condition : Condition or None
-        None for alarms that always count.
-    grace_ns : int
-        No alarm this long, ns, in the samples' own time, after the first sample, after time jumped back, and after the
-        condition began to hold.
-    value : float or None
-        The last value of the condition, if it is known already.
-
-    Attributes
-    ----------
-    value : float or None
-        The last value of the condition; None while none was received.
-    on : bool or None
-        Whether the condition holds; None while nothing, or nothing that is a number, is known. Without a condition
-        True.
+    `condition`: none for alarms that always count; `grace_ns`: no alarm this long, ns, in the samples' own time, after
+    the first sample, after time jumped back, and after the condition began to hold; `value`: the last value of the
+    condition, if it is known already; `value`: the last value of the condition; None while none was received; `on`:
+    whether the condition holds; None while nothing, or nothing that is a number, is known. Without a condition True.
     """
 
     def __init__(self, condition: Condition | None, grace_ns: int, value: float | None = None) -> None:
@@ -156,13 +104,7 @@ class Arming:
         self._from: int | None = None  # the first instant that counts
 
     def learn(self, value: float) -> None:
-        """Take a value of the condition's field.
-
-        Parameters
-        ----------
-        value : float
-            NaN where it is no number.
-        """
+        """Take a value of the condition's field."""
         assert self.condition is not None
         self.value = value
         before, self.on = self.on, self.condition.holds(value)
@@ -170,18 +112,7 @@ class Arming:
             self._from = None
 
     def said_on(self, condition: Condition | None) -> float | None:
-        """What is known of the field that another condition asks for.
-
-        Parameters
-        ----------
-        condition : Condition or None
-            The other condition.
-
-        Returns
-        -------
-        float or None
-            The value; None where it asks for another field, or nothing has come.
-        """
+        """What is known of the field that another condition asks for."""
         same = condition and self.condition and (condition.topic, condition.field) == (
             self.condition.topic, self.condition.field
         )  # fmt: skip
@@ -192,18 +123,7 @@ class Arming:
         self._from = None
 
     def at(self, t_ns: int) -> bool:
-        """Whether a verdict at this instant counts.
-
-        Parameters
-        ----------
-        t_ns : int
-            Instant of the sample, ns.
-
-        Returns
-        -------
-        bool
-            False within the grace time, and unless the condition holds.
-        """
+        """Whether a verdict at this instant counts."""
         if not self.on:
             return False
         if self._from is None:
@@ -218,19 +138,8 @@ class Arming:
     ) -> Armed:
         """`learn` and `at` over the samples of a recording, as the live session calls them one after the other.
 
-        Parameters
-        ----------
-        t_ns : array (N+1,) of int
-            Instants of the samples, ns; a step back starts the grace time over.
-        before : array (K,) of int
-            Samples decided before each value of the condition's field came, in order.
-        values : array (K,)
-            These values.
-
-        Returns
-        -------
-        Armed
-            Of each sample.
+        `t_ns` (N+1,): instants of the samples, ns; a step back starts the grace time over; `before` (K,): samples
+        decided before each value of the condition's field came, in order; `values` (K,): these values.
         """
         count = len(t_ns)
         if self.condition is None and not self._grace:
@@ -250,13 +159,7 @@ class Arming:
         return Armed(counts, cleared | ~counts)
 
     def why_off(self) -> str:
-        """Why alarms do not count, in words; empty if they do.
-
-        Returns
-        -------
-        str
-            A sentence, or an empty text.
-        """
+        """Why alarms do not count, in words; empty if they do."""
         if self.on is None and self.value is not None and self.condition is not None:
             return f"alarms are off: {self.condition.topic} comes without a number in {self.condition.field.text}"
         if self.on is None:

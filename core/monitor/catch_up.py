@@ -75,26 +75,12 @@ class Lags:
         self._seen: deque[tuple[float, int]] = deque(maxlen=_LAGS)
 
     def look(self, heard: float, stamp_ns: int) -> None:
-        """Note the last message; to be called now and then.
-
-        Parameters
-        ----------
-        heard : float
-            Steady time when it came, s.
-        stamp_ns : int
-            Its stamp, ns.
-        """
+        """Note the last message; to be called now and then."""
         if not self._seen or heard > self._seen[-1][0]:
             self._seen.append((heard, stamp_ns))
 
     def usual(self) -> float | None:
-        """The smallest lag lately.
-
-        Returns
-        -------
-        float or None
-            Steady time less stamp, s; None where stamps go at another pace than time, as those of a recording may.
-        """
+        """The smallest lag lately."""
         if len(self._seen) < 2:
             return None
         (first, stamp), (last, newest) = self._seen[0], self._seen[-1]
@@ -114,37 +100,14 @@ class CatchUp:
     there can be no verdict before every topic has been heard: until then each message waits the full time, in case the
     missing topic arrives in a burst.
 
-    Parameters
-    ----------
-    clock : str
-        Clock topic; its time is that of its header stamps.
-    stamped : sequence of str
-        Further topics whose time is that of their header stamps.
-    awaited : sequence of str
-        Those of them that are expected to arrive.
-    step : float
-        Expected step of the clock topic, s.
-    max_gap_ns : int
-        A step back of more than this is a reset, ns.
-    longest : float
-        How long a message waits at most, s.
-    start : bool
-        Whether the monitor starts; otherwise it goes on after a stall.
-    lag : float, optional
-        That of the clock topic before the stall, s; None where it is not known.
-    since : float, optional
-        Steady time of the last message before the stall, s.
-
-    Attributes
-    ----------
-    over : bool
-        Every message has been released, and none need wait any longer.
-    reordered : int
-        Messages that were released after one that came later.
-    behind_ns : int
-        How far a topic was behind the clock topic at most, ns, while it arrived in a burst.
-    took : float
-        How long the first message waited, s.
+    `clock`: clock topic; its time is that of its header stamps; `stamped`: further topics whose time is that of their
+    header stamps; `awaited`: those of them that are expected to arrive; `step`: expected step of the clock topic, s;
+    `max_gap_ns`: A step back of more than this is a reset, ns; `longest`: how long a message waits at most, s; `start`:
+    whether the monitor starts; otherwise it goes on after a stall; `lag`: that of the clock topic before the stall, s;
+    None where it is not known; `since`: steady time of the last message before the stall, s; `over`: every message has
+    been released, and none need wait any longer; `reordered`: messages that were released after one that came later;
+    `behind_ns`: how far a topic was behind the clock topic at most, ns, while it arrived in a burst; `took`: how long
+    the first message waited, s.
     """
 
     def __init__(
@@ -172,21 +135,7 @@ class CatchUp:
         self.over, self.reordered, self.behind_ns, self.took = False, 0, 0, 0.0
 
     def put(self, topic: str, arrival_ns: int, data: bytes, stamp_ns: int | None, now: float) -> None:
-        """Have a message wait.
-
-        Parameters
-        ----------
-        topic : str
-            Its topic.
-        arrival_ns : int
-            Its arrival, ns.
-        data : bytes
-            The message.
-        stamp_ns : int or None
-            Its header stamp, ns; None where it has none or its topic goes by arrival.
-        now : float
-            Steady time, s.
-        """
+        """Have a message wait."""
         if not self._number:
             self._began, self._until = now, now + self._longest
         self._waiting.append((self._number, now, stamp_ns or 0, (topic, arrival_ns, data)))
@@ -217,19 +166,7 @@ class CatchUp:
                 self.behind_ns = max(self.behind_ns, before, behind)
 
     def ready(self, now: float) -> list[Waiting]:
-        """Messages that need not wait any longer, in the order in which they are to be taken.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        list of (str, int, bytes)
-            Topic, arrival in ns, and data. An arrival is moved to just after that of the message before, where
-            a message that came later was released first.
-        """
+        """Messages that need not wait any longer, in the order in which they are to be taken."""
         full = len(self._waiting) > MOST
         if self._never and self._start and not full:
             return self._release(now - self._longest)
@@ -238,18 +175,7 @@ class CatchUp:
         return []
 
     def finish(self, now: float) -> list[Waiting]:
-        """Release everything.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        list of (str, int, bytes)
-            As `ready`.
-        """
+        """Release everything."""
         self.over, self.took = True, now - self._began if self._number else 0.0
         return self._release(math.inf)
 

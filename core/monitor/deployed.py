@@ -33,26 +33,10 @@ LONGEST_GRACE = 86400.0
 class DeployedMonitor:
     """A monitor with the conditions of its deployment.
 
-    Parameters
-    ----------
-    monitor : EnvelopeMonitor
-        With rule and masked states.
-    condition : Condition, optional
-        No alarm unless it holds.
-    grace : float, default 0.0
-        No alarm this long, s, after the first sample, after time jumped back, and after the condition began to hold.
-    latch : bool, default False
-        An alarm lasts to the end.
-    start : float, optional
-        Only samples from here on are judged, s after the first sample of the recording: as if the node were started
-        then, with the condition known.
-    stop : float, optional
-        Only samples up to here are judged, s after the first sample.
-
-    Raises
-    ------
-    ModelError
-        A time is out of range.
+    `monitor`: with rule and masked states; `condition`: no alarm unless it holds; `grace`: no alarm this long, s, after
+    the first sample, after time jumped back, and after the condition began to hold; `latch`: an alarm lasts to the end;
+    `start`: only samples from here on are judged, s after the first sample of the recording: as if the node were
+    started then, with the condition known; `stop`: only samples up to here are judged, s after the first sample.
     """
 
     monitor: EnvelopeMonitor
@@ -76,24 +60,8 @@ class DeployedMonitor:
     ) -> Verdicts:
         """Verdicts over a recording with the alarm that the node would have published.
 
-        Parameters
-        ----------
-        transient : Transient
-            In recorded units.
-        before : array (K,) of int
-            Samples decided before each value of the condition's field came, of `read_field`.
-        values : array (K,)
-            These values.
-
-        Returns
-        -------
-        Verdicts
-            One row per sample; without a verdict outside `start` to `stop`.
-
-        Raises
-        ------
-        ModelError
-            As `EnvelopeMonitor.check`; or no sample lies between `start` and `stop`.
+        `before` (K,): samples decided before each value of the condition's field came, of `read_field`; `values` (K,):
+        these values.
         """
         t, count = transient.t, len(transient)
         inside = np.ones(count, dtype=bool)
@@ -121,13 +89,7 @@ class DeployedMonitor:
         return verdicts
 
     def words(self) -> str:
-        """What differs from a monitor without conditions.
-
-        Returns
-        -------
-        str
-            Clauses; empty if nothing does.
-        """
+        """What differs from a monitor without conditions."""
         return ", ".join(
             [
                 *([f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []),
@@ -139,22 +101,7 @@ class DeployedMonitor:
 
 
 def condition_words(condition: Condition | None, grace: float, latch: bool) -> list[str]:
-    """When an alarm counts and how long it lasts, in words.
-
-    Parameters
-    ----------
-    condition : Condition or None
-        No alarm unless it holds.
-    grace : float
-        Time of grace, s.
-    latch : bool
-        Whether an alarm lasts.
-
-    Returns
-    -------
-    list of str
-        A clause for each that is set.
-    """
+    """When an alarm counts and how long it lasts, in words."""
     return [
         *([f"as long as {condition}"] if condition else []),
         *([f"grace {grace:g} s"] if grace else []),

@@ -54,10 +54,7 @@ class _Matter:
 class EventLog:
     """Logs alarms with the states that left their bounds, verdicts that begin and cease, inputs that fall silent.
 
-    Parameters
-    ----------
-    log : callable
-        Takes a level of `session` (WARN for the alarm, OK for all else) and a line.
+    `log`: takes a level of `session` (WARN for the alarm, OK for all else) and a line.
     """
 
     def __init__(self, log: Callable[[int, str], None]) -> None:
@@ -72,15 +69,7 @@ class EventLog:
         self._cause = ("", 0.0)  # why there are no verdicts, and since when
 
     def begin(self, session: Session, now: float) -> None:
-        """A session starts, with no sample.
-
-        Parameters
-        ----------
-        session : Session
-            The session.
-        now : float
-            Steady time, s.
-        """
+        """A session starts, with no sample."""
         self._alarm, self._named, self._latest, self._unnamed = session.alarm, session.alarm, "", 0
         self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
         self._ceased, self._judged = now, False
@@ -96,17 +85,6 @@ class EventLog:
         """Log the alarm if it has changed: its start with the states that left their bounds, its end if the start was.
 
         Of many alarms some starts are left out; the next line, at most 10 s later, counts them and names the last.
-
-        Parameters
-        ----------
-        session : Session
-            The session.
-        verdicts : iterable of Verdict
-            Those that may have changed it.
-        now : float
-            Steady time, s.
-        why : str, default ""
-            What else changed it, with a blank in front.
         """
         if session.alarm == self._alarm:
             return
@@ -148,21 +126,7 @@ class EventLog:
     def look(
         self, session: Session, now: float, timeout: float, publishers: Mapping[str, int], problems: Sequence[str]
     ) -> None:
-        """Log what has changed since the last call.
-
-        Parameters
-        ----------
-        session : Session
-            The session.
-        now : float
-            Steady time, s.
-        timeout : float
-            Time without a verdict or a message after which that is logged, s.
-        publishers : mapping of str to int
-            Topic -> number of publishers.
-        problems : sequence of str
-            Why messages are missing, in words that stay the same while it lasts.
-        """
+        """Log what has changed since the last call."""
         self.turned(session, (), now)
         self._catch_up(now)
         if session.monitor.alarm and self._named:

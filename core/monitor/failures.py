@@ -21,15 +21,7 @@ _LOGGED = 5.0  # s between two log entries on unexpected errors
 class Failures:
     """Unexpected errors: their number, and the last one.
 
-    Parameters
-    ----------
-    log : callable
-        Takes an entry for the log.
-
-    Attributes
-    ----------
-    count : int
-        Errors so far.
+    `log`: takes an entry for the log; `count`: errors so far.
     """
 
     def __init__(self, log: Callable[[str], None]) -> None:
@@ -38,15 +30,7 @@ class Failures:
         self._logged: dict[str, float] = {}  # where: when
 
     def note(self, where: str, error: Exception) -> None:
-        """Count an error, and log it unless one from the same place was logged just before.
-
-        Parameters
-        ----------
-        where : str
-            What was being done.
-        error : Exception
-            The error.
-        """
+        """Count an error, and log it unless one from the same place was logged just before."""
         self.count += 1
         self._last = f"{where}: {error!r}"[:300]
         now = time.monotonic()
@@ -56,13 +40,7 @@ class Failures:
             self._log(f"unexpected error {self.count}, {where}; the node goes on\n{trace}")
 
     def problems(self) -> list[str]:
-        """What went wrong since the last report.
-
-        Returns
-        -------
-        list of str
-            One sentence, or none.
-        """
+        """What went wrong since the last report."""
         if self.count > self._reported:
             return [f"{self.count} unexpected errors, the last {self._last}"]
         return []

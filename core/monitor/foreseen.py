@@ -22,12 +22,7 @@ from uncertain_lti.monitor.verdict import place
 class Foreseen:
     """Bounds at an instant to come.
 
-    Parameters
-    ----------
-    t_ns : int
-        The instant, ns.
-    bounds : buffer of doubles (2 n,)
-        The lower bounds and then the upper ones, recorded units.
+    `t_ns`: the instant, ns; `bounds`: the lower bounds and then the upper ones, recorded units.
     """
 
     __slots__ = ("_bounds", "_n", "t_ns")
@@ -46,18 +41,7 @@ class Foreseen:
         return np.array(self._bounds[self._n :], dtype=np.float64)
 
     def packed(self, wanted: frozenset[int] = frozenset()) -> bytes:
-        """The bounds, where `Verdict.packed` has them.
-
-        Parameters
-        ----------
-        wanted : frozenset of int, optional
-            Not looked at.
-
-        Returns
-        -------
-        bytes
-            Little-endian doubles; zeros for all but lower and upper.
-        """
+        """The bounds, where `Verdict.packed` has them."""
         n = self._n
         numbers = bytearray(place("utilisation", n).stop)
         numbers[place("lower", n)] = self._bounds[:n].tobytes()

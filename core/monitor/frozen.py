@@ -53,14 +53,8 @@ Bounds = tuple[Sequence[float], Sequence[float], Sequence[float]]
 class Looked(NamedTuple):
     """What one transition says of repeats.
 
-    Parameters
-    ----------
-    frozen : tuple of Moved
-        States that are frozen at its end; empty for none.
-    thawed : bool
-        A state was frozen at its begin and is not any more: its bounds begin at no measurement.
-    repeating : tuple of Moved
-        Other states that repeat for longer than ever in the fit.
+    `frozen`: states that are frozen at its end; empty for none; `thawed`: A state was frozen at its begin and is not
+    any more: its bounds begin at no measurement; `repeating`: other states that repeat for longer than ever in the fit.
     """
 
     frozen: tuple[Moved, ...] = ()
@@ -79,14 +73,8 @@ _NOTHING = Looked()
 class FrozenWatch:
     """Tells frozen states, one transition after another.
 
-    Parameters
-    ----------
-    repeats : Repeats
-        Those of the fit.
-    margin : float
-        Of the bounds that it will be given.
-    counted : sequence of bool (n,)
-        States to look at: one that is masked is never frozen.
+    `repeats`: those of the fit; `margin`: of the bounds that it will be given; `counted`: states to look at: one that
+    is masked is never frozen.
     """
 
     __slots__ = (
@@ -128,26 +116,7 @@ class FrozenWatch:
     def look(
         self, t_ns: int, dt: float, before: Sequence[float], after: Sequence[float], bounds: Callable[[], Bounds]
     ) -> Looked:
-        """Take one transition.
-
-        Parameters
-        ----------
-        t_ns : int
-            Instant of its arrival, ns.
-        dt : float
-            Δt, s.
-        before : sequence of float, at least (n,)
-            States at its begin, and what follows them, recorded units.
-        after : sequence of float (n,)
-            States at its end.
-        bounds : callable
-            Called only if some state repeats.
-
-        Returns
-        -------
-        Looked
-            With the same bits for the same transitions.
-        """
+        """Take one transition."""
         if not any(map(eq, before, after)):
             if not self._on:
                 return _NOTHING
@@ -193,22 +162,7 @@ class FrozenWatch:
 
 
 def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
-    """What is said of a frozen state.
-
-    Parameters
-    ----------
-    name : str
-        Of the state.
-    moved : Moved
-        Its repeat.
-    repeats : Repeats
-        Those of the fit.
-
-    Returns
-    -------
-    str
-        Without a full stop.
-    """
+    """What is said of a frozen state."""
     what = repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])
     size, noisy = max(moved.run, moved.sum), repeats.noisy_steps[moved.state]
     if size <= 1.0 and moved.activity > repeats.active_beyond[moved.state]:
@@ -222,38 +176,12 @@ def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
 
 
 def why_frozen(state: int, repeats: Repeats) -> str:
-    """Why a repeat of this state may be called frozen.
-
-    Parameters
-    ----------
-    state : int
-        Number of the state.
-    repeats : Repeats
-        Those of the fit.
-
-    Returns
-    -------
-    str
-        Follows what is repeated.
-    """
+    """Why a repeat of this state may be called frozen."""
     noisy = repeats.noisy_steps[state] >= NOISY and repeats.longest_repeat_s[state] == 0.0
     return "while the model moves it" + (", or noise always changed it" if noisy else "")
 
 
 def repeat_words(seconds: float, longest: float) -> str:
-    """What is said of a repeat.
-
-    Parameters
-    ----------
-    seconds : float
-        How long it is, s.
-    longest : float
-        The longest of the fit, s.
-
-    Returns
-    -------
-    str
-        Begins with a verb.
-    """
+    """What is said of a repeat."""
     most = f"at most {longest:.3g} s" if longest > 0.0 else "never"
     return f"repeats exactly for {seconds:.3g} s ({most} in the fit)"

@@ -33,26 +33,11 @@ _AT_ONCE, _PAUSE = 200, 0.01  # messages that had waited are taken so many at on
 class Intake:
     """Takes the messages of a live monitor.
 
-    Parameters
-    ----------
-    sender : Sender
-        Publishes.
-    memory : Any
-        Remembers messages for snapshots: unless `recent` is None, `add` takes an `Entry` and whether it raised the
-        alarm, and `alarm_over` the steady time in s.
-    turned : callable
-        Told of a change of the alarm: the session, the verdicts and the steady time in s.
-    failed : callable
-        Told of an unexpected error: where it was, and the error.
-
-    Attributes
-    ----------
-    session : Stream or None
-        Judges; None while there is no model.
-    active : bool
-        Whether messages are taken.
-    clock : callable or None
-        Gives the time of arrival in ns; None for the time of the system.
+    `sender`: publishes; `memory`: remembers messages for snapshots: unless `recent` is None, `add` takes an `Entry` and
+    whether it raised the alarm, and `alarm_over` the steady time in s; `turned`: told of a change of the alarm: the
+    session, the verdicts and the steady time in s; `failed`: told of an unexpected error: where it was, and the error;
+    `session`: judges; None while there is no model; `active`: whether messages are taken; `clock`: gives the time of
+    arrival in ns; None for the time of the system.
     """
 
     session: Any = cython.declare(object, visibility="public")
@@ -74,15 +59,7 @@ class Intake:
         self.session, self.active, self.clock = None, False, None
 
     def message(self, topic: str, data: bytes) -> None:
-        """Take a message as it arrives.
-
-        Parameters
-        ----------
-        topic : str
-            Its topic.
-        data : bytes
-            The message.
-        """
+        """Take a message as it arrives."""
         session = self.session
         if session is None or not self.active:
             return
@@ -96,13 +73,7 @@ class Intake:
             self._take_all(session, messages, now)
 
     def waiting(self, all_of_them: bool = False) -> None:
-        """Take messages that need not wait any longer.
-
-        Parameters
-        ----------
-        all_of_them : bool, default False
-            Whether those too that should wait, as nothing more is accepted.
-        """
+        """Take messages that need not wait any longer."""
         if self.session is not None and self.active:
             now = time.monotonic()
             self._take_all(self.session, self.session.release(now, all_of_them), now)

@@ -40,14 +40,8 @@ _LIMIT = 10.0  # of a utilisation: one sample must not be all of a pattern
 class Part(NamedTuple):
     """A part of the machine that would leave such a pattern.
 
-    Parameters
-    ----------
-    kind : str
-        `actuator`, `sensor` or `equation`.
-    name : str
-        Of the control or state.
-    share : float
-        Share of the pattern that it explains, 0 to 1.
+    `kind`: `actuator`, `sensor` or `equation`; `name`: of the control or state; `share`: share of the pattern that it
+    explains, 0 to 1.
     """
 
     kind: str
@@ -105,12 +99,7 @@ class Likeness(NamedTuple):
 class Pattern:
     """Mean of u uᵀ of each horizon over verdicts.
 
-    Parameters
-    ----------
-    steps : sequence of int (H,)
-        Horizons.
-    n : int
-        Number of states.
+    `steps`: horizons; `n`: number of states.
     """
 
     def __init__(self, steps: Sequence[int], n: int) -> None:
@@ -121,12 +110,8 @@ class Pattern:
     def add(self, table: Array, half: Array) -> None:
         """Take one verdict.
 
-        Parameters
-        ----------
-        table : array (H, n)
-            Utilisation; a row with NaN is left out.
-        half : array (n,)
-            Half-widths of one step, normalised; a common factor does not matter.
+        `table` (H, n): utilisation; a row with NaN is left out; `half` (n,): half-widths of one step, normalised; a
+        common factor does not matter.
         """
         self.verdicts += 1
         self._half += half
@@ -135,33 +120,11 @@ class Pattern:
                 total += row[:, None] * row
 
     def signature(self, label: str) -> Signature:
-        """The pattern as a signature of one recording.
-
-        Parameters
-        ----------
-        label : str
-            What it is called.
-
-        Returns
-        -------
-        Signature
-            Scaled.
-        """
+        """The pattern as a signature of one recording."""
         return Signature(label, self.steps, scaled(self._sum), 1, self.verdicts)
 
     def parts(self, model: UncertainLTI) -> tuple[Part, ...]:
-        """What single part of the machine explains the one-step pattern.
-
-        Parameters
-        ----------
-        model : UncertainLTI
-            Gives A and B; of a scheduled model, those of its block with most data.
-
-        Returns
-        -------
-        tuple of Part
-            The best first, with those that explain nearly as much; empty if none explains enough.
-        """
+        """What single part of the machine explains the one-step pattern."""
         moment, half = self._sum[0], self._half / max(self.verdicts, 1)
         whole = float(np.trace(moment))
         if not (whole > 0.0 and (half > 0.0).all() and np.isfinite(half).all()):
@@ -185,37 +148,14 @@ class Pattern:
 def scaled(moments: Array) -> Array:
     """Matrices of Frobenius norm 1.
 
-    Parameters
-    ----------
-    moments : array (H, n, n)
-        Any size.
-
-    Returns
-    -------
-    array (H, n, n)
-        0 where it was 0.
+    `moments` (H, n, n): any size; Returns (H, n, n): 0 where it was 0.
     """
     size = np.sqrt(np.sum(moments**2, axis=(1, 2), keepdims=True))
     return np.asarray(np.divide(moments, size, out=np.zeros_like(moments), where=size > 0))
 
 
 def likeness(model: UncertainLTI, pattern: Pattern, first: Sequence[str] = ()) -> Likeness:
-    """What a pattern looks like.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Has the signatures.
-    pattern : Pattern
-        Of an alarm.
-    first : sequence of str
-        States outside their bounds when it began.
-
-    Returns
-    -------
-    Likeness
-        Unknown stays unknown: no label below `MATCH`, or with another signature that matches nearly as well.
-    """
+    """What a pattern looks like."""
     own = pattern.signature("-")
     every = sorted(((closeness(own, s), s.label) for s in model.signatures), reverse=True)
     label = ""
@@ -228,15 +168,7 @@ def likeness(model: UncertainLTI, pattern: Pattern, first: Sequence[str] = ()) -
 class Explainer:
     """The pattern of the alarm that is on, or was on last, one verdict after another.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        What judges.
-
-    Attributes
-    ----------
-    pattern : Pattern or None
-        None before any alarm.
+    `model`: what judges; `pattern`: none before any alarm.
     """
 
     def __init__(self, model: UncertainLTI) -> None:
@@ -253,19 +185,8 @@ class Explainer:
     def push(self, table: Array, lower: Array, upper: Array, quiet: int) -> bool:
         """Take a verdict with an alarm.
 
-        Parameters
-        ----------
-        table : array (H, n)
-            Utilisation for one step and for each horizon.
-        lower, upper : array (n,)
-            Bounds of one step, recorded units.
-        quiet : int
-            Verdicts without an alarm since the last one with.
-
-        Returns
-        -------
-        bool
-            Another pattern begins with it.
+        `table` (H, n): utilisation for one step and for each horizon; `lower, upper` (n,): bounds of one step, recorded
+        units.
         """
         begins = self.pattern is None or quiet > APART
         if begins:
@@ -279,13 +200,7 @@ class Explainer:
         return begins
 
     def likeness(self) -> Likeness | None:
-        """What the alarm looks like.
-
-        Returns
-        -------
-        Likeness or None
-            None before any alarm.
-        """
+        """What the alarm looks like."""
         return None if self.pattern is None else likeness(self._model, self.pattern, self._first)
 
 
@@ -299,23 +214,8 @@ def over_recording(
 ) -> Iterable[tuple[int, int, Explainer]]:
     """`Explainer` over the verdicts of a recording.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        What judged.
-    judged, alarm : array (N+1,) of bool
-        As in `Verdicts`.
-    table : array (N+1, H, n)
-        Utilisation.
-    lower, upper : array (N+1, n)
-        Bounds of one step, recorded units.
-
-    Yields
-    ------
-    int, int
-        First and last sample of each pattern.
-    Explainer
-        After the last.
+    `judged, alarm` (N+1,): as in `Verdicts`; `table` (N+1, H, n): utilisation; `lower, upper` (N+1, n): bounds of one
+    step, recorded units.
     """
     explainer, begin, last, before = Explainer(model), -1, -1, 0
     count = np.cumsum(judged)

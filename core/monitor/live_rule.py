@@ -21,24 +21,10 @@ from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 class Rule:
     """Alarm rule as the parameters give it; 0 means that of the model.
 
-    Parameters
-    ----------
-    violations : int, default 0
-        m of the rule.
-    window : int, default 0
-        n of the rule, in verdicts.
-    margin : float, default 0.0
-        Multiplies the half-widths.
-    masked : str, default ""
-        States that do not count, separated by commas.
-    enable : str, default ""
-        See `Condition`; empty for none.
-    enable_type : str, default ""
-        Message type of its topic; empty for that of the model or of the graph.
-    grace : float, default 0.0
-        Time of grace, s.
-    latch : bool, default False
-        Whether an alarm lasts until it is reset.
+    `violations`: m of the rule; `window`: n of the rule, in verdicts; `margin`: multiplies the half-widths; `masked`:
+    states that do not count, separated by commas; `enable`: see `Condition`; empty for none; `enable_type`: message
+    type of its topic; empty for that of the model or of the graph; `grace`: time of grace, s; `latch`: whether an alarm
+    lasts until it is reset.
     """
 
     violations: int = 0
@@ -51,39 +37,12 @@ class Rule:
     latch: bool = False
 
     def monitor(self, model: UncertainLTI) -> EnvelopeMonitor:
-        """Monitor of a model under this rule.
-
-        Parameters
-        ----------
-        model : UncertainLTI
-            The model.
-
-        Returns
-        -------
-        EnvelopeMonitor
-            With a cleared alarm.
-
-        Raises
-        ------
-        ModelError
-            The two do not fit.
-        """
+        """Monitor of a model under this rule."""
         return EnvelopeMonitor(
             model, self.violations or None, self.window or None, self.margin or None, listed_states(self.masked)
         )
 
 
 def listed_states(text: str) -> list[str]:
-    """Names of states, separated by commas.
-
-    Parameters
-    ----------
-    text : str
-        Of the parameter `masked`.
-
-    Returns
-    -------
-    list of str
-        The names.
-    """
+    """Names of states, separated by commas."""
     return [name.strip() for name in text.split(",") if name.strip()]

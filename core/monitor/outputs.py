@@ -27,31 +27,16 @@ NODE = "/envelope_monitor"
 class Output:
     """One topic below the node's name.
 
-    Parameters
-    ----------
-    name : str
-        Last part of the topic's name.
-    type : str
-        Message type: `VECTOR_TYPE` with one number per state, `FLAG_TYPE` with the alarm, or `TEXT_TYPE` in words.
-    when : {"message", "judged", "changed", "predicted", "predicted over"}
-        For every clock message, for those with a verdict, on a change, or for the prediction after an open sample: of
-        one step, or over the longest horizon.
-    text : str
-        Its meaning, for the reference (Markdown).
-    position : str
-        The number of a verdict that `position` holds, one of `verdict.NUMBERS`; empty without one.
-    velocity : str
-        Attribute of a verdict, true or false, that `velocity` repeats for each state; empty without one.
-    view : {"", "bound", "sample", "states", "steps", "alarm"}
-        How viewers draw it: a bound or the sample in the plot of each state, all states in one plot, changes in time,
-        or the alarm. Empty: not at all.
-    title : str
-        Title of its plot, for the views "states" and "steps".
-    limits : tuple of (str, float)
-        Constant lines of its plot, for the view "states".
-    of : {"states", "horizons", "statistics"}
-        What its numbers are of: the states, the states at one step and at each horizon of the model, or the statistics
-        of the alarm. A model without horizons, or an alarm without statistics, does not have the output.
+    `name`: last part of the topic's name; `type`: message type: `VECTOR_TYPE` with one number per state, `FLAG_TYPE`
+    with the alarm, or `TEXT_TYPE` in words; `when`: for every clock message, for those with a verdict, on a change, or
+    for the prediction after an open sample: of one step, or over the longest horizon; `text`: its meaning, for the
+    reference (Markdown); `position`: the number of a verdict that `position` holds, one of `verdict.NUMBERS`; empty
+    without one; `velocity`: attribute of a verdict, true or false, that `velocity` repeats for each state; empty
+    without one; `view`: how viewers draw it: a bound or the sample in the plot of each state, all states in one plot,
+    changes in time, or the alarm. Empty: not at all; `title`: title of its plot, for the views "states" and "steps";
+    `limits`: constant lines of its plot, for the view "states"; `of`: what its numbers are of: the states, the states
+    at one step and at each horizon of the model, or the statistics of the alarm. A model without horizons, or an alarm
+    without statistics, does not have the output.
     """
 
     name: str
@@ -157,22 +142,7 @@ JUDGED = tuple(output for output in OUTPUTS if output.when == "judged")
 def names_of(
     states: Sequence[str], steps: Sequence[int] = (), statistics: Sequence[str] = ()
 ) -> dict[str, tuple[str, ...]]:
-    """Names of the numbers that outputs carry, by what they are of.
-
-    Parameters
-    ----------
-    states : sequence of str
-        Of the model.
-    steps : sequence of int
-        Of its horizons.
-    statistics : sequence of str
-        Of the alarm, of `Alarm.names`.
-
-    Returns
-    -------
-    dict of str to tuple of str
-        `state@steps` for horizons, one step first; none without horizons.
-    """
+    """Names of the numbers that outputs carry, by what they are of."""
     over = [1, *steps] if steps else []
     horizons = tuple(f"{name}@{h}" for h in over for name in states)
     return {"states": tuple(states), "horizons": horizons, "statistics": tuple(statistics)}

@@ -43,24 +43,11 @@ QUIET = "no alarm"
 class Facts(NamedTuple):
     """What the words on one sample are made of.
 
-    Parameters
-    ----------
-    alarm : bool
-        The alarm after it.
-    status : Status
-        OK with a verdict.
-    unknown_regime : bool
-        The verdict is on a regime that was not fitted.
-    raised : sequence of Raised
-        Which rules raise the alarm; empty without a verdict.
-    frozen : sequence of str
-        States that are frozen.
-    lacking : sequence of str
-        Signals without a value at either end of the transition; looked at if the status is MISSING.
-    unlisted : str
-        Which mode the model does not list, in words; looked at if the status is MODE.
-    jumps : sequence of str
-        States that left their bounds by a jump larger than any of the fit, in words.
+    `alarm`: the alarm after it; `status`: OK with a verdict; `unknown_regime`: the verdict is on a regime that was not
+    fitted; `raised`: which rules raise the alarm; empty without a verdict; `frozen`: states that are frozen; `lacking`:
+    signals without a value at either end of the transition; looked at if the status is MISSING; `unlisted`: which mode
+    the model does not list, in words; looked at if the status is MODE; `jumps`: states that left their bounds by a jump
+    larger than any of the fit, in words.
     """
 
     alarm: bool
@@ -79,19 +66,8 @@ class Reasons:
     While the same rules hold the alarm, the states that any of its verdicts blamed stay named: which of them is outside
     its bounds may change with every sample.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        Names the signals.
-    rules : sequence of Rule
-        Of the alarm.
-
-    Attributes
-    ----------
-    text : str
-        On the last sample.
-    by : str
-        What holds the alarm, or held it last: rules, horizons and states; empty before any.
+    `model`: names the signals; `rules`: of the alarm; `text`: on the last sample; `by`: what holds the alarm, or held
+    it last: rules, horizons and states; empty before any.
     """
 
     def __init__(self, model: UncertainLTI, rules: Sequence[Rule]) -> None:
@@ -107,30 +83,11 @@ class Reasons:
         self._held = self.by = ""
 
     def fresh(self) -> Reasons:
-        """The same without any sample.
-
-        Returns
-        -------
-        Reasons
-            For other samples.
-        """
+        """The same without any sample."""
         return Reasons(self._model, self._rules)
 
     def take(self, verdict: Verdict, alarm: bool) -> str:
-        """`push` of a verdict of the monitor.
-
-        Parameters
-        ----------
-        verdict : Verdict
-            On the sample.
-        alarm : bool
-            The alarm after it, one that is latched included.
-
-        Returns
-        -------
-        str
-            As `push`.
-        """
+        """`push` of a verdict of the monitor."""
         if verdict.status.dropped:
             return self.text
         if verdict.judged and not alarm:
@@ -155,18 +112,7 @@ class Reasons:
         return list(dict.fromkeys(name for name, value in zip(of, values, strict=True) if value != value))
 
     def push(self, facts: Facts) -> str:
-        """Take one sample that was not dropped.
-
-        Parameters
-        ----------
-        facts : Facts
-            Of the sample.
-
-        Returns
-        -------
-        str
-            `text` after it.
-        """
+        """Take one sample that was not dropped."""
         judged = facts.status is Status.OK
         if not facts.alarm:
             self._blamed, self._jumps, self._held = {}, [], ""
@@ -211,22 +157,7 @@ class Reasons:
 
 
 def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[int, str]]:
-    """What is said of the samples of a recording, as far as it changes.
-
-    Parameters
-    ----------
-    verdicts : Verdicts
-        Of `EnvelopeMonitor.check`.
-    model : UncertainLTI
-        What judged.
-
-    Yields
-    ------
-    int
-        The sample.
-    str
-        What is said from there on.
-    """
+    """What is said of the samples of a recording, as far as it changes."""
     reasons, said = Reasons(model, verdicts.alarms.rules), ""
     transient, statuses = verdicts.transient, verdicts.statuses()
     names = model.state_names

@@ -60,17 +60,8 @@ class _Heard:
 class Sender:
     """Sends what is published of verdicts.
 
-    Parameters
-    ----------
-    now : float
-        Steady time, s.
-
-    Attributes
-    ----------
-    alarm_sent : float
-        When ~/violation was last published, steady time in s.
-    held_back : int
-        Verdicts that were not published, as sending took so long that inputs would have been lost.
+    `now`: steady time, s; `alarm_sent`: when ~/violation was last published, steady time in s; `held_back`: verdicts
+    that were not published, as sending took so long that inputs would have been lost.
     """
 
     alarm_sent: float = cython.declare(cython.double, visibility="readonly")
@@ -98,25 +89,13 @@ class Sender:
         self._given = self._judged = self._predicted = self._foreseen = None
 
     def open(self, publishers: Mapping[str, Publisher]) -> None:
-        """Send through other publishers from now on.
-
-        Parameters
-        ----------
-        publishers : mapping of str to Publisher
-            By name of the output, of every one of `OUTPUTS`.
-        """
+        """Send through other publishers from now on."""
         self._publishers = publishers
         self._violation, self._reason = publishers[VIOLATION.name], publishers[REASON.name]
         self._reason_sent, self._known = "", False
 
     def prepare(self, messages: VerdictMessages) -> None:
-        """Lay out other messages from now on.
-
-        Parameters
-        ----------
-        messages : VerdictMessages
-            Of a model and its alarm.
-        """
+        """Lay out other messages from now on."""
         self._messages, self._known = messages, False
 
     def changed(self) -> None:
@@ -143,19 +122,6 @@ class Sender:
 
         A subscriber that stands still can make sending a hundred times slower, so that inputs would be lost. Then
         verdicts are held back, but for a try now and then; the alarm is published when it changes.
-
-        Parameters
-        ----------
-        session : Stream
-            Gives the alarm and the prediction.
-        verdicts : sequence of Verdict
-            On the clock messages that were decided.
-        opened : bool
-            A sample was opened, from which bounds can be predicted.
-        now : float
-            Steady time, s.
-        turned : bool
-            The alarm changed; it is published in any case.
         """
         heard: _Heard
         if not self._known:
@@ -210,26 +176,12 @@ class Sender:
         ]
 
     def send_alarm(self, alarm: bool, now: float) -> None:
-        """Publish ~/violation.
-
-        Parameters
-        ----------
-        alarm : bool
-            Whether the alarm is raised.
-        now : float
-            Steady time, s.
-        """
+        """Publish ~/violation."""
         self.alarm_sent = now
         self._violation.send(TRUE if alarm else FALSE)
 
     def send_reason(self, text: str) -> None:
-        """Publish ~/reason if it has changed.
-
-        Parameters
-        ----------
-        text : str
-            What is said now.
-        """
+        """Publish ~/reason if it has changed."""
         if text != self._reason_sent:
             self._reason_sent = text
             self._reason.send(text_message(text))

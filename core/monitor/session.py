@@ -37,16 +37,8 @@ OK, WARN, ERROR, STALE = 0, 1, 2, 3
 class Report:
     """One diagnostic status.
 
-    Parameters
-    ----------
-    level : int
-        OK, WARN, ERROR or STALE.
-    name : str
-        `monitor`, or the state.
-    message : str
-        A sentence.
-    values : mapping of str to str
-        Texts by name, numbers among them as `repr` writes them.
+    `level`: OK, WARN, ERROR or STALE; `name`: `monitor`, or the state; `message`: A sentence; `values`: texts by name,
+    numbers among them as `repr` writes them.
     """
 
     level: int
@@ -59,23 +51,7 @@ class Session(Stream):
     """A stream that reports on itself, in the words and levels of diagnostics; takes what `Stream` takes."""
 
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
-        """Statuses of the monitor and of each state since the last call.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-        state_timeout : float
-            Time without a verdict, s, after which a state is STALE, never contained.
-        problems : sequence of str, optional
-            What the outside reports (publishers that cannot be heard, lost messages); they make the monitor's status at
-            least WARN.
-
-        Returns
-        -------
-        list of Report
-            That of the monitor first.
-        """
+        """Statuses of the monitor and of each state since the last call."""
         period = self.pass_over(now)
         without = self.without_verdict(now)
         reports = [self._report_monitor(period, now, without, state_timeout, problems)]
@@ -147,20 +123,7 @@ class Session(Stream):
         return Report(level, "monitor", message, self.counts(now))
 
     def reason(self, now: float, timeout: float) -> str:
-        """What holds the alarm, or why there is no verdict, as published on ~/reason.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-        timeout : float
-            Time without a verdict, s, after which that is said.
-
-        Returns
-        -------
-        str
-            In words that change only with the cause.
-        """
+        """What holds the alarm, or why there is no verdict, as published on ~/reason."""
         text = self.reasons.text
         if self.without_verdict(now) <= timeout or "no verdict:" in text:
             return text
@@ -170,66 +133,26 @@ class Session(Stream):
         return f"{text}; {said}" if self.alarm else said
 
     def likeness(self) -> Likeness | None:
-        """What the alarm that is on, or was on last, looks like.
-
-        Returns
-        -------
-        Likeness or None
-            None before any alarm.
-        """
+        """What the alarm that is on, or was on last, looks like."""
         return self.explainer.likeness()
 
     def frozen_text(self, moved: Moved) -> str:
-        """What is said of a frozen state.
-
-        Parameters
-        ----------
-        moved : Moved
-            Its repeat.
-
-        Returns
-        -------
-        str
-            Names it.
-        """
+        """What is said of a frozen state."""
         assert self.model.repeats is not None
         return frozen_words(self.model.state_names[moved.state], moved, self.model.repeats)
 
     def lacking(self, before: Counter[str]) -> list[str]:
-        """Signals that samples had no value of since some counters.
-
-        Parameters
-        ----------
-        before : Counter
-            Counters of the sampler then.
-
-        Returns
-        -------
-        list of str
-            Names.
-        """
+        """Signals that samples had no value of since some counters."""
         since = Counters(self.sampler.counters - before)
         lacking = since.of(MISSING) | since.of(TOO_OLD)
         return [signal.name for signal in self.model.signals if signal.name in lacking]
 
     def rule_text(self) -> str:
-        """The rules of the alarm in words.
-
-        Returns
-        -------
-        str
-            `at least 2 of 5 verdicts violated`, for example.
-        """
+        """The rules of the alarm in words."""
         return ", or ".join(rule.words for rule in self.monitor.alarms.rules)
 
     def whole_rule_text(self) -> str:
-        """The alarm rule in words, with everything that it depends on.
-
-        Returns
-        -------
-        str
-            One line.
-        """
+        """The alarm rule in words, with everything that it depends on."""
         rule = self.rule
         parts = [f"alarm when {self.rule_text()}", f"margin {self.monitor.rule.margin:g}"]
         parts += [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
@@ -271,16 +194,6 @@ class Session(Stream):
         """Counters by name: what was received, judged, dropped, late and missing, and how old each topic is.
 
         Of each statistic of the alarm also the value of the state that is nearest to its threshold, and both.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        dict of str to str
-            Name -> number as text; ages in s.
         """
         counters = self.sampler.counters
         rule = self.monitor.rule

@@ -36,20 +36,8 @@ _PER_STATE = 200  # and for each state of a verdict
 class Entry:
     """One message as received, with the verdicts and the alarm after it.
 
-    Parameters
-    ----------
-    now : float
-        Steady time, s.
-    arrival_ns : int
-        Arrival, ns.
-    topic : str
-        Its topic.
-    data : bytes
-        Serialised message.
-    verdicts : sequence of Verdict
-        On the clock messages that it decided.
-    alarm : bool
-        The alarm after it.
+    `now`: steady time, s; `arrival_ns`: arrival, ns; `topic`: its topic; `data`: serialised message; `verdicts`: on the
+    clock messages that it decided; `alarm`: the alarm after it.
     """
 
     now: float
@@ -65,12 +53,7 @@ class Recent:
 
     Of each topic the last message before these is kept as well: its values hold when they begin.
 
-    Parameters
-    ----------
-    seconds : float
-        How long a message is kept, s.
-    limit : int
-        Bytes at most.
+    `seconds`: how long a message is kept, s; `limit`: bytes at most.
     """
 
     def __init__(self, seconds: float, limit: int) -> None:
@@ -80,13 +63,7 @@ class Recent:
         self._bytes = 0
 
     def add(self, entry: Entry) -> None:
-        """Keep one more.
-
-        Parameters
-        ----------
-        entry : Entry
-            The latest.
-        """
+        """Keep one more."""
         entries = self._entries
         entries.append(entry)
         self._bytes += len(entry.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in entry.verdicts)
@@ -97,13 +74,7 @@ class Recent:
             self._bytes -= len(gone.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in gone.verdicts)
 
     def entries(self) -> list[Entry]:
-        """All, in order of arrival.
-
-        Returns
-        -------
-        list of Entry
-            In order of arrival.
-        """
+        """All, in order of arrival."""
         return [*sorted(self._before.values(), key=lambda entry: entry.now), *self._entries]
 
     def clear(self) -> None:
@@ -117,26 +88,10 @@ class Recent:
 class Scene:
     """What a snapshot file holds.
 
-    Parameters
-    ----------
-    entries : sequence of Entry
-        Messages in order of arrival.
-    names : sequence of str
-        Of the states.
-    inputs : mapping of str to str
-        Topic -> type of what came in.
-    outputs : mapping of str to str
-        Name of an output (flags, violation, lower, ...) -> its topic.
-    notes : mapping of str to str
-        Pairs for a metadata record.
-    definition : callable
-        Type name -> text of its definition.
-    steps : sequence of int
-        Of the horizons of the model.
-    statistics : sequence of str
-        Names of the statistics of the alarm.
-    reasons : Reasons, optional
-        Without any sample; default none are written.
+    `entries`: messages in order of arrival; `names`: of the states; `inputs`: topic -> type of what came in; `outputs`:
+    name of an output (flags, violation, lower, ...) -> its topic; `notes`: pairs for a metadata record; `definition`:
+    type name -> text of its definition; `steps`: of the horizons of the model; `statistics`: names of the statistics of
+    the alarm; `reasons`: without any sample; default none are written.
     """
 
     entries: Sequence[Entry]
@@ -150,23 +105,7 @@ class Scene:
     reasons: Reasons | None = None
 
     def write(self, path: Path) -> int:
-        """Write an MCAP file.
-
-        Parameters
-        ----------
-        path : Path
-            A file that does not exist.
-
-        Returns
-        -------
-        int
-            Messages written.
-
-        Raises
-        ------
-        OSError
-            The file cannot be written.
-        """
+        """Write an MCAP file."""
         count = 0
         messages = VerdictMessages(self.names, steps=self.steps, statistics=self.statistics)
         encode = {name: messages.encoder([name]) for name in messages.outputs}
@@ -213,28 +152,10 @@ class Scene:
 class Album:
     """Snapshot files in one folder, bounded in number and in bytes; written one at a time, in a thread of their own.
 
-    Parameters
-    ----------
-    folder : str
-        Made where it is not there. Only files in it that bear this node's name and a time are ever removed.
-    node_name : str
-        Begins the name of every file.
-    keep : int
-        Most files of this node; the oldest go first.
-    limit : int
-        Most bytes of the files of this node.
-
-    Attributes
-    ----------
-    written : int
-        Files written so far.
-    last, problem : str
-        Path of the last file, and why the last attempt failed; empty if there was none, or it did not.
-
-    Raises
-    ------
-    ModelError
-        The folder cannot be written to.
+    `folder`: made where it is not there. Only files in it that bear this node's name and a time are ever removed;
+    `node_name`: begins the name of every file; `keep`: most files of this node; the oldest go first; `limit`: most
+    bytes of the files of this node; `written`: files written so far; `last, problem`: path of the last file, and why
+    the last attempt failed; empty if there was none, or it did not.
     """
 
     def __init__(self, folder: str, node_name: str, keep: int, limit: int) -> None:
@@ -262,25 +183,7 @@ class Album:
         return self._thread is not None and self._thread.is_alive()
 
     def take(self, scene: Scene, patience: float) -> str:
-        """Begin to write a file.
-
-        Parameters
-        ----------
-        scene : Scene
-            What it holds.
-        patience : float
-            How long to wait for it, s.
-
-        Returns
-        -------
-        str
-            The outcome, a sentence.
-
-        Raises
-        ------
-        ModelError
-            A file is being written, no message was received yet, or writing failed; states the reason.
-        """
+        """Begin to write a file."""
         if self.busy:
             raise ModelError("a snapshot is being written; ask again in a moment")
         if not scene.entries:

@@ -44,34 +44,10 @@ _LONGEST = 1_000_000  # verdicts of a window at most
 class Statistic:
     """One statistic of one verdict after another, and whether it is over its threshold.
 
-    Parameters
-    ----------
-    kind : int
-        One of the kinds above.
-    n : int
-        Number of states.
-    window_s : float
-        T, s.
-    thresholds : sequence of float (n,), or (1,) of chi2 and mewma
-        What raises the alarm if it is exceeded.
-    counted : sequence of bool (n,)
-        States that raise it.
-    allowance : float
-        Of cusum.
-    mean : array (n,), optional
-        Of what chi2 and mewma take; see `model.residuals`.
-    whitening : array (n, n), optional
-        Of the same.
-
-    Attributes
-    ----------
-    alarm : bool
-        The statistic of some state that counts is over its threshold.
-
-    Raises
-    ------
-    ValueError
-        The arrays do not fit one another.
+    `kind`: one of the kinds above; `n`: number of states; `window_s`: T, s; `thresholds`: what raises the alarm if it
+    is exceeded; `counted`: states that raise it; `allowance`: of cusum; `mean` (n,): of what chi2 and mewma take; see
+    `model.residuals`; `whitening` (n, n): of the same; `alarm`: the statistic of some state that counts is over its
+    threshold.
     """
 
     alarm = cython.declare(cython.bint, visibility="readonly")
@@ -145,10 +121,7 @@ class Statistic:
     def values(self) -> Any:
         """The statistic over its threshold: 1 and -1 are the threshold; NaN before the first verdict.
 
-        Returns
-        -------
-        array of doubles (n,), or (1,) of chi2 and mewma
-            A copy; of mean, ewma and cusum with the sign of the utilisation.
+        Returns (n,): A copy; of mean, ewma and cusum with the sign of the utilisation.
         """
         if not self._pushed:
             return array("d", [float("nan")] * self._size)
@@ -157,25 +130,9 @@ class Statistic:
     def push_all(self, dt: Any, rows: Any) -> tuple[Any, Any]:
         """Take many verdicts.
 
-        Parameters
-        ----------
-        dt : array (K,)
-            Steps, s.
-        rows : array (K, n)
-            The utilisation of each state, or the residual, a row for each verdict. If all are NaN there is no verdict,
-            and nothing changes.
-
-        Returns
-        -------
-        array of bool (K,)
-            The alarm after each.
-        array (K, n), or (K, 1) of chi2 and mewma
-            `values` after each.
-
-        Raises
-        ------
-        ValueError
-            The arrays do not fit one another.
+        `dt` (K,): steps, s; `rows` (K, n): the utilisation of each state, or the residual, a row for each verdict. If
+        all are NaN there is no verdict, and nothing changes; Returns (K,): the alarm after each; Returns (K, n):
+        `values` after each.
         """
         count: cython.Py_ssize_t = len(dt)
         i: cython.Py_ssize_t
@@ -346,12 +303,7 @@ class Statistic:
 class Statistics:
     """Several statistics, each of its own part of the numbers of one verdict after another.
 
-    Parameters
-    ----------
-    parts : sequence of Statistic
-        The statistics.
-    begins : sequence of int
-        Where the numbers of each begin.
+    `parts`: the statistics; `begins`: where the numbers of each begin.
     """
 
     _parts = cython.declare(list)
@@ -361,26 +313,7 @@ class Statistics:
         self._parts, self._begins = list(parts), array("q", begins or [0])
 
     def push(self, dt: cython.double, table: Any) -> bool:
-        """Take one verdict.
-
-        Parameters
-        ----------
-        dt : float
-            Step that it ends, s.
-        table : buffer of doubles
-            The utilisation of each state, or the residual, for each statistic. If all of its own are NaN there is no
-            verdict for it, and nothing changes.
-
-        Returns
-        -------
-        bool
-            Whether some statistic raises the alarm after it.
-
-        Raises
-        ------
-        ValueError
-            There are too few numbers.
-        """
+        """Take one verdict."""
         part: Statistic
         k: cython.Py_ssize_t = 0
         begin: cython.Py_ssize_t
@@ -396,13 +329,7 @@ class Statistics:
         return raised
 
     def values(self) -> Any:
-        """`Statistic.values` of each, one after the other.
-
-        Returns
-        -------
-        array of doubles
-            A copy.
-        """
+        """`Statistic.values` of each, one after the other."""
         part: Statistic
         found = array("d")
         for part in self._parts:
@@ -411,27 +338,7 @@ class Statistics:
 
 
 def some_beyond(table: Any, places: Any, limit: cython.double) -> int:
-    """Whether the size of one of some numbers is over a limit, or one of them is NaN.
-
-    Parameters
-    ----------
-    table : buffer of doubles
-        The numbers, among others.
-    places : buffer of 8-byte integers
-        Where they are.
-    limit : float
-        The limit.
-
-    Returns
-    -------
-    int
-        0 or 1; -1 if all are NaN.
-
-    Raises
-    ------
-    ValueError
-        There are too few numbers.
-    """
+    """Whether the size of one of some numbers is over a limit, or one of them is NaN."""
     row: cython.double[::1] = table
     at: cython.longlong[::1] = places
     i: cython.Py_ssize_t

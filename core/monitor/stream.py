@@ -59,42 +59,13 @@ MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
 class Period:
     """What has happened since the last report.
 
-    Parameters
-    ----------
-    began : float
-        Steady time, s.
-
-    Attributes
-    ----------
-    verdicts : int
-        Verdicts given in it.
-    outside : int
-        Those from outside the fitted domain.
-    unknown : int
-        Those of a regime that was not fitted.
-    last_unknown : Verdict or None
-        The last of these.
-    last_unlisted : Verdict or None
-        The last in it on a mode that the model does not list.
-    alarm : bool
-        The alarm was raised at some time in it.
-    frozen, repeating : dict of int to Moved
-        By number of the state, the last repeat of those that were frozen, and of others that repeat for longer than
-        ever in the fit.
-    violations : Counter of int
-        By number of the state.
-    jumps : list of str
-        The first jumps larger than any of the fit, in words.
-    statuses : Counter of Status
-        Of the samples in it.
-    counters : Counter of str
-        Those of the sampler when it began.
-    late : int
-        Late messages when it began.
-    unreadable : int
-        Unreadable messages when it began.
-    future : int
-        Messages with a stamp in the future when it began.
+    `began`: steady time, s; `verdicts`: verdicts given in it; `outside`: those from outside the fitted domain;
+    `unknown`: those of a regime that was not fitted; `last_unknown`: the last of these; `last_unlisted`: the last in it
+    on a mode that the model does not list; `alarm`: the alarm was raised at some time in it; `frozen, repeating`: by
+    number of the state, the last repeat of those that were frozen, and of others that repeat for longer than ever in
+    the fit; `violations`: by number of the state; `jumps`: the first jumps larger than any of the fit, in words;
+    `statuses`: of the samples in it; `counters`: those of the sampler when it began; `late`: late messages when it
+    began; `unreadable`: unreadable messages when it began; `future`: messages with a stamp in the future when it began.
     """
 
     began: float = cython.declare(cython.double, visibility="readonly")
@@ -124,29 +95,7 @@ class Period:
 
 
 def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> dict[str, str]:
-    """Message type of each topic that a model reads, with every field path checked.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted to a recording.
-    source : str
-        What errors call the model.
-    type_fields : callable
-        Type name -> {field name: FieldType}.
-
-    Returns
-    -------
-    dict of str to str
-        Topic -> type.
-
-    Raises
-    ------
-    ModelError
-        The model names no topics or types, or two types for one topic.
-    SignalError
-        A type is not installed, or a field is not in it.
-    """
+    """Message type of each topic that a model reads, with every field path checked."""
     types: dict[str, str] = {}
     for signal in model.signals.signals:
         if not (signal.topic and signal.type):
@@ -175,44 +124,13 @@ def _held(model: UncertainLTI, signals: Sequence[int]) -> float:
 class Stream:
     """Samples and judges the messages of one model, and keeps count.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted to a recording.
-    rule : Rule
-        The alarm rule.
-    types : mapping of str to str
-        From `topic_types`.
-    type_fields : callable
-        Type name -> {field name: FieldType}.
-    make_reader : callable
-        Type name and paths -> `MessageReader`.
-    now : float
-        A steady time in s, as everywhere below.
-    arming : Arming, optional
-        Of the session before: where the condition asks for the same field, what is known of that stays.
-    catch_up : float, optional
-        How long messages wait in `accept` at most, s; 0 for not at all.
-
-    Attributes
-    ----------
-    latched : bool
-        An alarm has been raised that lasts until `reset`.
-    enable_topic : str
-        Topic of the enable condition; empty without one.
-    period : Period
-        What has happened since the last report.
-    reordered : int
-        Messages that were taken after one that came later.
-    caught_up : str
-        What the last catching up came to, in words; empty as long as no message was put in order.
-
-    Raises
-    ------
-    ModelError
-        The rule does not fit.
-    SignalError
-        The model does not state how samples are cut.
+    `model`: fitted to a recording; `rule`: the alarm rule; `types`: from `topic_types`; `type_fields`: type name ->
+    {field name: FieldType}; `make_reader`: type name and paths -> `MessageReader`; `now`: A steady time in s, as
+    everywhere below; `arming`: of the session before: where the condition asks for the same field, what is known of
+    that stays; `catch_up`: how long messages wait in `accept` at most, s; 0 for not at all; `latched`: an alarm has
+    been raised that lasts until `reset`; `enable_topic`: topic of the enable condition; empty without one; `period`:
+    what has happened since the last report; `reordered`: messages that were taken after one that came later;
+    `caught_up`: what the last catching up came to, in words; empty as long as no message was put in order.
     """
 
     model: UncertainLTI = cython.declare(object, visibility="public")
@@ -283,13 +201,7 @@ class Stream:
         self.restart(now)
 
     def restart(self, now: float) -> None:
-        """Forget every message, verdict and count; keep the last value of the enable condition.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-        """
+        """Forget every message, verdict and count; keep the last value of the enable condition."""
         self._start()
         self.unreadable: Counter[str] = Counter()
         self.why_unreadable: dict[str, str] = {}
@@ -316,18 +228,6 @@ class Stream:
 
         The alarm starts cleared, and one that is raised is latched if the rule asks for it. A rule equal to the
         present one changes nothing.
-
-        Parameters
-        ----------
-        rule : Rule
-            The alarm rule.
-
-        Raises
-        ------
-        ModelError
-            The rule does not fit; the old one stays.
-        SignalError
-            The condition's field is not in its type.
         """
         if rule != self.rule:
             raised = self.alarm
@@ -347,11 +247,6 @@ class Stream:
         """Keep what the previous session knows: the last values of topics that both read alike, and a latched alarm.
 
         States start over; controls would not arrive again if they are sent on a change only.
-
-        Parameters
-        ----------
-        other : Stream
-            The previous session.
         """
         mine, theirs = self.model.signals, other.model.signals
         for topic in self.types:
@@ -374,20 +269,7 @@ class Stream:
         self.latched = self.rule.latch and other.alarm
 
     def check(self, rule: Rule) -> None:
-        """Raise what `follow` would raise.
-
-        Parameters
-        ----------
-        rule : Rule
-            The alarm rule.
-
-        Raises
-        ------
-        ModelError
-            As `follow`.
-        SignalError
-            As `follow`.
-        """
+        """Raise what `follow` would raise."""
         self._prepared(rule)
 
     def _prepared(self, rule: Rule) -> tuple[EnvelopeMonitor, Condition | None, str, MessageReader | None]:
@@ -411,20 +293,7 @@ class Stream:
         return self._make_reader(type_name, [condition.field])
 
     def found_enable_type(self, type_name: str) -> None:
-        """Take the type of the condition's topic from the graph.
-
-        Parameters
-        ----------
-        type_name : str
-            As package/msg/Name.
-
-        Raises
-        ------
-        SignalError
-            The condition's field is not in it.
-        ModelError
-            The model has another type for the topic.
-        """
+        """Take the type of the condition's topic from the graph."""
         assert self.arming.condition is not None
         self._reads_condition = self._condition_reader(self.arming.condition, type_name)
         self.enable_type = type_name
@@ -475,22 +344,6 @@ class Stream:
 
         That is this message, except at the start and after a stall, when messages wait until topics have caught
         up with each other (`CatchUp`). Then `release` has to be called every now and then.
-
-        Parameters
-        ----------
-        topic : str
-            Its topic.
-        arrival_ns : int
-            Its arrival, ns.
-        data : bytes
-            The message.
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        sequence of (str, int, bytes)
-            Arguments of `take`, of each message in order.
         """
         before, self._came = self._came, now
         if self._catches_up is None:
@@ -509,20 +362,7 @@ class Stream:
         return self.release(now)
 
     def release(self, now: float, all_of_them: bool = False) -> Sequence[Waiting]:
-        """Messages that need not wait any longer.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-        all_of_them : bool, default False
-            Whether those too that should wait: no more messages are accepted.
-
-        Returns
-        -------
-        sequence of (str, int, bytes)
-            Arguments of `take`, of each message in order.
-        """
+        """Messages that need not wait any longer."""
         waits = self._catches_up
         if waits is None:
             if math.isfinite(self._stall):
@@ -541,26 +381,7 @@ class Stream:
         return released
 
     def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[Sequence[Verdict], bool]:
-        """Take one serialised message.
-
-        Parameters
-        ----------
-        topic : str
-            Its topic.
-        arrival_ns : int
-            Its arrival, ns.
-        data : bytes
-            The message.
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        sequence of Verdict
-            Verdicts on the clock messages that it decided.
-        bool
-            Whether it opened a sample.
-        """
+        """Take one serialised message."""
         self.received[topic] += 1
         self._heard[topic] = now
         if topic == self.enable_topic and self._reads_condition is not None:
@@ -654,18 +475,7 @@ class Stream:
                     period.violations[i] += 1
 
     def jumps_of(self, verdict: Verdict) -> list[str]:
-        """What is said of states that left their bounds by a jump larger than any of the fit.
-
-        Parameters
-        ----------
-        verdict : Verdict
-            On a sample.
-
-        Returns
-        -------
-        list of str
-            Names the states; empty if none did.
-        """
+        """What is said of states that left their bounds by a jump larger than any of the fit."""
         if not verdict.violated:
             return []
         flags = zip(self.model.state_names, verdict.numbers("flags"), strict=True)
@@ -676,11 +486,6 @@ class Stream:
         """Bounds for one median step after the open sample, as `EnvelopeMonitor.expect` gives them.
 
         None where a signal is missing, or the model does not know its median step.
-
-        Returns
-        -------
-        Verdict or None
-            Its `lower` and `upper` are the bounds; None if there are none.
         """
         dt, latest = self.model.sampling.dt_median, self.sampler.latest()
         if dt is None or latest is None:
@@ -689,13 +494,7 @@ class Stream:
         return self.monitor.expect(t_ns + round(dt * 1e9), z, dt) if all_finite(z) else None
 
     def foresee(self) -> Foreseen | None:
-        """Bounds at the end of the longest horizon after the open sample, as `EnvelopeMonitor.foresee` gives them.
-
-        Returns
-        -------
-        Foreseen or None
-            None where `predict` gives None, and without horizons.
-        """
+        """Bounds at the end of the longest horizon after the open sample, as `EnvelopeMonitor.foresee` gives them."""
         dt, latest = self.model.sampling.dt_median, self.sampler.latest()
         if dt is None or latest is None or not all_finite(latest[1]):
             return None
@@ -707,78 +506,23 @@ class Stream:
         return sum(self.sampler.counters.of(LATE).values())
 
     def heard(self, topic: str) -> float | None:
-        """When the last message of a topic arrived.
-
-        Parameters
-        ----------
-        topic : str
-            The topic.
-
-        Returns
-        -------
-        float or None
-            Steady time, s; None where none has come.
-        """
+        """When the last message of a topic arrived."""
         return self._heard.get(topic)
 
     def held(self, topic: str) -> float:
-        """How long the last values of a topic may be used.
-
-        Parameters
-        ----------
-        topic : str
-            The topic.
-
-        Returns
-        -------
-        float
-            Seconds; infinite where the model sets no limit.
-        """
+        """How long the last values of a topic may be used."""
         return self._held.get(topic, math.inf)  # infinite for that of the enable condition
 
     def without_verdict(self, now: float) -> float:
-        """Time since the last verdict, or since the start.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        float
-            Seconds.
-        """
+        """Time since the last verdict, or since the start."""
         return now - max(self._judged, self._began)
 
     def silent_for(self, now: float) -> float:
-        """Time since the last message of the clock topic.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        float
-            Seconds.
-        """
+        """Time since the last message of the clock topic."""
         return now - self._heard.get(self.sampler.clock, self._began)
 
     def pass_over(self, now: float) -> Period:
-        """Begin another period for `report`.
-
-        Parameters
-        ----------
-        now : float
-            Steady time, s.
-
-        Returns
-        -------
-        Period
-            The period that ends.
-        """
+        """Begin another period for `report`."""
         period, self.period = self.period, Period(now)
         self.period.alarm = self.alarm
         self.period.late = self.late

@@ -41,37 +41,13 @@ _EVERY = frozenset(range(1 + UTILISATION))
 
 
 def kinds(names: Iterable[str]) -> frozenset[int]:
-    """What `Verdict.packed` is asked for.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Of `NUMBERS`, or horizon_utilisation.
-
-    Returns
-    -------
-    frozenset of int
-        The parts of a judgement that they are.
-    """
+    """What `Verdict.packed` is asked for."""
     parts = ("utilisation" if name == "horizon_utilisation" else name for name in names)
     return frozenset(_OF_JUDGEMENT[part] for part in parts if part != "state")
 
 
 def place(name: str, n: int) -> slice:
-    """Where the numbers of one kind are in `Verdict.packed`.
-
-    Parameters
-    ----------
-    name : str
-        One of `NUMBERS`, or horizon_utilisation.
-    n : int
-        Number of states.
-
-    Returns
-    -------
-    slice
-        Of bytes.
-    """
+    """Where the numbers of one kind are in `Verdict.packed`."""
     if name == "horizon_utilisation":  # one step, then the horizons
         return slice(8 * n * (_KINDS - 1), None)
     start = 8 * n * (0 if name == "state" else 1 + _OF_JUDGEMENT[name])

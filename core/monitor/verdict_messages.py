@@ -42,26 +42,9 @@ FIRST_S, LAST_S = -(2**31), 2**31 - 1
 class NamedVector:
     """sensor_msgs/JointState with these names, in serialised form.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Of the states.
-    velocities : bool
-        Whether `velocity` holds as many numbers as `position`, or none.
-
-    Attributes
-    ----------
-    template : bytes
-        The message with zeros for stamp and numbers.
-    count : int
-        Number of names.
-    position, velocity : int
-        Byte at which their numbers begin.
-
-    Raises
-    ------
-    ModelError
-        The names cannot be sent.
+    `names`: of the states; `velocities`: whether `velocity` holds as many numbers as `position`, or none; `template`:
+    the message with zeros for stamp and numbers; `count`: number of names; `position, velocity`: byte at which their
+    numbers begin.
     """
 
     template = cython.declare(bytes, visibility="readonly")
@@ -102,50 +85,17 @@ class NamedVector:
 
     @cython.ccall
     def head(self, t_ns: int) -> bytes:
-        """Everything before the positions, which does not depend on whether there are velocities.
-
-        Parameters
-        ----------
-        t_ns : int
-            The stamp, ns.
-
-        Returns
-        -------
-        bytes
-            Begins the message.
-        """
+        """Everything before the positions, which does not depend on whether there are velocities."""
         seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
         return self._start + _STAMP.pack(max(FIRST_S, min(seconds, LAST_S)), nanoseconds) + self._names
 
     def tail(self, velocity: bytes = b"") -> bytes:
-        """Everything after the positions.
-
-        Parameters
-        ----------
-        velocity : bytes
-            Little-endian doubles, all of them.
-
-        Returns
-        -------
-        bytes
-            Ends the message.
-        """
+        """Everything after the positions."""
         return self._between + velocity + self._end
 
 
 def text_message(text: str) -> bytes:
-    """std_msgs/String in serialised form.
-
-    Parameters
-    ----------
-    text : str
-        Its data.
-
-    Returns
-    -------
-    bytes
-        The message.
-    """
+    """std_msgs/String in serialised form."""
     data = text.encode(errors="replace") + b"\x00"
     return _CDR + struct.pack("<I", len(data)) + data
 
@@ -178,14 +128,7 @@ class _Row:
 class Encoder:
     """Messages of several outputs, all of one verdict at once: the stamp is laid out and numbers are packed only once.
 
-    Parameters
-    ----------
-    outputs : sequence of Output
-        Vectors only.
-    vectors : sequence of NamedVector
-        The message of each; several may have the same.
-    n : int
-        Number of states.
+    `outputs`: vectors only; `vectors`: the message of each; several may have the same; `n`: number of states.
     """
 
     _vectors: list[NamedVector]  # of different names
@@ -203,18 +146,7 @@ class Encoder:
             self._rows.append(_Row(output, vector, head, n))
 
     def __call__(self, verdict: Any) -> list[bytes]:
-        """The messages, in the order of the outputs.
-
-        Parameters
-        ----------
-        verdict : Verdict or Foreseen
-            Of the model whose messages these are.
-
-        Returns
-        -------
-        list of bytes
-            One per output.
-        """
+        """The messages, in the order of the outputs."""
         row: _Row
         vector: NamedVector
         t_ns, numbers = verdict.t_ns, verdict.packed(self._kinds)
@@ -232,21 +164,9 @@ class Encoder:
 class VerdictMessages:
     """Messages of the verdicts of one model, for the vectors of `OUTPUTS`.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Of the states.
-    make_vector : callable, optional
-        Makes the messages from names and `velocities`; raises ModelError. Default `NamedVector`.
-    steps : sequence of int
-        Of the model's horizons.
-    statistics : sequence of str
-        Names of the statistics of the alarm.
-
-    Attributes
-    ----------
-    outputs : dict of str to Output
-        Each vector of `OUTPUTS` that model and alarm have, by name, in their order.
+    `names`: of the states; `make_vector`: makes the messages from names and `velocities`; raises ModelError. Default
+    `NamedVector`; `steps`: of the model's horizons; `statistics`: names of the statistics of the alarm; `outputs`: each
+    vector of `OUTPUTS` that model and alarm have, by name, in their order.
     """
 
     def __init__(
@@ -267,18 +187,7 @@ class VerdictMessages:
         self._vectors = {(of, marked): (make_vector or NamedVector)(every[of], marked) for of, marked in sorted(kinds)}
 
     def encoder(self, names: Sequence[str]) -> Encoder:
-        """What makes the messages of some outputs.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Of `outputs`.
-
-        Returns
-        -------
-        Encoder
-            Its messages are in the same order.
-        """
+        """What makes the messages of some outputs."""
         outputs = [self.outputs[name] for name in names]
         return Encoder(outputs, [self._vectors[output.of, bool(output.velocity)] for output in outputs], self._n)
 

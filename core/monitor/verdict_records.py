@@ -27,16 +27,8 @@ _NAN = float("nan")
 class VerdictRecords:
     """MCAP message records of many verdicts at once, with the bytes that `VerdictMessages` gives one by one.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Of the states.
-    channels : mapping of str to int
-        Number of the channel of each of `RECORDED` that is to be there, by name.
-    steps : sequence of int
-        Of the model's horizons.
-    statistics : sequence of str
-        Names of the statistics of the alarm.
+    `names`: of the states; `channels`: number of the channel of each of `RECORDED` that is to be there, by name;
+    `steps`: of the model's horizons; `statistics`: names of the statistics of the alarm.
     """
 
     def __init__(
@@ -79,25 +71,8 @@ class VerdictRecords:
     ) -> tuple[bytes, dict[int, bytes]]:
         """Records of K verdicts in rising log time.
 
-        Parameters
-        ----------
-        log_time : array (K,) of int
-            ns.
-        t_ns : array (K,) of int
-            Instants of the samples, ns.
-        judged : array (K,) of bool
-            Whether there is a verdict; the numbers of the others are published as NaN.
-        alarm : array (K,) of bool
-            As in `Verdicts`.
-        numbers : mapping of str to array
-            Of each `position` in `RECORDED` the numbers (K, ...), of each `velocity` the truth values (K,).
-
-        Returns
-        -------
-        bytes
-            The records.
-        dict of int to bytes
-            The index that `McapWriter.chunk` takes.
+        `log_time` (K,): ns; `t_ns` (K,): instants of the samples, ns; `judged` (K,): whether there is a verdict; the
+        numbers of the others are published as NaN; `alarm` (K,): as in `Verdicts`.
         """
         count = len(log_time)
         rows = np.tile(self._row, (count, 1))

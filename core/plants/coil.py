@@ -37,16 +37,6 @@ def inductance(current: ArrayLike) -> Array:
 
     The coil of the nonlinear circuit in Forgione and Piga, "Continuous-time system identification with neural
     networks", European Journal of Control 59, 2021.
-
-    Parameters
-    ----------
-    current : array
-        A, of either sign.
-
-    Returns
-    -------
-    array
-        H.
     """
     magnitude = np.abs(np.asarray(current, dtype=np.float64))
     falls: Array = 0.5 - np.arctan(5.0 * (magnitude - SATURATION)) / np.pi
@@ -64,32 +54,7 @@ def coil_runs(
     more_resistance: float = 1.0,
     more_inductance: float = 1.0,
 ) -> list[Transient]:
-    """Runs from rest: V_C (V) and I_L (A) under V_IN (V), held between samples; integrated by Runge-Kutta, no noise.
-
-    Parameters
-    ----------
-    seeds : sequence of int
-        Of the voltages; one seed, one run.
-    samples : int, default 501
-        Samples of each.
-    volts : float, default 40.0
-        Standard deviation of the voltage, V.
-    magnitude : bool, default False
-        `I_L_magnitude`, |I_L|, is there as a further scheduling signal.
-    act : callable, optional
-        The voltages that the source really gives, for the commanded ones (samples, seeds), which V_IN tells of.
-    onset : int, default 0
-        Sample from which the two factors below hold.
-    more_resistance : float, default 1.0
-        Factor on R.
-    more_inductance : float, default 1.0
-        Factor on the inductance at every current.
-
-    Returns
-    -------
-    list of Transient
-        One per seed.
-    """
+    """Runs from rest: V_C (V) and I_L (A) under V_IN (V), held between samples; integrated by Runge-Kutta, no noise."""
     h = STEP_NS * 1e-9 / SUBSTEPS
     pole = math.exp(-2.0 * math.pi * BANDWIDTH * STEP_NS * 1e-9)
     warm = 200

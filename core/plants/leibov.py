@@ -41,11 +41,6 @@ def leibov2006() -> UncertainLTI:
     """The model printed in the paper: n = 5, m = 4, normalised quantities, 1/s.
 
     Its signals name `position[<state>]` of the topics that the plant node publishes.
-
-    Returns
-    -------
-    UncertainLTI
-        Without drift and noise; no domain and no fit.
     """
     data = json.loads((files(__package__) / "leibov2006.json").read_text(encoding="utf-8"))
     signals = SignalMap(
@@ -66,19 +61,7 @@ def _signals(names: list[str], topic: str) -> tuple[Signal, ...]:
 def pulses(steps: int, controls: int, rng: np.random.Generator) -> Array:
     """Pulses on each control in turn, first up and then down, separated by short rests; (steps, controls).
 
-    Parameters
-    ----------
-    steps : int
-        Samples.
-    controls : int
-        Number of controls.
-    rng : numpy.random.Generator
-        Draws height and ripple of each pulse.
-
-    Returns
-    -------
-    array (steps, controls)
-        Normalised deviations.
+    Returns (steps, controls): normalised deviations.
     """
     u = np.zeros((steps, controls))
     for number, start in enumerate(range(REST, steps, PULSE + REST)):
@@ -93,22 +76,6 @@ def transient(steps: int, seed: int, fault_at: int | None = None, start_ns: int 
     """One run of the plant from rest, every matrix element drawn again inside its interval at each step.
 
     Leibov (2006), eq. (3): x_{k+1} = x_k + Δt (A_k x_k + B_k u_k) with A_k in A ± ΔA and B_k in B ± ΔB.
-
-    Parameters
-    ----------
-    steps : int
-        Number of samples, at least 2.
-    seed : int
-        Seed of pulses and elements; one seed, one run to the last bit.
-    fault_at : int, optional
-        From the step that leaves this sample on, the elements are drawn as a fault (see FAULT_SPREAD).
-    start_ns : int, default 0
-        Instant of sample 0, ns; the others follow exactly 0.025 s apart.
-
-    Returns
-    -------
-    Transient
-        `steps` samples in normalised units, with the signals of `leibov2006`.
     """
     model = leibov2006()
     rng = np.random.default_rng(seed)

@@ -47,32 +47,13 @@ SHORT_CONTROLS = ("fuel", "area", "fan vanes", "comp. vanes")
 class Case:
     """One identification and its check.
 
-    Parameters
-    ----------
-    name : str
-        What it was identified from.
-    model : UncertainLTI
-        The model fitted.
-    verdicts : Verdicts
-        On the check transient.
-    outside : int
-        Transitions outside the bounds in the identification transients.
-    inside : array (n,)
-        Share of the check's transitions inside the bounds of each state.
-    inside_all : float
-        Share of the check's transitions inside all bounds.
-    mean_width : array (n,)
-        Mean width of the bounds over the check, normalised, per step.
-    max_width : array (n,)
-        Largest such width.
-    squared : float
-        Discrepancy of the nominal model over the check, Leibov (2006), eq. (4), W = I.
-    largest : array (n,)
-        The same, eq. (5).
-    outside_domain : int
-        Transitions of the check outside the fitted ranges.
-    seconds : float
-        Wall-clock time of the fit.
+    `name`: what it was identified from; `model`: the model fitted; `verdicts`: on the check transient; `outside`:
+    transitions outside the bounds in the identification transients; `inside` (n,): share of the check's transitions
+    inside the bounds of each state; `inside_all`: share of the check's transitions inside all bounds; `mean_width`
+    (n,): mean width of the bounds over the check, normalised, per step; `max_width` (n,): largest such width;
+    `squared`: discrepancy of the nominal model over the check, Leibov (2006), eq. (4), W = I; `largest` (n,): the same,
+    eq. (5); `outside_domain`: transitions of the check outside the fitted ranges; `seconds`: wall-clock time of the
+    fit.
     """
 
     name: str
@@ -97,26 +78,7 @@ class Case:
     def of(
         cls, name: str, transients: Sequence[Transient], check: Transient, criterion: Any, additive: Any = "none"
     ) -> Case:
-        """Fit a model and check it on another transient.
-
-        Parameters
-        ----------
-        name : str
-            What it is identified from.
-        transients : sequence of Transient
-            To fit.
-        check : Transient
-            To check.
-        criterion : {"qp", "lp"}
-            Criterion (10) or (11) of Leibov (2006).
-        additive : {"none", "disturbance", "noise", "both"}, default "none"
-            The additive term.
-
-        Returns
-        -------
-        Case
-            The result.
-        """
+        """Fit a model and check it on another transient."""
         began = time.perf_counter()
         model = fit(transients, criterion, additive=additive)
         seconds = time.perf_counter() - began
@@ -142,13 +104,7 @@ class Case:
         )
 
     def data(self) -> dict[str, Any]:
-        """The numbers, as plain data for JSON.
-
-        Returns
-        -------
-        dict of str to object
-            Lists and numbers; widths normalised, eigenvalues as [real, imaginary] in 1/s.
-        """
+        """The numbers, as plain data for JSON."""
         return {
             "identified_from": self.name,
             "criterion": self.model.fit_summary["criterion"],
@@ -172,27 +128,7 @@ def reproduce(
     say: Callable[[str], None] = print,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
-    """Run the experiment, write figures, models, `reproduce.txt` and `reproduce.json` to a folder.
-
-    Parameters
-    ----------
-    output : path
-        Folder; made where it is not there.
-    say : callable
-        Takes each part of the text as it is ready.
-    progress : callable, optional
-        Called with one line of text before each simulation, fit and search.
-
-    Returns
-    -------
-    dict
-        What is in `reproduce.json`.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be written.
-    """
+    """Run the experiment, write figures, models, `reproduce.txt` and `reproduce.json` to a folder."""
     folder = Path(output)
     folder.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
@@ -266,13 +202,7 @@ def reproduce(
 
 
 def trim_text() -> str:
-    """Steady states at 68 and 60 deg.
-
-    Returns
-    -------
-    str
-        A table: speeds in rpm, thrust in kN, consumption in kg/(kgf h), temperatures in K, flows in kg/s.
-    """
+    """Steady states at 68 and 60 deg."""
     rows = []
     for pla in (68.0, 60.0):
         t = trim(pla)
@@ -290,18 +220,7 @@ def trim_text() -> str:
 
 
 def cases_text(cases: Sequence[Case]) -> str:
-    """Shares of the check inside.
-
-    Parameters
-    ----------
-    cases : sequence of Case
-        All cases.
-
-    Returns
-    -------
-    str
-        A table.
-    """
+    """Shares of the check inside."""
     rows = [
         [
             c.name, *c.fitted_by, str(c.outside), f"{c.inside_all:.0%}",
@@ -316,18 +235,7 @@ def cases_text(cases: Sequence[Case]) -> str:
 
 
 def width_text(cases: Sequence[Case]) -> str:
-    """Widths and discrepancies over the check.
-
-    Parameters
-    ----------
-    cases : sequence of Case
-        All cases, checked on transients of the same length.
-
-    Returns
-    -------
-    str
-        A table in 1e-4 of the scale.
-    """
+    """Widths and discrepancies over the check."""
     rows = [
         [
             c.name, *c.fitted_by, *(f"{1e4 * w:.2f}" for w in c.mean_width),
@@ -346,18 +254,7 @@ def width_text(cases: Sequence[Case]) -> str:
 
 
 def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
-    """Eigenvalues compared with the published ones.
-
-    Parameters
-    ----------
-    models : dict of str to UncertainLTI
-        Models by the name that the table shows.
-
-    Returns
-    -------
-    str
-        A table, 1/s.
-    """
+    """Eigenvalues compared with the published ones."""
     point, plant = operating_point(), engine()
     A = plant.linearise(point.x_s, point.u_s, point.X, point.U)[0]
     sampled = (expm(A * DT) - np.eye(len(A))) / DT
@@ -378,20 +275,7 @@ def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
 
 
 def matrix_text(model: UncertainLTI, name: str) -> str:
-    """A, B and their half-widths compared with the published ones.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model fitted.
-    name : str
-        What the heading calls it.
-
-    Returns
-    -------
-    str
-        Two tables, 1/s.
-    """
+    """A, B and their half-widths compared with the published ones."""
     parts = []
     published = leibov2006()
     for title, m in (("published", published), (name, model)):
@@ -404,18 +288,7 @@ def matrix_text(model: UncertainLTI, name: str) -> str:
 
 
 def search_text(searches: Sequence[dict[str, Any]]) -> str:
-    """The paper's solver compared with the exact one.
-
-    Parameters
-    ----------
-    searches : sequence of dict
-        Per identification the objectives and the times of both solvers; the keys are those of `reproduce.json`.
-
-    Returns
-    -------
-    str
-        A table.
-    """
+    """The paper's solver compared with the exact one."""
     rows = [
         [
             s["identified_from"], number(s["exact"]), number(s["direct_search"]),
@@ -432,18 +305,6 @@ def check_figure(case: Case, path: str | os.PathLike[str]) -> None:
     """The paper's figure: each state between the bounds; next to it the same relative to the bounds' centre.
 
     Left, in recorded units, as the paper draws it; the bounds are so close there that right shows what they leave.
-
-    Parameters
-    ----------
-    case : Case
-        The case to draw.
-    path : path
-        The figure; its ending chooses the format, PNG where it has none.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

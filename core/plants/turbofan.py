@@ -65,44 +65,14 @@ class DesignPoint:
     Flow, pressure ratio and bypass ratio are those published for the RD-33; the turbine inlet temperature is the one
     that gives its thrust in a cycle without cooling air; the others are typical of the class, and chosen.
 
-    Parameters
-    ----------
-    flow : float, default 76.0
-        Air flow, kg/s.
-    fan_ratio : float, default 3.15
-        Pressure ratio of the fan.
-    compressor_ratio : float, default 6.9
-        Pressure ratio of the compressor.
-    bypass_ratio : float, default 0.49
-        Bypass flow over core flow.
-    turbine_inlet : float, default 1440.0
-        Temperature in front of the turbine, K.
-    fan_efficiency : float, default 0.82
-        Isentropic.
-    compressor_efficiency : float, default 0.84
-        Isentropic.
-    high_turbine_efficiency : float, default 0.87
-        Isentropic.
-    low_turbine_efficiency : float, default 0.88
-        Isentropic.
-    combustion_efficiency : float, default 0.99
-        Share of the heating value that is released.
-    combustor_loss : float, default 0.05
-        Share of total pressure.
-    bypass_loss : float, default 0.03
-        Share of total pressure.
-    mixer_loss : float, default 0.03
-        Share of total pressure, in mixer, jet pipe and unlit afterburner.
-    mechanical_efficiency : float, default 0.99
-        Of either spool.
-    velocity_coefficient : float, default 0.985
-        Of the nozzle.
-    core_mach : float, default 0.5
-        In the mixing plane, behind the turbine.
-    fan_speed : float, default 11000.0
-        rpm.
-    compressor_speed : float, default 15500.0
-        rpm.
+    `flow`: air flow, kg/s; `fan_ratio`: pressure ratio of the fan; `compressor_ratio`: pressure ratio of the
+    compressor; `bypass_ratio`: bypass flow over core flow; `turbine_inlet`: temperature in front of the turbine, K;
+    `fan_efficiency`: isentropic; `compressor_efficiency`: isentropic; `high_turbine_efficiency`: isentropic;
+    `low_turbine_efficiency`: isentropic; `combustion_efficiency`: share of the heating value that is released;
+    `combustor_loss`: share of total pressure; `bypass_loss`: share of total pressure; `mixer_loss`: share of total
+    pressure, in mixer, jet pipe and unlit afterburner; `mechanical_efficiency`: of either spool;
+    `velocity_coefficient`: of the nozzle; `core_mach`: in the mixing plane, behind the turbine; `fan_speed`: rpm;
+    `compressor_speed`: rpm.
     """
 
     flow: float = 76.0  # kg/s
@@ -129,18 +99,9 @@ class DesignPoint:
 class Rotors:
     """Moments of inertia and sensor lags, chosen for the modes of the paper (see docs/turbofan.md).
 
-    Parameters
-    ----------
-    low : float, default 16.0
-        Moment of inertia of the fan's spool, kg m^2.
-    high : float, default 7.25
-        Moment of inertia of the compressor's spool, kg m^2.
-    compressor_pressure : float, default 0.055
-        Lag of the sensor behind the compressor, s.
-    turbine_pressure : float, default 0.045
-        Lag of the pressure sensor behind the turbine, s.
-    turbine_temperature : float, default 0.07
-        Lag of the temperature sensor behind the turbine, s.
+    `low`: moment of inertia of the fan's spool, kg m^2; `high`: moment of inertia of the compressor's spool, kg m^2;
+    `compressor_pressure`: lag of the sensor behind the compressor, s; `turbine_pressure`: lag of the pressure sensor
+    behind the turbine, s; `turbine_temperature`: lag of the temperature sensor behind the turbine, s.
     """
 
     low: float = 16.0
@@ -154,12 +115,7 @@ class Rotors:
 class Health:
     """Factors on the efficiencies of fan and compressor; 1 is healthy.
 
-    Parameters
-    ----------
-    fan : float, default 1.0
-        Factor on the fan's efficiency.
-    compressor : float, default 1.0
-        Factor on the compressor's efficiency.
+    `fan`: factor on the fan's efficiency; `compressor`: factor on the compressor's efficiency.
     """
 
     fan: float = 1.0
@@ -170,56 +126,13 @@ class Health:
 class GasPath:
     """Everything at one operating condition; the stations are those of the module's docstring.
 
-    Parameters
-    ----------
-    P3 : float
-        Total pressure, Pa.
-    T3 : float
-        Total temperature, K.
-    T4 : float
-        Total temperature, K.
-    P5 : float
-        Total pressure, Pa.
-    T5 : float
-        Total temperature, K.
-    P13 : float
-        Total pressure, Pa.
-    T13 : float
-        Total temperature, K.
-    P6 : float
-        Total pressure, Pa.
-    T6 : float
-        Total temperature, K.
-    w4 : float
-        Mass fraction of burnt fuel at station 4.
-    w6 : float
-        Mass fraction of burnt fuel at station 6.
-    W2 : float
-        Flow, kg/s.
-    W25 : float
-        Flow, kg/s.
-    W4 : float
-        Flow, kg/s.
-    W5 : float
-        Flow, kg/s.
-    W16 : float
-        Flow, kg/s.
-    W8 : float
-        Flow, kg/s.
-    fuel : float
-        Fuel flow, kg/s.
-    thrust : float
-        Gross thrust, N.
-    fan_power : float
-        Taken by the fan, W.
-    compressor_power : float
-        Taken by the compressor, W.
-    high_turbine_power : float
-        Given by the turbine of the compressor's spool, W.
-    low_turbine_power : float
-        Given by the turbine of the fan's spool, W.
-    residual : float
-        Largest relative mismatch of the five flow balances.
+    `P3`: total pressure, Pa; `T3`: total temperature, K; `T4`: total temperature, K; `P5`: total pressure, Pa; `T5`:
+    total temperature, K; `P13`: total pressure, Pa; `T13`: total temperature, K; `P6`: total pressure, Pa; `T6`: total
+    temperature, K; `w4`: mass fraction of burnt fuel at station 4; `w6`: mass fraction of burnt fuel at station 6;
+    `W2`: flow, kg/s; `W25`: flow, kg/s; `W4`: flow, kg/s; `W5`: flow, kg/s; `W16`: flow, kg/s; `W8`: flow, kg/s;
+    `fuel`: fuel flow, kg/s; `thrust`: gross thrust, N; `fan_power`: taken by the fan, W; `compressor_power`: taken by
+    the compressor, W; `high_turbine_power`: given by the turbine of the compressor's spool, W; `low_turbine_power`:
+    given by the turbine of the fan's spool, W; `residual`: largest relative mismatch of the five flow balances.
     """
 
     P3: float
@@ -268,17 +181,7 @@ class Engine:
 
     States and controls in recorded units, in the order of STATES and CONTROLS.
 
-    Parameters
-    ----------
-    design : DesignPoint, optional
-        Sizes; default `DesignPoint()`.
-    rotors : Rotors, optional
-        Inertias and sensor lags; default `Rotors()`.
-
-    Raises
-    ------
-    UncertainLTIError
-        The sizes leave no pressure for the bypass.
+    `design`: sizes; default `DesignPoint()`; `rotors`: inertias and sensor lags; default `Rotors()`.
     """
 
     def __init__(self, design: DesignPoint | None = None, rotors: Rotors | None = None) -> None:
@@ -401,29 +304,7 @@ class Engine:
     def gas_path(
         self, x: Sequence[float], u: Sequence[float], health: Health | None = None, solver: GasPathSolver | None = None
     ) -> GasPath:
-        """Matched gas path at spool speeds x[:2] and controls u, to a relative mismatch of 1e-12.
-
-        Parameters
-        ----------
-        x : sequence of float (5,)
-            States in recorded units; the speeds alone count.
-        u : sequence of float (4,)
-            Controls in recorded units.
-        health : Health, optional
-            Default healthy.
-        solver : GasPathSolver, optional
-            Keeps the last solution as the next guess; default a new one.
-
-        Returns
-        -------
-        GasPath
-            Flows matched to a relative 1e-12.
-
-        Raises
-        ------
-        UncertainLTIError
-            The flows cannot be matched: outside what the engine can do.
-        """
+        """Matched gas path at spool speeds x[:2] and controls u, to a relative mismatch of 1e-12."""
         return (solver or GasPathSolver(self)).solve(x, u, health or Health())
 
     def derivative(
@@ -431,26 +312,7 @@ class Engine:
     ) -> Array:
         """Rate of the states.
 
-        Parameters
-        ----------
-        x : sequence of float (5,)
-            States in recorded units.
-        u : sequence of float (4,)
-            Controls in recorded units.
-        health : Health, optional
-            Default healthy.
-        solver : GasPathSolver, optional
-            As for `gas_path`.
-
-        Returns
-        -------
-        array (5,)
-            dx/dt, recorded units per s.
-
-        Raises
-        ------
-        UncertainLTIError
-            As `gas_path`.
+        Returns (5,): dx/dt, recorded units per s.
         """
         path = self.gas_path(x, u, health, solver)
         r, loss = self.rotors, self.design.mechanical_efficiency
@@ -471,30 +333,8 @@ class Engine:
     ) -> tuple[Array, Array]:
         """A and B of the scaled deviations, by central differences.
 
-        Parameters
-        ----------
-        x : array (5,)
-            States of the operating point, recorded units.
-        u : array (4,)
-            Its controls.
-        X : array (5,)
-            Scales of the states.
-        U : array (4,)
-            Scales of the controls.
-        step : float, default 1e-05
-            Half the difference, over the scale.
-
-        Returns
-        -------
-        array (5, 5)
-            A, 1/s.
-        array (5, 4)
-            B, 1/s.
-
-        Raises
-        ------
-        UncertainLTIError
-            As `gas_path`.
+        `x` (5,): states of the operating point, recorded units; `u` (4,): its controls; `X` (5,): scales of the states;
+        `U` (4,): scales of the controls; Returns (5, 5): A, 1/s; Returns (5, 4): B, 1/s.
         """
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
         X, U = np.asarray(X, dtype=np.float64), np.asarray(U, dtype=np.float64)
@@ -523,10 +363,7 @@ class GasPathSolver:
     The Jacobian is kept as long as it serves, and computed again by differences where convergence is slow. If the step
     from the last condition is too large, the condition is approached from the design point in several.
 
-    Parameters
-    ----------
-    engine : Engine
-        The engine whose flows are matched.
+    `engine`: the engine whose flows are matched.
     """
 
     TOLERANCE = 1e-12
@@ -538,27 +375,7 @@ class GasPathSolver:
         self._inverse: Array | None = None
 
     def solve(self, x: Sequence[float], u: Sequence[float], health: Health) -> GasPath:
-        """Matched gas path; see `Engine.gas_path`.
-
-        Parameters
-        ----------
-        x : sequence of float (5,)
-            States in recorded units; the speeds alone count.
-        u : sequence of float (4,)
-            Controls in recorded units.
-        health : Health
-            Factors on the efficiencies.
-
-        Returns
-        -------
-        GasPath
-            Flows matched to a relative 1e-12, or to 1e-10 where rounding allows no more.
-
-        Raises
-        ------
-        UncertainLTIError
-            The flows cannot be matched: outside what the engine can do.
-        """
+        """Matched gas path; see `Engine.gas_path`."""
         path = self._newton(x, u, health)
         if path is None:
             path = self._approach(x, u, health)
@@ -660,11 +477,5 @@ def _fuel_for(air: float, T3: float, T4: float, efficiency: float) -> float:
 
 @cache
 def engine() -> Engine:
-    """The engine with its default sizes.
-
-    Returns
-    -------
-    Engine
-        Made once.
-    """
+    """The engine with its default sizes."""
     return Engine()

@@ -35,38 +35,14 @@ class CompressorMap:
         work / theta          = work n^2 (1 - deloading a - slope (phi - 1) - curvature (phi - 1)^2)
         efficiency            = efficiency (1 - narrow (phi - 1)^2 - off_speed (n - 1)^2 - off_vane (a - schedule)^2)
 
-    Parameters
-    ----------
-    flow : float
-        Corrected design flow, kg/s.
-    work : float
-        Corrected design work, J/kg.
-    efficiency : float
-        Isentropic, at the design point.
-    T_design : float
-        Inlet temperature at the design point, K; corrected speed is relative to it.
-    exponent : float
-        How fast the flow falls with speed: more stages, more compressibility, higher.
-    steepening : float
-        How much faster at low speed.
-    slope : float
-        How fast work falls with flow: speed lines are steep in a multi-stage compressor.
-    curvature : float
-        Of the speed lines.
-    closing : float
-        Loss of flow per closing of the vanes, 1/deg.
-    deloading : float
-        Loss of work per closing of the vanes, 1/deg: pre-swirl lowers the work.
-    narrow : float
-        Loss of efficiency off the design flow coefficient.
-    off_speed : float
-        Loss of efficiency off the design speed.
-    off_vane : float
-        Loss of efficiency off the scheduled vane angle, 1/deg^2.
-    vane_low : float
-        Scheduled vane angle at `n_low`, deg.
-    n_low : float
-        Corrected speed over design at which the vanes are at `vane_low`.
+    `flow`: corrected design flow, kg/s; `work`: corrected design work, J/kg; `efficiency`: isentropic, at the design
+    point; `T_design`: inlet temperature at the design point, K; corrected speed is relative to it; `exponent`: how fast
+    the flow falls with speed: more stages, more compressibility, higher; `steepening`: how much faster at low speed;
+    `slope`: how fast work falls with flow: speed lines are steep in a multi-stage compressor; `curvature`: of the speed
+    lines; `closing`: loss of flow per closing of the vanes, 1/deg; `deloading`: loss of work per closing of the vanes,
+    1/deg: pre-swirl lowers the work; `narrow`: loss of efficiency off the design flow coefficient; `off_speed`: loss of
+    efficiency off the design speed; `off_vane`: loss of efficiency off the scheduled vane angle, 1/deg^2; `vane_low`:
+    scheduled vane angle at `n_low`, deg; `n_low`: corrected speed over design at which the vanes are at `vane_low`.
     """
 
     flow: float  # corrected design flow, kg/s
@@ -86,51 +62,13 @@ class CompressorMap:
     n_low: float
 
     def schedule(self, n: float) -> float:
-        """Vane angle that suits the corrected speed n, deg: a straight line, 0 at n = 1, `vane_low` at `n_low`.
-
-        Parameters
-        ----------
-        n : float
-            Corrected speed over its design value.
-
-        Returns
-        -------
-        float
-            Angle, deg; the line ends at -0.2 and 1.2 of `vane_low`.
-        """
+        """Vane angle that suits the corrected speed n, deg: a straight line, 0 at n = 1, `vane_low` at `n_low`."""
         return self.vane_low * min(max((1.0 - n) / (1.0 - self.n_low), -0.2), 1.2)
 
     def run(
         self, speed: float, phi: float, vane: float, P: float, T: float, health: float
     ) -> tuple[float, float, float, float]:
-        """One operating condition.
-
-        Parameters
-        ----------
-        speed : float
-            Mechanical speed over its design value.
-        phi : float
-            Flow coefficient over its design value.
-        vane : float
-            Vane angle, deg; positive closes.
-        P : float
-            Total pressure at the inlet, Pa.
-        T : float
-            Total temperature at the inlet, K.
-        health : float
-            Factor on the efficiency.
-
-        Returns
-        -------
-        float
-            Flow, kg/s.
-        float
-            Total pressure at the exit, Pa.
-        float
-            Total temperature at the exit, K.
-        float
-            Isentropic efficiency.
-        """
+        """One operating condition."""
         theta = T / self.T_design
         n = speed / sqrt(theta)
         d = phi - 1.0
@@ -153,16 +91,8 @@ class TurbineMap:
     W sqrt(T) / P = capacity sqrt(1 - (p / P)^2)
     efficiency    = efficiency (1 - narrow (nu - 1)^2),  nu = speed / sqrt(ideal drop) over its design value
 
-    Parameters
-    ----------
-    capacity : float
-        Flow capacity, kg sqrt(K) / (s Pa).
-    efficiency : float
-        Isentropic, at the design point.
-    drop : float
-        Ideal enthalpy drop at the design point, J/kg.
-    narrow : float
-        Loss of efficiency off the design velocity ratio.
+    `capacity`: flow capacity, kg sqrt(K) / (s Pa); `efficiency`: isentropic, at the design point; `drop`: ideal
+    enthalpy drop at the design point, J/kg; `narrow`: loss of efficiency off the design velocity ratio.
     """
 
     capacity: float  # kg sqrt(K) / (s Pa)
@@ -171,30 +101,7 @@ class TurbineMap:
     narrow: float
 
     def run(self, speed: float, drop: float, P: float, T: float, w: float) -> tuple[float, float, float]:
-        """One operating condition.
-
-        Parameters
-        ----------
-        speed : float
-            Mechanical speed over its design value.
-        drop : float
-            Ideal enthalpy drop, J/kg.
-        P : float
-            Total pressure at the inlet, Pa.
-        T : float
-            Total temperature at the inlet, K.
-        w : float
-            Mass fraction of burnt fuel.
-
-        Returns
-        -------
-        float
-            Flow, kg/s.
-        float
-            Total pressure at the exit, Pa.
-        float
-            Total temperature at the exit, K.
-        """
+        """One operating condition."""
         h = gas.enthalpy(T, w)
         ratio = gas.pressure_ratio(T, gas.temperature(h - drop, w), w)
         flow = self.capacity * P / sqrt(T) * sqrt(max(1.0 - ratio * ratio, 1e-12))
@@ -204,56 +111,14 @@ class TurbineMap:
 
 
 def burn(air: float, T: float, fuel: float, efficiency: float) -> tuple[float, float]:
-    """Combustor: exit temperature from the heat balance.
-
-    Parameters
-    ----------
-    air : float
-        Air flow, kg/s.
-    T : float
-        Temperature of the air, K.
-    fuel : float
-        Fuel flow, kg/s, at 298.15 K.
-    efficiency : float
-        Share of the heating value that is released.
-
-    Returns
-    -------
-    float
-        Exit temperature, K.
-    float
-        Mass fraction of burnt fuel.
-    """
+    """Combustor: exit temperature from the heat balance."""
     w = fuel / (air + fuel)
     heat = (1.0 - w) * (gas.enthalpy(T, 0.0) - gas.enthalpy(gas.T_REFERENCE, 0.0)) + w * efficiency * gas.HEATING_VALUE
     return gas.temperature(gas.enthalpy(gas.T_REFERENCE, w) + heat, w), w
 
 
 def nozzle(area: float, P: float, T: float, w: float, ambient: float, velocity: float) -> tuple[float, float]:
-    """Convergent nozzle.
-
-    Parameters
-    ----------
-    area : float
-        Effective throat area, m^2.
-    P : float
-        Total pressure, Pa.
-    T : float
-        Total temperature, K.
-    w : float
-        Mass fraction of burnt fuel.
-    ambient : float
-        Static pressure outside, Pa.
-    velocity : float
-        Velocity coefficient.
-
-    Returns
-    -------
-    float
-        Flow, kg/s.
-    float
-        Gross thrust, N.
-    """
+    """Convergent nozzle."""
     flow = gas.mass_flow(area, P, T, w, ambient)
     g = gas.gamma(T, w)
     throat = max(ambient, P * (2.0 / (g + 1.0)) ** (g / (g - 1.0)))

@@ -28,72 +28,20 @@ IDLE, MAXIMUM = 12.0, 68.0
 
 
 def power(pla: float) -> float:
-    """Lever position between idle, 0, and the maximum regime, 1.
-
-    Parameters
-    ----------
-    pla : float
-        Power-lever angle, deg.
-
-    Returns
-    -------
-    float
-        0 to 1.
-
-    Raises
-    ------
-    UncertainLTIError
-        The lever is out of range.
-    """
+    """Lever position between idle, 0, and the maximum regime, 1."""
     if not IDLE <= pla <= MAXIMUM:
         raise UncertainLTIError(f"turbofan: PLA is {pla:g} deg; it must be from {IDLE:g} to {MAXIMUM:g}")
     return (pla - IDLE) / (MAXIMUM - IDLE)
 
 
 def fan_speed(pla: float, plant: Engine) -> float:
-    """Scheduled fan speed, rpm: 50 % at idle, flatter towards the maximum (chosen).
-
-    Parameters
-    ----------
-    pla : float
-        Power-lever angle, deg.
-    plant : Engine
-        The engine.
-
-    Returns
-    -------
-    float
-        Fan speed, rpm.
-
-    Raises
-    ------
-    UncertainLTIError
-        The lever is out of range.
-    """
+    """Scheduled fan speed, rpm: 50 % at idle, flatter towards the maximum (chosen)."""
     share: float = 0.5 + 0.5 * power(pla) ** 0.75
     return share * plant.design.fan_speed
 
 
 def nozzle_area(pla: float, plant: Engine) -> float:
-    """Scheduled throat area, m^2: opened by 20 % at idle, to keep thrust low and the fan away from surge (chosen).
-
-    Parameters
-    ----------
-    pla : float
-        Power-lever angle, deg.
-    plant : Engine
-        The engine.
-
-    Returns
-    -------
-    float
-        Area, m^2.
-
-    Raises
-    ------
-    UncertainLTIError
-        The lever is out of range.
-    """
+    """Scheduled throat area, m^2: opened by 20 % at idle, to keep thrust low and the fan away from surge (chosen)."""
     return float(plant.nozzle_area * (1.0 + 0.20 * (1.0 - power(pla)) ** 1.2))
 
 
@@ -102,22 +50,6 @@ def vanes(low: float, high: float, plant: Engine) -> tuple[float, float]:
 
     The compressor's inlet temperature, which its corrected speed needs, is taken from the fan speed, as its rise goes
     nearly with the square of that.
-
-    Parameters
-    ----------
-    low : float
-        Fan speed, rpm.
-    high : float
-        Compressor speed, rpm.
-    plant : Engine
-        The engine.
-
-    Returns
-    -------
-    float
-        Angle of the fan's vanes, deg.
-    float
-        Angle of the compressor's vanes, deg.
     """
     n = low / plant.design.fan_speed
     share = T_STANDARD / plant.compressor.T_design
@@ -129,16 +61,8 @@ def vanes(low: float, high: float, plant: Engine) -> tuple[float, float]:
 class Trim:
     """A steady state and its gas path.
 
-    Parameters
-    ----------
-    pla : float
-        Power-lever angle, deg.
-    x : array (5,)
-        States in recorded units.
-    u : array (4,)
-        Controls in recorded units.
-    path : GasPath
-        The gas path there.
+    `pla`: power-lever angle, deg; `x` (5,): states in recorded units; `u` (4,): controls in recorded units; `path`: the
+    gas path there.
     """
 
     pla: float
@@ -148,27 +72,7 @@ class Trim:
 
 
 def trim(pla: float, plant: Engine | None = None, health: Health | None = None) -> Trim:
-    """Steady state at a lever angle: fan speed, area and vanes by schedule, fuel and compressor speed by balance.
-
-    Parameters
-    ----------
-    pla : float
-        Power-lever angle, deg.
-    plant : Engine, optional
-        Default `turbofan.engine()`.
-    health : Health, optional
-        Default healthy.
-
-    Returns
-    -------
-    Trim
-        The steady state, balanced to a relative 1e-9.
-
-    Raises
-    ------
-    UncertainLTIError
-        The lever is out of range, or there is no steady state.
-    """
+    """Steady state at a lever angle: fan speed, area and vanes by schedule, fuel and compressor speed by balance."""
     plant, health = plant or engine(), health or Health()
     d, low, area = plant.design, fan_speed(pla, plant), nozzle_area(pla, plant)
     solver = GasPathSolver(plant)
@@ -207,13 +111,7 @@ def trim(pla: float, plant: Engine | None = None, health: Health | None = None) 
 
 @cache
 def operating_point() -> OperatingPoint:
-    """PLA 68 deg, scaled by the largest steady magnitude from idle to there (Leibov's normalisation).
-
-    Returns
-    -------
-    OperatingPoint
-        States and controls in recorded units.
-    """
+    """PLA 68 deg, scaled by the largest steady magnitude from idle to there (Leibov's normalisation)."""
     trims = [trim(pla) for pla in np.linspace(IDLE, MAXIMUM, 15)]
     X = np.abs([t.x for t in trims]).max(axis=0)
     U = np.abs([t.u for t in trims]).max(axis=0)
@@ -227,14 +125,7 @@ class Controller:
     integrates the distance to the nearer limit; the cap has no proportional part and stays above the law while no limit
     is near, so that noise is not rectified. Gains are chosen for a response of about a second.
 
-    Parameters
-    ----------
-    plant : Engine
-        The engine.
-    start : Trim
-        The steady state that the controller takes over.
-    dt : float
-        Step, s.
+    `plant`: the engine; `start`: the steady state that the controller takes over; `dt`: step, s.
     """
 
     PROPORTIONAL, INTEGRAL = 2.0, 4.0  # relative fuel over relative speed: 1, 1/s
@@ -261,22 +152,7 @@ class Controller:
     def step(self, pla: float, x: Array) -> Array:
         """Commands from the lever and the measured states, once per sample.
 
-        Parameters
-        ----------
-        pla : float
-            Power-lever angle, deg.
-        x : array (5,)
-            Measured states, recorded units.
-
-        Returns
-        -------
-        array (4,)
-            Commands, recorded units.
-
-        Raises
-        ------
-        UncertainLTIError
-            The lever is out of range.
+        `x` (5,): measured states, recorded units; Returns (4,): commands, recorded units.
         """
         fuel, dt, u = self._plant.fuel, self._dt, self._command.copy()
         demand = fan_speed(pla, self._plant) + self._offset

@@ -39,19 +39,8 @@ DAMAGE = 0.02  # of the efficiency
 class Fault:
     """A kind of fault and the instant of its onset.
 
-    Parameters
-    ----------
-    kind : str
-        One of KINDS.
-    at : float
-        Onset, s after the first sample.
-    size : float, default 1.0
-        Of the fault, over the size that KINDS states: 2 is a bias, a drift, a rate of wear or a loss twice as large.
-
-    Raises
-    ------
-    UncertainLTIError
-        The kind is not one of KINDS, the size is not positive, or it is other than 1 for an actuator that is stuck.
+    `kind`: one of KINDS; `at`: onset, s after the first sample; `size`: of the fault, over the size that KINDS states:
+    2 is a bias, a drift, a rate of wear or a loss twice as large.
     """
 
     kind: str
@@ -69,34 +58,12 @@ class Fault:
             )
 
     def first_sample(self, dt: float) -> int:
-        """The first sample that can show it: a sensor's at the onset, anything else one step later.
-
-        Parameters
-        ----------
-        dt : float
-            Step, s.
-
-        Returns
-        -------
-        int
-            Position of the sample.
-        """
+        """The first sample that can show it: a sensor's at the onset, anything else one step later."""
         onset = int(np.ceil(self.at / dt - 1e-9))
         return onset if self.kind.startswith("sensor") else onset + 1
 
     def health(self, t: float) -> Health:
-        """Efficiency factors at one instant.
-
-        Parameters
-        ----------
-        t : float
-            Instant, s.
-
-        Returns
-        -------
-        Health
-            Both factors 1 before the onset, and for faults of other parts.
-        """
+        """Efficiency factors at one instant."""
         if self.kind == "compressor_wear" and t > self.at:
             return Health(compressor=1.0 - self.size * min(WEAR * (t - self.at), WORST_WEAR))
         if self.kind == "fan_damage" and t >= self.at:
@@ -106,19 +73,8 @@ class Fault:
     def reading(self, t: float, x: Array, X: Array) -> Array:
         """What the sensors read.
 
-        Parameters
-        ----------
-        t : float
-            Instant, s.
-        x : array (5,)
-            States, recorded units.
-        X : array (5,)
-            Scales of the states.
-
-        Returns
-        -------
-        array (5,)
-            Readings; `x` itself where no sensor is at fault.
+        `x` (5,): states, recorded units; `X` (5,): scales of the states; Returns (5,): readings; `x` itself where no
+        sensor is at fault.
         """
         if t < self.at or not self.kind.startswith("sensor"):
             return x
@@ -132,18 +88,7 @@ class Fault:
         return x
 
     def stuck(self, t: float) -> int | None:
-        """Position of the control that no longer follows its command, if any.
-
-        Parameters
-        ----------
-        t : float
-            Instant, s.
-
-        Returns
-        -------
-        int or None
-            Position in CONTROLS, or None.
-        """
+        """Position of the control that no longer follows its command, if any."""
         if t < self.at:
             return None
         return {

@@ -31,116 +31,34 @@ HEATING_VALUE = 43.1e6
 
 
 def cp(T: float, w: float) -> float:
-    """Specific heat at constant pressure.
-
-    Parameters
-    ----------
-    T : float
-        Temperature, K.
-    w : float
-        Mass fraction of burnt fuel.
-
-    Returns
-    -------
-    float
-        J/(kg K).
-    """
+    """Specific heat at constant pressure."""
     return AIR_A + w * FUEL_A + (AIR_B + w * FUEL_B) * T
 
 
 def gamma(T: float, w: float) -> float:
-    """Ratio of specific heats.
-
-    Parameters
-    ----------
-    T : float
-        Temperature, K.
-    w : float
-        Mass fraction of burnt fuel.
-
-    Returns
-    -------
-    float
-        c_p / c_v.
-    """
+    """Ratio of specific heats."""
     heat = cp(T, w)
     return heat / (heat - R)
 
 
 def enthalpy(T: float, w: float) -> float:
-    """Sensible enthalpy over 0 K.
-
-    Parameters
-    ----------
-    T : float
-        Temperature, K.
-    w : float
-        Mass fraction of burnt fuel.
-
-    Returns
-    -------
-    float
-        J/kg.
-    """
+    """Sensible enthalpy over 0 K."""
     return (AIR_A + w * FUEL_A) * T + 0.5 * (AIR_B + w * FUEL_B) * T * T
 
 
 def temperature(h: float, w: float) -> float:
-    """Temperature at which `enthalpy` is h.
-
-    Parameters
-    ----------
-    h : float
-        Sensible enthalpy over 0 K, J/kg.
-    w : float
-        Mass fraction of burnt fuel.
-
-    Returns
-    -------
-    float
-        K.
-    """
+    """Temperature at which `enthalpy` is h."""
     a, b = AIR_A + w * FUEL_A, AIR_B + w * FUEL_B
     return (sqrt(a * a + 2.0 * b * h) - a) / b
 
 
 def pressure_ratio(T1: float, T2: float, w: float) -> float:
-    """p2 / p1 of an isentropic change from T1 to T2.
-
-    Parameters
-    ----------
-    T1 : float
-        Temperature before, K.
-    T2 : float
-        Temperature after, K.
-    w : float
-        Mass fraction of burnt fuel.
-
-    Returns
-    -------
-    float
-        p2 / p1.
-    """
+    """p2 / p1 of an isentropic change from T1 to T2."""
     return exp(((AIR_A + w * FUEL_A) * log(T2 / T1) + (AIR_B + w * FUEL_B) * (T2 - T1)) / R)
 
 
 def isentropic_temperature(T1: float, ratio: float, w: float) -> float:
-    """Temperature after an isentropic change.
-
-    Parameters
-    ----------
-    T1 : float
-        Temperature before, K.
-    ratio : float
-        Pressure ratio p2 / p1.
-    w : float
-        Mass fraction of burnt fuel.
-
-    Returns
-    -------
-    float
-        T2, K.
-    """
+    """Temperature after an isentropic change."""
     a, b = AIR_A + w * FUEL_A, AIR_B + w * FUEL_B
     target = a * log(T1) + b * T1 + R * log(ratio)
     T2: float = T1 * ratio ** (R / cp(T1, w))
@@ -154,24 +72,6 @@ def mass_flow(area: float, P: float, T: float, w: float, p: float) -> float:
 
     Isentropic with gamma at T. Where p exceeds P the flow is reversed at the same magnitude of ratio, which keeps
     a solver's trial steps defined; no converged point lies there.
-
-    Parameters
-    ----------
-    area : float
-        Area of the passage, m^2.
-    P : float
-        Total pressure, Pa.
-    T : float
-        Total temperature, K.
-    w : float
-        Mass fraction of burnt fuel.
-    p : float
-        Static pressure behind the passage, Pa.
-
-    Returns
-    -------
-    float
-        kg/s; negative where p exceeds P.
     """
     g = gamma(T, w)
     ratio = p / P

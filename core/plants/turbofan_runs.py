@@ -64,13 +64,7 @@ LEVELS = ((0.0, 68.0), (4.0, 64.0), (9.0, 67.0), (13.0, 61.0), (18.0, 65.0), (22
 
 @cache
 def turbofan_signals() -> SignalMap:
-    """States and controls as the plant node publishes them, around PLA 68 deg; `config/signals/turbofan.yaml`.
-
-    Returns
-    -------
-    SignalMap
-        Resolved: clock, max_gap, time sources and types are there.
-    """
+    """States and controls as the plant node publishes them, around PLA 68 deg; `config/signals/turbofan.yaml`."""
     point = operating_point()
 
     def signals(names: tuple[str, ...], units: tuple[str, ...], topic: str, steady: Array, scale: Array,
@@ -94,28 +88,11 @@ def turbofan_signals() -> SignalMap:
 class Run:
     """One run of the plant.
 
-    Parameters
-    ----------
-    samples : int
-        Number of samples, at least 2.
-    amplitude : float or None, optional
-        Height of the pulses of an open-loop run, see `pulses`, negative downwards, around the steady state at the
-        first angle of `lever`; None for a closed-loop run along `lever`.
-    lever : tuple of (float, float), default ((0.0, MAXIMUM),)
-        (instant s, angle deg) of each jump of the lever; with `ramps`, of each corner of its path.
-    noise : float, default 0.0
-        Standard deviation of every reading, over its scale.
-    seed : int, default 0
-        Seed of the noise.
-    fault : Fault or None, optional
-        What goes wrong; None for a healthy run.
-    ramps : bool, default False
-        The lever moves evenly from corner to corner; two corners at one instant are a jump.
-
-    Raises
-    ------
-    UncertainLTIError
-        There are fewer than 2 samples, or noise is negative.
+    `samples`: number of samples, at least 2; `amplitude`: height of the pulses of an open-loop run, see `pulses`,
+    negative downwards, around the steady state at the first angle of `lever`; None for a closed-loop run along `lever`;
+    `lever`: (instant s, angle deg) of each jump of the lever; with `ramps`, of each corner of its path; `noise`:
+    standard deviation of every reading, over its scale; `seed`: seed of the noise; `fault`: what goes wrong; None for a
+    healthy run; `ramps`: the lever moves evenly from corner to corner; two corners at one instant are a jump.
     """
 
     samples: int
@@ -139,17 +116,7 @@ def pulses(t: float, amplitude: float) -> Array:
     1.875 s of rest, then for each control 3.75 s of pulse and 3.75 s of rest: 30 s, as in the numerical example of
     Leibov (2006).
 
-    Parameters
-    ----------
-    t : float
-        Instant, s.
-    amplitude : float
-        Height; each control takes its PROPORTION of it.
-
-    Returns
-    -------
-    array (4,)
-        Normalised deviations.
+    Returns (4,): normalised deviations.
     """
     u = np.zeros(len(CONTROLS))
     number, phase = divmod(t - PULSE / 2.0, 2.0 * PULSE)
@@ -163,25 +130,6 @@ def simulate(run: Run, start_ns: int = START_NS, plant: Engine | None = None) ->
 
     Between samples the nonlinear equations are integrated by SciPy's DOP853 to a relative tolerance of 1e-9, with the
     commands held.
-
-    Parameters
-    ----------
-    run : Run
-        What is commanded and what goes wrong.
-    start_ns : int, default START_NS
-        Stamp of the first sample, ns.
-    plant : Engine, optional
-        Default `turbofan.engine()`.
-
-    Returns
-    -------
-    Transient
-        Readings and commands in recorded units, with `turbofan_signals`.
-
-    Raises
-    ------
-    UncertainLTIError
-        The run leaves what the engine can do.
     """
     plant = plant or engine()
     point, rng = operating_point(), np.random.default_rng(run.seed)
@@ -260,26 +208,6 @@ def lever_moves(
 
     Angles are uniform, but about one in five is the smallest and one in five the largest: what a machine does from end
     to end has to be in recordings that shall represent it.
-
-    Parameters
-    ----------
-    seconds : float
-        Until when it moves, s.
-    seed : int
-        One seed, one profile.
-    jumps : float, default 0.5
-        Share of the moves that jump.
-    rate : tuple of (float, float), default (1.0, 4.0)
-        Slowest and fastest ramp, deg/s.
-    hold : tuple of (float, float), default (0.5, 5.0)
-        Shortest and longest rest after a move, s.
-    low : float, default 60.0
-        Smallest angle, deg; the largest is MAXIMUM.
-
-    Returns
-    -------
-    tuple of (float, float)
-        (instant s, angle deg) of each corner.
     """
     rng = np.random.default_rng(seed)
     beyond = (MAXIMUM - low) / 3.0
@@ -308,35 +236,7 @@ def make_run(
     fault_at: float = 24.0,
     samples: int = 0,
 ) -> Run:
-    """A run by name.
-
-    Parameters
-    ----------
-    manoeuvre : str
-        `pulses` (open loop, see `pulses`), `check` (lever from 68 to 60 deg) or `levels` (see LEVELS).
-    amplitude : float, default 0.0
-        Height of the pulses; other than 0 for `pulses` and for it alone.
-    noise : float, default 0.0
-        Standard deviation of every reading, over its scale.
-    seed : int, default 0
-        Seed of the noise.
-    fault : str, default ""
-        One of `turbofan_faults.KINDS`, or empty.
-    fault_at : float, default 24.0
-        Onset of the fault, s.
-    samples : int, default 0
-        Number of samples; 0 for the usual one.
-
-    Returns
-    -------
-    Run
-        The run.
-
-    Raises
-    ------
-    UncertainLTIError
-        A name is not known, or a number out of range.
-    """
+    """A run by name."""
     usual = {"pulses": PULSE_SAMPLES, "check": CHECK_SAMPLES, "levels": LEVELS_SAMPLES}
     if manoeuvre not in usual:
         raise UncertainLTIError(f"turbofan: there is no manoeuvre '{manoeuvre}'; there are {', '.join(usual)}")

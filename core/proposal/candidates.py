@@ -35,30 +35,12 @@ WRAPPING = "|".join(name for name, function in FUNCTIONS.items() if function.wra
 class Candidate:
     """One number of a topic that could be a signal.
 
-    Parameters
-    ----------
-    topic : str
-        Its topic.
-    path : str
-        Of the number in the message, as `FieldPath` reads it.
-    values : list of array (messages,), optional
-        One array per recording; NaN where there is none.
-    name : str, default ""
-        Of the signal, once it is chosen.
-    unit : str, default ""
-        Of the signal; empty where it is unknown.
-    reason : str, default ""
-        Why it is not proposed; empty if it is, or if there is no reason against it.
-    ready : str, default ""
-        `state` or `control` for one that a person may well want back; empty for others.
-    steady : float, default 0.0
-        Steady state, recorded units.
-    scale : float, default 1.0
-        Scale, recorded units.
-    delay : int, default 0
-        Samples by which the states follow a control later.
-    ignore : tuple of float, default ()
-        Values that stand for none.
+    `topic`: its topic; `path`: of the number in the message, as `FieldPath` reads it; `values` (messages,): one array
+    per recording; NaN where there is none; `name`: of the signal, once it is chosen; `unit`: of the signal; empty where
+    it is unknown; `reason`: why it is not proposed; empty if it is, or if there is no reason against it; `ready`:
+    `state` or `control` for one that a person may well want back; empty for others; `steady`: steady state, recorded
+    units; `scale`: scale, recorded units; `delay`: samples by which the states follow a control later; `ignore`: values
+    that stand for none.
     """
 
     topic: str
@@ -89,29 +71,12 @@ class Candidate:
 class Source:
     """One topic: its times per recording, what it seems to be, and its numbers.
 
-    Parameters
-    ----------
-    topic : str
-        Its name.
-    type : str
-        Message type, `pkg/msg/Type`.
-    role : str
-        `control`, `reference` (of some controller), `state`, empty (unknown), `apart` (neither) or `guess` (a
-        control by its effect).
-    stamped : bool
-        Whether header stamps can be used.
-    offset : float or None
-        Median of log time less header stamp, s; None without a stamp.
-    arrival : list of array (messages,) of int, optional
-        Log times per recording, ns.
-    stamp : list of array (messages,) of int, optional
-        Header stamps per recording, ns; negative for none.
-    candidates : list of Candidate, optional
-        Its numbers.
-    reason : str, default ""
-        Why none of them is proposed; empty otherwise.
-    halting : bool, default False
-        Its header stamps mostly repeat the one before.
+    `topic`: its name; `type`: message type, `pkg/msg/Type`; `role`: `control`, `reference` (of some controller),
+    `state`, empty (unknown), `apart` (neither) or `guess` (a control by its effect); `stamped`: whether header stamps
+    can be used; `offset`: median of log time less header stamp, s; None without a stamp; `arrival` (messages,): log
+    times per recording, ns; `stamp` (messages,): header stamps per recording, ns; negative for none; `candidates`: its
+    numbers; `reason`: why none of them is proposed; empty otherwise; `halting`: its header stamps mostly repeat the one
+    before.
     """
 
     topic: str
@@ -142,19 +107,7 @@ class Source:
     def instants(self, clock: Source, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Times of this topic's messages and another one's by one clock: stamps where both have them, else arrival.
 
-        Parameters
-        ----------
-        clock : Source
-            The other topic.
-        number : int
-            Which recording.
-
-        Returns
-        -------
-        array (messages,) of int
-            Of this topic, ns.
-        array (messages,) of int
-            Of the other one, ns.
+        Returns (messages,): of this topic, ns; Returns (messages,): of the other one, ns.
         """
         if self.stamped and clock.stamped and abs((self.offset or 0.0) - (clock.offset or 0.0)) <= 1.0:
             mine, theirs = self.stamp[number], clock.stamp[number]

@@ -37,24 +37,7 @@ MOST_STATES, MOST_CONTROLS = 8, 6
 
 
 def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "") -> tuple[list[Candidate], str]:
-    """States of the model, and a sentence where they look like none; reasons go to what is left out.
-
-    Parameters
-    ----------
-    states : sequence of Source
-        Topics that may be the state; those left out get a reason.
-    controls : sequence of Source
-        Topics of the controls; numbers left out get a reason.
-    like : str, default ""
-        The member of many alike that is looked at; default the one whose command shows most.
-
-    Returns
-    -------
-    list of Candidate
-        States of the model.
-    str
-        A sentence where they look like none; else empty.
-    """
+    """States of the model, and a sentence where they look like none; reasons go to what is left out."""
     every = {s.topic: s for s in [*states, *controls]}
     for source in states:
         prefer_rates(source)

@@ -31,14 +31,7 @@ FAINT = 5.0
 class Steps:
     """Transitions of some states, with the controls in force.
 
-    Parameters
-    ----------
-    X : array (N, n)
-        States, recorded units.
-    U : array (N, m)
-        Controls, recorded units.
-    dX : array (N, n)
-        What the states change by.
+    `X` (N, n): states, recorded units; `U` (N, m): controls, recorded units; `dX` (N, n): what the states change by.
     """
 
     X: Array
@@ -49,20 +42,6 @@ class Steps:
         """F statistic in the next step of some states: of the controls, or of other states.
 
         Given the states `given` (default all), and the controls unless these are what is asked for.
-
-        Parameters
-        ----------
-        on : sequence of int
-            Positions of the states that are explained.
-        of : sequence of int, optional
-            Positions of the states that explain; default the controls.
-        given : sequence of int, optional
-            Positions of the states that are known anyway; default all.
-
-        Returns
-        -------
-        array (len(on),)
-            0 where too few transitions are there.
         """
         n, m = self.X.shape[1], self.U.shape[1]
         tested = list(range(n, n + m)) if of is None else list(of)
@@ -82,17 +61,7 @@ class Steps:
 def residual(Z: Array, Y: Array) -> Array:
     """Sum of squares that a least-squares fit on [1, Z] leaves.
 
-    Parameters
-    ----------
-    Z : array (N, j)
-        Regressors.
-    Y : array (N, k)
-        Targets.
-
-    Returns
-    -------
-    array (k,)
-        Units of Y squared.
+    `Z` (N, j): regressors; `Y` (N, k): targets; Returns (k,): units of Y squared.
     """
     size = np.maximum(np.abs(Z).max(axis=0, initial=0.0), 1e-300)
     design = np.hstack([np.ones((len(Z), 1)), Z / size])
@@ -104,24 +73,7 @@ def residual(Z: Array, Y: Array) -> Array:
 def steps_of(
     state: Sequence[Candidate], of: dict[str, Source], controls: Sequence[Candidate], lags: Sequence[int] = ()
 ) -> Steps:
-    """Samples on the messages of the slowest of the states' topics; of the others, the latest message before.
-
-    Parameters
-    ----------
-    state : sequence of Candidate
-        Candidates for states.
-    of : dict of str to Source
-        Topic -> source.
-    controls : sequence of Candidate
-        Candidates for controls.
-    lags : sequence of int, optional
-        Samples by which each control is taken earlier; none by default.
-
-    Returns
-    -------
-    Steps
-        At most 200 000 steps per recording.
-    """
+    """Samples on the messages of the slowest of the states' topics; of the others, the latest message before."""
     lags = lags or [0] * len(controls)
     longest = max(lags, default=0)
     topics = list(dict.fromkeys(c.topic for c in state))
@@ -159,17 +111,7 @@ def steps_of(
 def earlier(values: Array, samples: int) -> Array:
     """Each value some samples before.
 
-    Parameters
-    ----------
-    values : array (N,)
-        One per sample.
-    samples : int
-        How many samples earlier; 0 for the values themselves.
-
-    Returns
-    -------
-    array (N,)
-        NaN where there is none.
+    `values` (N,): one per sample; Returns (N,): naN where there is none.
     """
     return np.concatenate([np.full(min(samples, len(values)), np.nan), values[: max(len(values) - samples, 0)]])
 
@@ -177,23 +119,7 @@ def earlier(values: Array, samples: int) -> Array:
 def held(candidate: Candidate, source: Source, number: int, clock: Source, oldest: float | None = None) -> Array:
     """Latest value at each message of the clock.
 
-    Parameters
-    ----------
-    candidate : Candidate
-        What is read.
-    source : Source
-        Its topic.
-    number : int
-        Which recording.
-    clock : Source
-        Topic whose messages give the instants.
-    oldest : float, optional
-        Greatest age, s; default no limit.
-
-    Returns
-    -------
-    array (messages of the clock,)
-        NaN before the first value, and where it is too old.
+    Returns (messages of the clock,): naN before the first value, and where it is too old.
     """
     if number >= len(source.arrival) or not len(source.arrival[number]) or number >= len(candidate.values):
         return np.full(len(clock.arrival[number]), np.nan)
@@ -206,20 +132,7 @@ def held(candidate: Candidate, source: Source, number: int, clock: Source, oldes
 
 
 def explained(state: Source, controls: Sequence[Source]) -> float:
-    """How clearly some topics show in the next step of the best of a topic's numbers.
-
-    Parameters
-    ----------
-    state : Source
-        The topic that is explained.
-    controls : sequence of Source
-        The topics that explain.
-
-    Returns
-    -------
-    float
-        Largest F statistic; 0 with too few transitions.
-    """
+    """How clearly some topics show in the next step of the best of a topic's numbers."""
     every = {s.topic: s for s in [state, *controls]}
     steps = steps_of(state.free, every, [c for s in controls for c in s.free])
     if len(steps.X) < FEWEST:

@@ -235,25 +235,7 @@ def fit(
 def asked_for(
     transients: Sequence[Transient], schedule: Schedule | Mapping[str, Knots] | None
 ) -> Schedule | Mapping[str, Knots]:
-    """The schedule that a fit is asked for, by its argument or by the signals file.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    schedule : Schedule, mapping or None
-        As `fit` takes it.
-
-    Returns
-    -------
-    Schedule or mapping
-        Empty for one block.
-
-    Raises
-    ------
-    FitError
-        There is no such signal; names those that are near.
-    """
+    """The schedule that a fit is asked for, by its argument or by the signals file."""
     if not transients:
         return schedule or {}
     signals = transients[0].signals
@@ -270,27 +252,7 @@ def horizons_asked_for(
     horizons: HorizonRule | Mapping[str, Any] | Sequence[int] | Literal["auto"] | None,
     widths: WidthChoice | None = None,
 ) -> HorizonRule | None:
-    """The horizons that a fit is asked for, by its arguments or by the signals file.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    horizons : HorizonRule, mapping, sequence of int, "auto" or None
-        As `fit` takes it.
-    widths : {"auto", "growing", "constant"} or None
-        As `fit` takes it.
-
-    Returns
-    -------
-    HorizonRule or None
-        None for one step.
-
-    Raises
-    ------
-    FitError
-        They are none, or there are half-widths and no horizons.
-    """
+    """The horizons that a fit is asked for, by its arguments or by the signals file."""
     signals = transients[0].signals if transients else None
     if horizons is None:
         rule = None if signals is None else signals.horizons
@@ -312,18 +274,7 @@ def horizons_asked_for(
 
 
 def is_auto(schedule: Schedule | Mapping[str, Knots]) -> bool:
-    """Whether the knots of some signal are to be chosen.
-
-    Parameters
-    ----------
-    schedule : Schedule or mapping
-        Of `asked_for`.
-
-    Returns
-    -------
-    bool
-        True if the knots of a signal are "auto".
-    """
+    """Whether the knots of some signal are to be chosen."""
     return isinstance(schedule, Mapping) and any(_is_auto(knots) for knots in schedule.values())
 
 

@@ -43,18 +43,9 @@ outside is in as many windows as they have steps."""
 class HorizonCandidate:
     """One horizon with one kind of half-widths, judged on what was left out of its fits.
 
-    Parameters
-    ----------
-    steps : int
-        Number of steps.
-    widths : {"growing", "constant"}
-        Half-widths.
-    judged : array (units,)
-        Left-out windows of each recording, group or block.
-    outside : array (units,)
-        Those outside the envelope of some state.
-    log_width : float
-        Logarithm of the mean half-width relative to that of one step, the mean over states and left-out parts.
+    `steps`: number of steps; `widths`: half-widths; `judged` (units,): left-out windows of each recording, group or
+    block; `outside` (units,): those outside the envelope of some state; `log_width`: logarithm of the mean half-width
+    relative to that of one step, the mean over states and left-out parts.
     """
 
     steps: int
@@ -74,18 +65,7 @@ class HorizonCandidate:
         return math.exp(self.log_width) / self.steps
 
     def excess(self, base: HorizonCandidate) -> float:
-        """Share outside beyond 1 + SLACK times that of another, over the parts in which there is any.
-
-        Parameters
-        ----------
-        base : HorizonCandidate
-            The other, on the same left-out parts.
-
-        Returns
-        -------
-        float
-            Of all left-out windows.
-        """
+        """Share outside beyond 1 + SLACK times that of another, over the parts in which there is any."""
         share = np.divide(base.outside, base.judged, out=np.zeros_like(base.judged), where=base.judged > 0)
         beyond = np.maximum(self.outside - (1.0 + SLACK) * share * self.judged, 0.0)
         return float(beyond.sum() / max(self.judged.sum(), 1.0))
@@ -95,18 +75,9 @@ class HorizonCandidate:
 class HorizonChoice:
     """The horizons that hold on left-out data.
 
-    Parameters
-    ----------
-    chosen : dict of int to {"growing", "constant"}
-        Half-widths of each number of steps; empty if none is worth having.
-    rows : tuple of dict
-        The table: every candidate with its numbers, whether it was taken, and why.
-    what : str
-        What was left out at a time.
-    units : int
-        How many times.
-    reason : str
-        In words.
+    `chosen`: half-widths of each number of steps; empty if none is worth having; `rows`: the table: every candidate
+    with its numbers, whether it was taken, and why; `what`: what was left out at a time; `units`: how many times;
+    `reason`: in words.
     """
 
     chosen: dict[int, Widths]
@@ -116,13 +87,7 @@ class HorizonChoice:
     reason: str
 
     def facts(self) -> dict[str, Any]:
-        """As plain data for `fit_summary`.
-
-        Returns
-        -------
-        dict
-            The table, the choice and the reason.
-        """
+        """As plain data for `fit_summary`."""
         return {
             "left_out": self.what,
             "units": self.units,
@@ -140,25 +105,7 @@ def _admissible(candidate: HorizonCandidate, base: HorizonCandidate) -> bool:
 
 
 def lengths_of(rule: HorizonRule, transients: Sequence[Transient]) -> list[int]:
-    """Numbers of steps that a rule asks for, or that are to be tried.
-
-    Parameters
-    ----------
-    rule : HorizonRule
-        The rule.
-    transients : sequence of Transient
-        The recordings, for their median step and length.
-
-    Returns
-    -------
-    list of int
-        Increasing.
-
-    Raises
-    ------
-    FitError
-        A horizon is shorter than two steps, or longer than a model holds.
-    """
+    """Numbers of steps that a rule asks for, or that are to be tried."""
     steps = [t.dt[t.usable] for t in transients]
     every = np.concatenate(steps)
     if not len(every):
@@ -200,31 +147,6 @@ def choose_horizons(
     constant ones. A horizon that was not asked for by its length stays if the same holds of its windows and the
     transitions of one step, and if its half-width per step is at most PAYS of that of the horizon before it: then it
     sees slower changes.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    rule : HorizonRule
-        What is asked for.
-    lengths : sequence of int
-        Of `lengths_of`.
-    groups : sequence or str, optional
-        As in `validate`.
-    progress : callable, optional
-        Called with one line of text per kind of half-widths.
-    **options : object
-        Further arguments of `fit`, with the schedule.
-
-    Returns
-    -------
-    HorizonChoice
-        The choice with its table.
-
-    Raises
-    ------
-    FitError
-        No model can be fitted.
     """
     dropped: dict[int, str] = {}
     kinds: tuple[Widths, ...] = get_args(Widths) if rule.widths == "auto" else (rule.widths,)

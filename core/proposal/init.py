@@ -39,18 +39,9 @@ from uncertain_lti.signals.table_layout import TableLayout
 class Proposal:
     """States and controls of a machine, as far as a recording tells.
 
-    Parameters
-    ----------
-    states : tuple of Candidate
-        Proposed states.
-    controls : tuple of Candidate
-        Proposed controls.
-    text : str
-        The signals file, with its reasons.
-    warnings : tuple of str, optional
-        What the reader should know, a sentence each.
-    members : tuple of str, optional
-        Many alike, such as joints, that the file is for; the states and controls are those of one of them.
+    `states`: proposed states; `controls`: proposed controls; `text`: the signals file, with its reasons; `warnings`:
+    what the reader should know, a sentence each; `members`: many alike, such as joints, that the file is for; the
+    states and controls are those of one of them.
     """
 
     states: tuple[Candidate, ...]

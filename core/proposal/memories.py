@@ -42,12 +42,7 @@ FEWEST_STEPS, MOST_STEPS = 3, 0.05
 class Remembered:
     """A memory that may be added to the signals.
 
-    Parameters
-    ----------
-    of : str
-        The state or control whose samples it takes.
-    memory : Memory
-        How.
+    `of`: the state or control whose samples it takes; `memory`: how.
     """
 
     of: str
@@ -62,18 +57,7 @@ class Remembered:
         )
 
     def words(self, transients: Sequence[Transient]) -> str:
-        """The entry that adds it to a signals file, or the columns of arrays.
-
-        Parameters
-        ----------
-        transients : sequence of Transient
-            The recordings.
-
-        Returns
-        -------
-        str
-            One line.
-        """
+        """The entry that adds it to a signals file, or the columns of arrays."""
         signals = transients[0].signals
         signal = None if signals is None else next(s for s in signals if s.name == self.of)
         if signal is None or not signal.topic:
@@ -83,20 +67,7 @@ class Remembered:
 
 
 def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) -> list[Transient]:
-    """Recordings with further controls that follow from their own earlier samples.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    memories : sequence of Remembered
-        What is added.
-
-    Returns
-    -------
-    list of Transient
-        One per recording.
-    """
+    """Recordings with further controls that follow from their own earlier samples."""
     return [with_memories(t, {one.name: (one.of, one.memory) for one in memories}) for t in transients]
 
 
@@ -106,18 +77,6 @@ def memory_candidates(transients: Sequence[Transient], additive: str = "noise") 
     Of the states whose residual follows from sample to sample (`residuals.Residuals.follows`) the rates (the
     differences, if the step is constant) and the values one sample earlier; of the controls that seldom change the
     values one sample earlier, and their changes.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    additive : str, default "noise"
-        As in `fit`.
-
-    Returns
-    -------
-    list of tuple of Remembered
-        Alternatives for the states, then for the controls; empty where nothing speaks for one.
     """
     first = transients[0]
     point = operating_point(first)
@@ -155,27 +114,6 @@ def suggest_memories(
 
     Of the sets of `memory_candidates` those for the states are tried on about TRANSITIONS transitions, leaving out
     FOLDS times, then, beside the best of them, those for the controls.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    groups : sequence or str, optional
-        As in `validate`.
-    progress : callable, optional
-        Called with one line of text per candidate.
-    **options : object
-        Further arguments of `fit`, but no weights per sample.
-
-    Returns
-    -------
-    Suggestion
-        `facts["memories"]` lists what was tried, `facts["suggested"]` the names of what to add.
-
-    Raises
-    ------
-    FitError
-        The groups do not fit the recordings.
     """
     if options.get("structure") is not None or options.get("operating_point") is not None:
         return Suggestion({"not_done": "structure or operating point are for the signals as they are"}, "")
@@ -194,13 +132,8 @@ def suggest_memories(
 class Choice:
     """Memories that pay, and what was tried.
 
-    Parameters
-    ----------
-    chosen : tuple of Remembered
-        Empty where none pays.
-    facts : dict
-        Plain data: `memories` that were tried, the share `inside` without, the names `suggested`, and with them `width`
-        and the share `inside_with`.
+    `chosen`: empty where none pays; `facts`: plain data: `memories` that were tried, the share `inside` without, the
+    names `suggested`, and with them `width` and the share `inside_with`.
     """
 
     chosen: tuple[Remembered, ...]
@@ -213,29 +146,7 @@ def choose_memories(
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Choice:
-    """What `suggest_memories` suggests.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    groups : sequence or str, optional
-        As in `validate`.
-    progress : callable, optional
-        Called with one line of text per candidate.
-    **options : object
-        Further arguments of `fit`, but no weights per sample.
-
-    Returns
-    -------
-    Choice
-        The memories to add.
-
-    Raises
-    ------
-    FitError
-        The groups do not fit the recordings.
-    """
+    """What `suggest_memories` suggests."""
     sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), options.get("additive") or "noise")
     if not sets:
         return Choice((), {"memories": []})
@@ -286,18 +197,7 @@ def _judged(
 
 
 def operating_point(transient: Transient) -> OperatingPoint:
-    """That of the signals of a recording; of arrays 0, with scales of 1.
-
-    Parameters
-    ----------
-    transient : Transient
-        The recording.
-
-    Returns
-    -------
-    OperatingPoint
-        Steady values and scales.
-    """
+    """That of the signals of a recording; of arrays 0, with scales of 1."""
     signals = transient.signals
     if signals is not None:
         return OperatingPoint.of(signals.states, signals.controls, signals.scheduling)

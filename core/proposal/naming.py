@@ -35,15 +35,7 @@ _UNITS = (
 
 
 def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> None:
-    """Give every signal a name of its own and a unit.
-
-    Parameters
-    ----------
-    states : sequence of Candidate
-        Get `name` and `unit`.
-    controls : sequence of Candidate
-        Likewise.
-    """
+    """Give every signal a name of its own and a unit."""
     taken: set[str] = set()
     elements = {c.element for c in states} - {""}
     for group, suffix in ((states, "state"), (controls, "command")):

@@ -23,17 +23,7 @@ from uncertain_lti.signals.signal_map import Signal
 
 
 def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> None:
-    """Steady states and scales by the rule for `auto`; the range where the magnitude is small compared with it.
-
-    Parameters
-    ----------
-    states : sequence of Candidate
-        Get `steady` and `scale`.
-    controls : sequence of Candidate
-        Likewise.
-    sources : sequence of Source
-        All topics.
-    """
+    """Steady states and scales by the rule for `auto`; the range where the magnitude is small compared with it."""
     every = {s.topic: s for s in sources}
     clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
     group = [*states, *controls]
@@ -54,35 +44,14 @@ def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidat
 
 
 def set_own_scale(candidate: Candidate) -> None:
-    """Median and range, for one in a comment.
-
-    Parameters
-    ----------
-    candidate : Candidate
-        Gets `steady` and `scale`.
-    """
+    """Median and range, for one in a comment."""
     finite = np.concatenate(candidate.values)
     finite = finite[np.isfinite(finite)]
     candidate.steady, candidate.scale = float(np.median(finite)), float(np.ptp(finite))
 
 
 def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
-    """Greatest age of a command that comes at a steady rate and ends, or pauses, before the states do.
-
-    Parameters
-    ----------
-    source : Source
-        Topic of the command.
-    clock : Source
-        Topic of the states.
-
-    Returns
-    -------
-    float or None
-        Greatest age, s; None for no limit.
-    str
-        The reason, for a comment.
-    """
+    """Greatest age of a command that comes at a steady rate and ends, or pauses, before the states do."""
     steps = np.concatenate([np.diff(a) for a in source.arrival if len(a) > 1] or [np.empty(0)]) * 1e-9
     steps = steps[steps > 0]
     if not len(steps):

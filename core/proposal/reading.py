@@ -51,20 +51,7 @@ _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 
 
 def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[Source]:
-    """Every topic of the recordings with its numbers.
-
-    Parameters
-    ----------
-    bags : sequence of Recording
-        The recordings.
-    progress : callable or None
-        As for `read_transients`.
-
-    Returns
-    -------
-    list of Source
-        One per topic; those that cannot be used have a reason and no candidates.
-    """
+    """Every topic of the recordings with its numbers."""
     facts: dict[str, TopicFacts] = {}
     for bag in bags:
         for fact in bag.facts(progress):
@@ -109,19 +96,7 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
 def moving_numbers(bag: Recording, progress: Iterate | None) -> tuple[list[tuple[str, str, Array, Array]], list[str]]:
     """Every number of a recording that moves.
 
-    Parameters
-    ----------
-    bag : Recording
-        The recording.
-    progress : callable or None
-        As for `read_transients`.
-
-    Returns
-    -------
-    list of (str, str, array (messages,), array (messages,))
-        Topic, path, time of arrival in s after the first message of them all, and values.
-    list of str
-        What is left out, with the reason.
+    Returns (messages,): topic, path, time of arrival in s after the first message of them all, and values.
     """
     sources = read_sources([bag], progress)
     chosen = [(s, c) for s in sources if not s.reason for c in s.candidates if not c.reason]
@@ -135,19 +110,7 @@ def moving_numbers(bag: Recording, progress: Iterate | None) -> tuple[list[tuple
 
 
 def run_column(bags: Sequence[Recording]) -> str:
-    """Column of tables that tells the runs in one file apart.
-
-    Parameters
-    ----------
-    bags : sequence of Recording
-        The recordings.
-
-    Returns
-    -------
-    str
-        Name of a column each of whose values stands in one stretch of rows, FEWEST of them on average, with a name as
-        runs have, or with a time that steps back where it changes; empty if there is none, or a recording is no table.
-    """
+    """Column of tables that tells the runs in one file apart."""
     tables = [bag for bag in bags if isinstance(bag, Table)]
     if not tables or len(tables) < len(bags):
         return ""

@@ -30,18 +30,6 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
 
     Such a function leaves next to nothing of a candidate, or nothing but noise. Of two that are functions of each
     other, the one in which the controls show clearly more stays, else the first.
-
-    Parameters
-    ----------
-    steps : Steps
-        Transitions of the pool.
-    pool : list of Candidate
-        Candidates for states; those dropped get a reason.
-
-    Returns
-    -------
-    list of Candidate
-        Those that stay.
     """
     if len(steps.X) < FEWEST:
         return pool
@@ -84,24 +72,7 @@ def _function(of: Array, values: Array) -> bool:
 def drop_noise(
     pool: list[Candidate], every: dict[str, Source], used: Sequence[Candidate]
 ) -> tuple[list[Candidate], str]:
-    """Drop candidates that are noise from sample to sample, unless all are.
-
-    Parameters
-    ----------
-    pool : list of Candidate
-        Candidates for states; those dropped get a reason.
-    every : dict of str to Source
-        Topic -> source.
-    used : sequence of Candidate
-        Controls.
-
-    Returns
-    -------
-    list of Candidate
-        Those that stay.
-    str
-        A sentence where all are noise; else empty.
-    """
+    """Drop candidates that are noise from sample to sample, unless all are."""
     late = [*used] * (SHORT_DELAY + 1)
     steps = steps_of(pool, every, late, [lag for lag in range(SHORT_DELAY + 1) for _ in used])
     if len(steps.X) < max(FEWEST, 2 * (len(pool) + len(late))):
@@ -122,15 +93,7 @@ def drop_noise(
 
 
 def drop_idle_controls(steps: Steps, used: Sequence[Candidate]) -> None:
-    """Leave out controls that show nowhere given the others, and those that move with another one.
-
-    Parameters
-    ----------
-    steps : Steps
-        Transitions of the states with these controls.
-    used : sequence of Candidate
-        Controls; those left out get a reason.
-    """
+    """Leave out controls that show nowhere given the others, and those that move with another one."""
     n, m = steps.X.shape[1], steps.U.shape[1]
     if len(steps.X) < FEWEST or m < 2:
         return
@@ -152,13 +115,7 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate]) -> None:
 
 
 def prefer_rates(source: Source) -> None:
-    """Of a pose and its twist the twist; of a joint's position, velocity and effort not the effort.
-
-    Parameters
-    ----------
-    source : Source
-        Topic whose candidates get reasons.
-    """
+    """Of a pose and its twist the twist; of a joint's position, velocity and effort not the effort."""
     moves = {c.path for c in source.free}
     if any("twist." in p for p in moves):
         for candidate in source.free:
@@ -175,13 +132,7 @@ def prefer_rates(source: Source) -> None:
 
 
 def drop_copies(pool: Sequence[Candidate]) -> None:
-    """Leave out what moves as another candidate of the same topic does.
-
-    Parameters
-    ----------
-    pool : sequence of Candidate
-        Those left out get a reason.
-    """
+    """Leave out what moves as another candidate of the same topic does."""
     kept: list[Candidate] = []
     for candidate in pool:
         mine = np.concatenate(candidate.values)

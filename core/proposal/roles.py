@@ -65,36 +65,12 @@ _APART_TYPES = {
 
 
 def is_physical(type_name: str) -> bool:
-    """Whether messages of a type hold how a body or a joint is and moves.
-
-    Parameters
-    ----------
-    type_name : str
-        `pkg/msg/Type`.
-
-    Returns
-    -------
-    bool
-        By the type's name.
-    """
+    """Whether messages of a type hold how a body or a joint is and moves."""
     return bool(_PHYSICAL.search(type_name.rpartition("/")[2].lower()))
 
 
 def role_by_name(topic: str, type_name: str) -> str:
-    """What a topic seems to be by its name, the last word first, else by its type.
-
-    Parameters
-    ----------
-    topic : str
-        Its name.
-    type_name : str
-        Its message type, `pkg/msg/Type`.
-
-    Returns
-    -------
-    str
-        As `Source.role`.
-    """
+    """What a topic seems to be by its name, the last word first, else by its type."""
     if type_name in _APART_TYPES:
         return "apart"
     name = topic.strip("/").lower()
@@ -117,18 +93,7 @@ def role_by_name(topic: str, type_name: str) -> str:
 
 
 def role_of_column(name: str) -> str:
-    """What a column of a table seems to be by its name.
-
-    Parameters
-    ----------
-    name : str
-        As a field path takes it.
-
-    Returns
-    -------
-    str
-        `control`, `reference`, or `state` for every other.
-    """
+    """What a column of a table seems to be by its name."""
     low = name.lower()
     if _ANSWER.search(low):
         return "state"
@@ -138,18 +103,7 @@ def role_of_column(name: str) -> str:
 
 
 def at_rest(sources: Sequence[Source]) -> str:
-    """What to say of recordings in which there are commands and none of them moves.
-
-    Parameters
-    ----------
-    sources : sequence of Source
-        All topics.
-
-    Returns
-    -------
-    str
-        A sentence without its full stop; empty if there is no command, or one moves.
-    """
+    """What to say of recordings in which there are commands and none of them moves."""
     commands = [s for s in sources if s.role == "control" and s.count and s.candidates]
     if not commands or any(s.free for s in commands):
         return ""
@@ -161,24 +115,7 @@ def at_rest(sources: Sequence[Source]) -> str:
 
 
 def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
-    """Give the roles that a person asks for in place of those by name.
-
-    Parameters
-    ----------
-    sources : sequence of Source
-        All topics.
-    states : sequence of str
-        Patterns: TOPIC or TOPIC:FIELD; none to leave the states to their names.
-    controls : sequence of str
-        Likewise.
-    where : str
-        What errors call the recording.
-
-    Raises
-    ------
-    BagError
-        A pattern meets nothing that moves.
-    """
+    """Give the roles that a person asks for in place of those by name."""
     asked = [("state", p) for p in states] + [("control", p) for p in controls]
     met: dict[str, set[int]] = {"state": set(), "control": set()}
     for role, pattern in asked:
@@ -235,20 +172,7 @@ def _held_columns(table: Source) -> Source | None:
 
 
 def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
-    """Which topics are controls, and which may be the state.
-
-    Parameters
-    ----------
-    sources : sequence of Source
-        All topics; those that are neither get a reason.
-
-    Returns
-    -------
-    list of Source
-        Topics of the controls.
-    list of Source
-        Topics that may be the state.
-    """
+    """Which topics are controls, and which may be the state."""
     moving = [s for s in sources if s.free]
     controls = [s for s in moving if s.role == "control"]
     references = [s for s in moving if s.role == "reference"]

@@ -66,16 +66,8 @@ FINEST = 1e-6
 class Fold:
     """How recordings are left out, the same way for every candidate.
 
-    Parameters
-    ----------
-    groups : list of str or None
-        One name per recording, where whole groups are left out.
-    blocks : int or None
-        Blocks of a single recording.
-    gap : float or None
-        Guard interval of the blocks, s.
-    what : str
-        What is left out at a time: recording, group or block.
+    `groups`: one name per recording, where whole groups are left out; `blocks`: blocks of a single recording; `gap`:
+    guard interval of the blocks, s; `what`: what is left out at a time: recording, group or block.
     """
 
     groups: list[str] | None
@@ -88,24 +80,11 @@ class Fold:
 class Candidate:
     """One number of knots, judged on what was left out of its fits.
 
-    Parameters
-    ----------
-    count : int
-        Knots of the signal.
-    model : UncertainLTI or None
-        Fitted to everything; None where there is no such fit.
-    refused : str
-        Why there is none, or why nothing could be left out of it.
-    judged : array (units,)
-        Left-out transitions of each recording, group or block.
-    outside : array (units,)
-        Those outside the bounds of some state.
-    log_width : array (units,)
-        Logarithm of the mean width relative to one knot, the mean over the states.
-    visits : array (blocks, units)
-        Left-out transitions nearest to each knot.
-    block_outside : array (blocks,)
-        Those of them outside.
+    `count`: knots of the signal; `model`: fitted to everything; None where there is no such fit; `refused`: why there
+    is none, or why nothing could be left out of it; `judged` (units,): left-out transitions of each recording, group or
+    block; `outside` (units,): those outside the bounds of some state; `log_width` (units,): logarithm of the mean width
+    relative to one knot, the mean over the states; `visits` (blocks, units): left-out transitions nearest to each knot;
+    `block_outside` (blocks,): those of them outside.
     """
 
     count: int
@@ -125,19 +104,7 @@ class Candidate:
     def more_outside(self, base: Candidate, of: NDArray[np.bool_] | None = None) -> tuple[float, float]:
         """Share outside beyond that of another candidate, with its standard error.
 
-        Parameters
-        ----------
-        base : Candidate
-            The other, on the same left-out transitions.
-        of : array of bool (units,), optional
-            The left-out parts that count; default all.
-
-        Returns
-        -------
-        float
-            Difference of the shares.
-        float
-            Standard error over what was left out.
+        `of` (units,): the left-out parts that count; default all.
         """
         of = np.ones(len(self.judged), dtype=bool) if of is None else of
         return jackknife((self.outside - base.outside)[of], self.judged[of])
@@ -145,17 +112,8 @@ class Candidate:
     def excess(self, base: Candidate, of: NDArray[np.bool_] | None = None) -> float:
         """Share outside beyond what may be, summed over the left-out parts in which there is any.
 
-        Parameters
-        ----------
-        base : Candidate
-            One knot, on the same left-out transitions.
-        of : array of bool (units,), optional
-            The left-out parts that count; default those in which it is largest, all or the ones that are like others.
-
-        Returns
-        -------
-        float
-            Of the left-out transitions of these parts.
+        `of` (units,): the left-out parts that count; default those in which it is largest, all or the ones that are
+        like others.
         """
         if of is None:
             return max(self.excess(base, parts) for parts in base.counted())
@@ -165,10 +123,8 @@ class Candidate:
     def counted(self) -> list[NDArray[np.bool_]]:
         """The sets of left-out parts on which coverage has to hold, of one knot.
 
-        Returns
-        -------
-        list of array of bool (units,)
-            All, and those of which it leaves at most UNLIKE outside if they are two at least, and half of all.
+        Returns (units,): all, and those of which it leaves at most UNLIKE outside if they are two at least, and half of
+        all.
         """
         like = self.outside <= UNLIKE * self.judged
         every = np.ones(len(like), dtype=bool)
@@ -184,20 +140,9 @@ class Candidate:
 class Choice:
     """The number of knots that the recordings carry on one signal.
 
-    Parameters
-    ----------
-    signal : str
-        Name of the signal.
-    candidates : tuple of Candidate
-        All that were tried, one knot first.
-    chosen : Candidate
-        The one taken.
-    what : str
-        What was left out at a time.
-    reason : str
-        Why, in words.
-    record : str
-        What to record so that more knots are carried; empty where that would not help.
+    `signal`: name of the signal; `candidates`: all that were tried, one knot first; `chosen`: the one taken; `what`:
+    what was left out at a time; `reason`: why, in words; `record`: what to record so that more knots are carried; empty
+    where that would not help.
     """
 
     signal: str
@@ -208,13 +153,7 @@ class Choice:
     record: str
 
     def facts(self) -> dict[str, Any]:
-        """As plain data for `fit_summary`.
-
-        Returns
-        -------
-        dict
-            The table with its errors, the choice, the reason, and what to record.
-        """
+        """As plain data for `fit_summary`."""
         base = self.candidates[0]
         rows = []
         for c in self.candidates:
@@ -251,25 +190,9 @@ class Choice:
 class Trials:
     """Numbers of knots, judged one after the other on the same left-out parts.
 
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    others : mapping, optional
-        Scheduling signals with their knots or modes, which every candidate has.
-    groups : sequence or str, optional
-        As in `validate`.
-    folds : int, optional
-        Times that something is left out, at most.
-    progress : callable, optional
-        Called with one line of text per candidate.
-    **options : object
-        Further arguments of `fit`.
-
-    Raises
-    ------
-    FitError
-        No model can be fitted at all.
+    `transients`: the recordings; `others`: scheduling signals with their knots or modes, which every candidate has;
+    `groups`: as in `validate`; `folds`: times that something is left out, at most; `progress`: called with one line of
+    text per candidate; `**options`: further arguments of `fit`.
     """
 
     def __init__(
@@ -294,20 +217,7 @@ class Trials:
             self.base = self._left_out(1, model)
 
     def candidate(self, signal: str, count: int) -> Candidate:
-        """One number of knots on one signal.
-
-        Parameters
-        ----------
-        signal : str
-            A state, a control or a further scheduling signal.
-        count : int
-            Number of knots, 2 or more.
-
-        Returns
-        -------
-        Candidate
-            What it is worth.
-        """
+        """One number of knots on one signal."""
         if self.progress is not None:
             self.progress(f"{plural(count, 'knot')} on {signal}")
         try:
@@ -356,31 +266,6 @@ def choose_knots(
     width (geometric over states and left-out parts) is at most PAYS of one knot's, the one with the least width is the
     best, and the fewest knots within one standard error of it are chosen. Standard errors are those of the jackknife
     over what was left out.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    signal : str
-        A state, a control or a further scheduling signal.
-    others : mapping, optional
-        Another scheduling signal with its knots or modes, which every candidate has.
-    groups : sequence or str, optional
-        As in `validate`.
-    progress : callable, optional
-        Called with one line of text per candidate.
-    **options : object
-        Further arguments of `fit`.
-
-    Returns
-    -------
-    Choice
-        The choice with its table.
-
-    Raises
-    ------
-    FitError
-        No model can be fitted at all.
     """
     trials = Trials(transients, others, groups=groups, progress=progress, **options)
     candidates = [trials.base]
@@ -392,20 +277,7 @@ def choose_knots(
 
 
 def knots_of(model: UncertainLTI, signal: str) -> list[float]:
-    """Knots of one scheduling signal in recorded units.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        With a schedule or without.
-    signal : str
-        Name of the signal.
-
-    Returns
-    -------
-    list of float
-        Empty if the model is not scheduled on it.
-    """
+    """Knots of one scheduling signal in recorded units."""
     if model.schedule is None:
         return []
     at = zip(model.schedule.axes, model.schedule.recorded_values(model.signals.signals), strict=True)
@@ -415,24 +287,7 @@ def knots_of(model: UncertainLTI, signal: str) -> list[float]:
 def fold_of(
     transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI, folds: int
 ) -> Fold:
-    """What is left out at a time.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    groups : sequence or str, optional
-        As in `validate`.
-    base : UncertainLTI
-        Fitted to all of them; its time constants give the guard interval between blocks of a single recording.
-    folds : int
-        Times that something is left out, at most.
-
-    Returns
-    -------
-    Fold
-        The same for every candidate.
-    """
+    """What is left out at a time."""
     names, _ = resolve_groups(transients, groups)
     if not names and len(transients) == 1:
         usable = int(transients[0].usable.sum())
@@ -483,19 +338,7 @@ def _judged(count: int, model: UncertainLTI, left: Validation, base: Validation)
 def jackknife(sums: Array, counts: Array) -> tuple[float, float]:
     """Σ sums / Σ counts, with its standard error over the units.
 
-    Parameters
-    ----------
-    sums : array (units,)
-        Of what was left out at a time.
-    counts : array (units,)
-        Likewise.
-
-    Returns
-    -------
-    float
-        NaN if nothing is counted.
-    float
-        Standard error; infinite of a single unit.
+    `sums` (units,): of what was left out at a time; `counts` (units,): likewise.
     """
     total = counts.sum()
     value = float(sums.sum() / total) if total else math.nan
@@ -525,44 +368,14 @@ def _admissible(candidate: Candidate, base: Candidate, allowed: float) -> bool:
 
 
 def best_of(candidates: Sequence[Candidate], allowed: float = EXCESS) -> Candidate:
-    """The least width among those that cover as well as one knot and whose widths pay; else one knot.
-
-    Parameters
-    ----------
-    candidates : sequence of Candidate
-        One knot first.
-    allowed : float, default EXCESS
-        Share that may be outside beyond 1 + SLACK times that of one knot.
-
-    Returns
-    -------
-    Candidate
-        One of them.
-    """
+    """The least width among those that cover as well as one knot and whose widths pay; else one knot."""
     base = candidates[0]
     good = [c for c in candidates[1:] if _admissible(c, base, allowed) and c.width[0] <= math.log(PAYS)]
     return min(good, key=lambda c: c.width[0], default=base)
 
 
 def decide(signal: str, candidates: Sequence[Candidate], trials: Trials, allowed: float = EXCESS) -> Choice:
-    """The simplest candidate within the error of the best, with the reason.
-
-    Parameters
-    ----------
-    signal : str
-        Name of the signal.
-    candidates : sequence of Candidate
-        One knot first, then more and more.
-    trials : Trials
-        That judged them.
-    allowed : float, default EXCESS
-        As for `best_of`.
-
-    Returns
-    -------
-    Choice
-        The choice.
-    """
+    """The simplest candidate within the error of the best, with the reason."""
     base, best = candidates[0], best_of(candidates, allowed)
     chosen = best
     if best is not base:
@@ -623,23 +436,7 @@ def _like_words(candidate: Candidate, base: Candidate, inside: bool) -> str:
 
 
 def ranges(candidate: Candidate, signal: str, trials: Trials) -> list[dict[str, Any]]:
-    """What the recordings hold of the signal, knot by knot.
-
-    Parameters
-    ----------
-    candidate : Candidate
-        With a model; where nothing was left out of it, its own recordings are counted.
-    signal : str
-        Name of the signal.
-    trials : Trials
-        That judged it.
-
-    Returns
-    -------
-    list of dict
-        `from`, `to` (recorded units), `recordings` that are there with as many transitions as a row has unknowns, and
-        the share `outside` of what was left out there (None where it is not known).
-    """
+    """What the recordings hold of the signal, knot by knot."""
     model = candidate.model
     assert model is not None and model.schedule is not None
     axis = [a.signal for a in model.schedule.axes].index(signal)

@@ -28,32 +28,7 @@ def signals_file(
     bags: Sequence[Recording], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
     doubt: str, memories: Sequence[str] = (), members: Mapping[str, Sequence[Candidate]] | None = None, runs: str = "",
 ) -> str:  # fmt: skip
-    """Write the text of the file.
-
-    Parameters
-    ----------
-    bags : sequence of Recording
-        The recordings.
-    sources : sequence of Source
-        All topics, with the reasons of those left out.
-    states : sequence of Candidate
-        Proposed states.
-    controls : sequence of Candidate
-        Proposed controls.
-    doubt : str
-        A sentence about the states, or an empty text.
-    memories : sequence of str, optional
-        Lines to add to the states.
-    members : mapping of str to sequence of Candidate, optional
-        Many alike, of which the states and controls are those of one, and what each has; the file is for all of them.
-    runs : str, default ""
-        Column of tables that tells the recordings in one file apart.
-
-    Returns
-    -------
-    str
-        YAML with comments.
-    """
+    """Write the text of the file."""
     every = {s.topic: s for s in sources}
     topics = list(dict.fromkeys(c.topic for c in [*states, *controls]))
     clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
@@ -123,22 +98,7 @@ def signals_file(
 
 
 def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
-    """The lines of one member of many alike as templates for all of them.
-
-    Parameters
-    ----------
-    lines : sequence of str
-        Of the file.
-    one : str
-        The member that they are of.
-    members : sequence of str
-        All members.
-
-    Returns
-    -------
-    list of str
-        The lines, with `structure: own` and `steady: auto`.
-    """
+    """The lines of one member of many alike as templates for all of them."""
     listed = ", ".join(_quoted(m) for m in members)
     found = []
     for line in lines:
@@ -182,24 +142,7 @@ def _quoted(text: str) -> str:
 
 
 def entry(candidate: Candidate, max_hold: float | None = None, comment: str = "", out: bool = False) -> str:
-    """Line of a signal.
-
-    Parameters
-    ----------
-    candidate : Candidate
-        The signal.
-    max_hold : float, optional
-        Greatest age, s.
-    comment : str, default ""
-        Behind it.
-    out : bool, default False
-        In a comment, ready to be taken in.
-
-    Returns
-    -------
-    str
-        One line.
-    """
+    """Line of a signal."""
     parts = [f"name: {_quoted(candidate.name)}", f"topic: {_quoted(candidate.topic)}"]
     parts.append('field: "' + re.sub(r'(["\\])', r"\\\1", candidate.path) + '"')
     parts += [f"steady: {_number(candidate.steady)}", f"scale: {_number(candidate.scale)}"]

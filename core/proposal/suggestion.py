@@ -43,12 +43,8 @@ PROMISING = 0.8
 class Suggestion:
     """What a schedule would do, as far as a part of the recordings tells.
 
-    Parameters
-    ----------
-    facts : dict
-        Plain data for `fit_summary`: how promising each signal is, the tables of those tried, and what is suggested.
-    message : str
-        In words; empty if no signal is promising.
+    `facts`: plain data for `fit_summary`: how promising each signal is, the tables of those tried, and what is
+    suggested; `message`: in words; empty if no signal is promising.
     """
 
     facts: dict[str, Any]
@@ -66,27 +62,6 @@ def suggest_schedule(
     At most TRANSITIONS transitions, SIGNALS signals (the second if the first is not worth it), three knots or two, and
     FOLDS times that something is left out, so at most 30 fits: the work does not grow with the recordings, and what is
     suggested depends on them alone.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    groups : sequence or str, optional
-        As in `validate`.
-    progress : callable, optional
-        Called with one line of text per candidate.
-    **options : object
-        Further arguments of `fit`, but no weights per sample.
-
-    Returns
-    -------
-    Suggestion
-        What was found.
-
-    Raises
-    ------
-    FitError
-        The groups do not fit the recordings.
     """
     some = thinned(transients, TRANSITIONS)
     found = promise(some)
@@ -129,20 +104,7 @@ def _not_carried(choice: Choice) -> str:
 
 
 def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:
-    """Pieces of each recording, evenly spread, so that about this many transitions are left in total.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    most : int
-        Transitions.
-
-    Returns
-    -------
-    list of Transient
-        One per recording, in the same order; the recordings themselves if they are small.
-    """
+    """Pieces of each recording, evenly spread, so that about this many transitions are left in total."""
     share = most / max(sum(len(t) for t in transients), 1)
     return list(transients) if share >= 1 else [_pieces(t, share) for t in transients]
 
@@ -182,17 +144,6 @@ def promise(transients: Sequence[Transient]) -> dict[str, float]:
     """How far the largest residuals of least squares shrink with three knots on each signal.
 
     The knots are the ends of the signal and one of a few places between, the best.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        Small recordings.
-
-    Returns
-    -------
-    dict of str to float
-        By signal: the largest residual relative to that with one knot, geometric over the states; 1 for a signal that
-        does not move, and for too little data.
     """
     steps = [t.transitions() for t in transients]
     first = transients[0]

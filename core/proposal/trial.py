@@ -29,32 +29,12 @@ from uncertain_lti.validation.detectable import log_sizes
 class Trial:
     """One way to fit with one family of alarm rules, judged on what was left out.
 
-    Parameters
-    ----------
-    setting : Setting
-        How it was fitted.
-    family : Family
-        What raises the alarm.
-    rules : tuple of Rule
-        The quiet alarm.
-    alarms : int
-        False alarms left out.
-    upper : float
-        One-sided upper confidence limit of the false alarms per hour, of 90 %.
-    hours : float
-        Time under verdict in the left-out parts, h.
-    inside : float
-        Share of the left-out verdicts inside the one-step bounds.
-    unknowns : int
-        Elements of the model that are not 0.
-    faults : tuple of dict
-        `kind`, `signal`, `largest` and `thresholds` of each.
-    units : array (cases,)
-        What each case was left out with.
-    seen : mapping of str to list of bool
-        By label, whether the alarm was raised in each labelled recording.
-    refused : str
-        Why there is none of this; "" otherwise.
+    `setting`: how it was fitted; `family`: what raises the alarm; `rules`: the quiet alarm; `alarms`: false alarms left
+    out; `upper`: one-sided upper confidence limit of the false alarms per hour, of 90 %; `hours`: time under verdict in
+    the left-out parts, h; `inside`: share of the left-out verdicts inside the one-step bounds; `unknowns`: elements of
+    the model that are not 0; `faults`: `kind`, `signal`, `largest` and `thresholds` of each; `units` (cases,): what
+    each case was left out with; `seen`: by label, whether the alarm was raised in each labelled recording; `refused`:
+    why there is none of this; "" otherwise.
     """
 
     setting: Setting
@@ -78,15 +58,7 @@ class Trial:
     def sizes(self, without: float | None = None) -> Array:
         """Logarithm of the smallest detectable size of each fault; NaN where it is not known.
 
-        Parameters
-        ----------
-        without : float, optional
-            A unit whose cases are not counted.
-
-        Returns
-        -------
-        array (faults,)
-            As of `log_sizes`.
+        Returns (faults,): as of `log_sizes`.
         """
         kept = np.ones(len(self.units), dtype=bool) if without is None else self.units != without
         return log_sizes([(fault["thresholds"], fault["largest"]) for fault in self.faults], kept)
@@ -99,20 +71,7 @@ class Trial:
 
 
 def row_of(trial: Trial, plain: Trial) -> dict[str, Any]:
-    """One way as plain data, for the table.
-
-    Parameters
-    ----------
-    trial : Trial
-        The way.
-    plain : Trial
-        The plain fit, whose sizes are 1.
-
-    Returns
-    -------
-    dict
-        For JSON.
-    """
+    """One way as plain data, for the table."""
     row: dict[str, Any] = {"fit": trial.setting.words, "alarm": trial.family.words}
     if trial.refused:
         return {**row, "refused": trial.refused}
@@ -141,18 +100,7 @@ def row_of(trial: Trial, plain: Trial) -> dict[str, Any]:
 
 
 def trial_data(trial: Trial) -> dict[str, Any]:
-    """A trial for the cache.
-
-    Parameters
-    ----------
-    trial : Trial
-        What a way came to.
-
-    Returns
-    -------
-    dict
-        For JSON.
-    """
+    """A trial for the cache."""
     return {
         "rules": [rule.to_dict() for rule in trial.rules],
         "alarms": trial.alarms,
@@ -168,27 +116,7 @@ def trial_data(trial: Trial) -> dict[str, Any]:
 
 
 def trial_from_data(data: Mapping[str, Any], setting: Setting, family: Family) -> Trial:
-    """A trial from the cache.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `trial_data`.
-    setting : Setting
-        How it was fitted.
-    family : Family
-        What raises the alarm.
-
-    Returns
-    -------
-    Trial
-        As it was.
-
-    Raises
-    ------
-    ModelError
-        A rule is none.
-    """
+    """A trial from the cache."""
     return Trial(
         setting,
         family,

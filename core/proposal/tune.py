@@ -69,22 +69,9 @@ MARGIN = 0.02
 class Tuned:
     """What `tune` chose, and all it tried.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted to everything, with its alarm and its validation.
-    chosen : Trial
-        How.
-    trials : tuple of Trial
-        Every way, the plain one first.
-    reason : str
-        Why this one.
-    record : tuple of str
-        What to record next, a sentence each.
-    not_tried : tuple of str
-        What the budget left no time for.
-    curve : tuple of dict
-        False alarms per hour and mean detectable size of the plain and of the chosen way.
+    `model`: fitted to everything, with its alarm and its validation; `chosen`: how; `trials`: every way, the plain one
+    first; `reason`: why this one; `record`: what to record next, a sentence each; `not_tried`: what the budget left no
+    time for; `curve`: false alarms per hour and mean detectable size of the plain and of the chosen way.
     """
 
     model: UncertainLTI
@@ -96,13 +83,7 @@ class Tuned:
     curve: tuple[dict[str, Any], ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for the model file and for `--json`.
-
-        Returns
-        -------
-        dict
-            A row for each way, the choice with its reason, and what to record.
-        """
+        """Plain data for the model file and for `--json`."""
         plain = self.trials[0]
         return {
             "trials": [row_of(t, plain) for t in self.trials],
@@ -137,37 +118,6 @@ def tune(
     standard error of the best (jackknife over what was left out) is chosen, and never one that detects less than the
     plain fit at as many false alarms. Labelled recordings with a fault come first: a way that misses more of them than
     the best by over a standard error is not taken.
-
-    Parameters
-    ----------
-    transients : Transient or sequence of Transient
-        Recordings of the healthy machine.
-    false_alarms : float
-        False alarms per hour at most.
-    within : float, optional
-        Time within which a fault shall be seen, s; default `typical_within`.
-    budget : float, optional
-        No further way is begun after so many s; the result then depends on how fast the machine is.
-    groups : sequence or str, optional
-        As in `validate`.
-    faulty : mapping of str to sequence of Transient, optional
-        Recordings with a fault, by what it is.
-    cache : path, optional
-        Folder that keeps what every way came to, so that an interrupted search goes on from there.
-    confidence : float, default 0.9
-        Of the limits of false alarms.
-    progress : callable, optional
-        Called with one line of text per way.
-
-    Returns
-    -------
-    Tuned
-        The model with the reason in `fit_summary["tune"]`.
-
-    Raises
-    ------
-    FitError
-        The rate or the time is not positive, there is too little to leave out, or no way can be fitted.
     """
     transients = [transients] if isinstance(transients, Transient) else list(transients)
     if not (math.isfinite(false_alarms) and false_alarms > 0):

@@ -47,18 +47,9 @@ _ADDITIVE = {
 class Setting:
     """One way to fit.
 
-    Parameters
-    ----------
-    words : str
-        What it is, in words.
-    options : mapping
-        Arguments of `fit`; knots of a schedule are stated by their number.
-    memories : tuple of Remembered
-        Lags and rates that are added to the controls.
-    delays : tuple of (str, int)
-        Controls that are taken so many samples earlier.
-    constant : bool, default False
-        Half-widths do not grow with x and u.
+    `words`: what it is, in words; `options`: arguments of `fit`; knots of a schedule are stated by their number;
+    `memories`: lags and rates that are added to the controls; `delays`: controls that are taken so many samples
+    earlier; `constant`: half-widths do not grow with x and u.
     """
 
     words: str
@@ -68,52 +59,17 @@ class Setting:
     constant: bool = False
 
     def prepared(self, transients: Sequence[Transient]) -> list[Transient]:
-        """The recordings with the delays and memories of this setting.
-
-        Parameters
-        ----------
-        transients : sequence of Transient
-            As recorded.
-
-        Returns
-        -------
-        list of Transient
-            One per recording.
-        """
+        """The recordings with the delays and memories of this setting."""
         if self.delays:
             transients = [with_delays(t, dict(self.delays)) for t in transients]
         return remember(transients, self.memories) if self.memories else list(transients)
 
     def beside(self, what: str, **changes: Any) -> Setting:
-        """This one with something more.
-
-        Parameters
-        ----------
-        what : str
-            In words.
-        **changes : object
-            Fields that differ.
-
-        Returns
-        -------
-        Setting
-            A new one.
-        """
+        """This one with something more."""
         return replace(self, words=f"{self.words.removeprefix(PLAIN)}, {what}", **changes)
 
     def arguments(self, transients: Sequence[Transient]) -> dict[str, Any]:
-        """Arguments of `fit` for recordings that were prepared.
-
-        Parameters
-        ----------
-        transients : sequence of Transient
-            Of `prepared`.
-
-        Returns
-        -------
-        dict
-            By name.
-        """
+        """Arguments of `fit` for recordings that were prepared."""
         options: dict[str, Any] = {"schedule": {}, **self.options}  # not that of the signals file, which may be auto
         if self.constant:
             n, m = transients[0].x.shape[1], transients[0].u.shape[1]
@@ -122,36 +78,14 @@ class Setting:
 
 
 def plain(transients: Sequence[Transient]) -> Setting:
-    """The fit without options: (10) with the additive term of the signals file.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-
-    Returns
-    -------
-    Setting
-        What every other is compared with.
-    """
+    """The fit without options: (10) with the additive term of the signals file."""
     asked = transients[0].signals.additive if transients[0].signals is not None else None
     additive = asked or "none"
     return Setting(f"{PLAIN}(10), {_ADDITIVE[additive]}", {"criterion": "qp", "additive": additive})
 
 
 def fits(transients: Sequence[Transient]) -> Iterator[Setting]:
-    """Additive terms, criteria and half-widths.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-
-    Yields
-    ------
-    Setting
-        The plainest first.
-    """
+    """Additive terms, criteria and half-widths."""
     for additive in ("none", "noise", "disturbance", "both"):
         for criterion, name in (("qp", "(10)"), ("lp", "(11)")):
             yield Setting(f"{name}, {_ADDITIVE[additive]}", {"criterion": criterion, "additive": additive})
@@ -161,20 +95,7 @@ def fits(transients: Sequence[Transient]) -> Iterator[Setting]:
 
 
 def delays(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
-    """Controls that are taken earlier: those that then explain more, and all of them by one sample.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    best : Setting
-        The best so far.
-
-    Yields
-    ------
-    Setting
-        With delays.
-    """
+    """Controls that are taken earlier: those that then explain more, and all of them by one sample."""
     first = transients[0]
     signals = () if first.signals is None else first.signals.controls
     remembered = {s.name for s in signals if s.memory is not None}
@@ -199,20 +120,7 @@ def delays(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
 
 
 def schedules(transients: Sequence[Transient], best: Setting) -> Iterator[list[Setting]]:
-    """Schedules on each promising signal.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    best : Setting
-        The best so far.
-
-    Yields
-    ------
-    list of Setting
-        More and more knots on one signal.
-    """
+    """Schedules on each promising signal."""
     found = promise(thinned(transients, TRANSITIONS))
     signals = [name for name in sorted(found, key=lambda name: found[name]) if found[name] <= PROMISING][:SIGNALS]
     for name in signals:
@@ -223,42 +131,14 @@ def schedules(transients: Sequence[Transient], best: Setting) -> Iterator[list[S
 
 
 def memories(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
-    """Lags and rates of states whose residuals follow from sample to sample, and of controls that seldom change.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    best : Setting
-        The best so far.
-
-    Yields
-    ------
-    Setting
-        With memories.
-    """
+    """Lags and rates of states whose residuals follow from sample to sample, and of controls that seldom change."""
     delayed = replace(best, memories=()).prepared(transients)
     for some in memory_candidates(delayed, str(best.options.get("additive", "noise"))):
         yield best.beside(f"with {', '.join(one.name for one in some)}", memories=some)
 
 
 def horizons(transients: Sequence[Transient], best: Setting, within: float) -> Iterator[Setting]:
-    """Envelopes over several steps beside that of one.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    best : Setting
-        The best so far.
-    within : float
-        Time within which a fault shall be seen, s: that of the longest.
-
-    Yields
-    ------
-    Setting
-        With one horizon.
-    """
+    """Envelopes over several steps beside that of one."""
     step = float(np.median(np.concatenate([t.dt for t in transients])))
     longest = min(LONGEST, round(within / step))
     for steps in sorted({max(2, longest // 4), longest}):

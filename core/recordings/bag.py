@@ -56,21 +56,10 @@ class Bag:
     Messages of one topic that has several types: the type with the most messages counts, the others are left out with a
     warning. Messages that do not fit their definition are left out with a warning as they are met.
 
-    Parameters
-    ----------
-    path : path
-        File or folder; with parts, the name of the recording.
-    parts : sequence of path or Contents, optional
-        Files in order, or what is known of them.
-    indexed : bool, default False
-        Where a file has an index, use what that states until messages are read; `described` gives what is needed to
-        read them in blocks, and everything else walks the file first. Damage to what is never read is then not
-        reported, and first and last log times of topics are those of the chunks they are in.
-
-    Raises
-    ------
-    BagError
-        There is no recording, or no message of it can be read.
+    `path`: file or folder; with parts, the name of the recording; `parts`: files in order, or what is known of them;
+    `indexed`: where a file has an index, use what that states until messages are read; `described` gives what is needed
+    to read them in blocks, and everything else walks the file first. Damage to what is never read is then not reported,
+    and first and last log times of topics are those of the chunks they are in.
     """
 
     def __init__(
@@ -99,36 +88,14 @@ class Bag:
         self.topics: Mapping[str, TopicInfo] = self._topics()
 
     def walk(self) -> None:
-        """Walk every file of which only the index was read.
-
-        Raises
-        ------
-        BagError
-            As opening the bag does.
-        """
+        """Walk every file of which only the index was read."""
         if self.indexed:
             self._warnings = self._folder_warnings
             self._undecoded = {}
             self._take([scan(part.path) if part.indexed else part for part in self._contents])
 
     def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
-        """Each file, and its channels that count for some topics.
-
-        Parameters
-        ----------
-        topics : iterable of str
-            Names.
-
-        Returns
-        -------
-        list of (Contents, dict of int to RecordedChannel)
-            Files in order; channels by their number in the file.
-
-        Raises
-        ------
-        BagError
-            As `messages`.
-        """
+        """Each file, and its channels that count for some topics."""
         wanted = self._required(topics)
         return [
             (contents, _of(channels, wanted, counted=True))
@@ -136,34 +103,11 @@ class Bag:
         ]
 
     def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
-        """Set `reading_notes`, for example to those of another process that read the same recording.
-
-        Parameters
-        ----------
-        warnings : sequence of str
-            As of `reading_notes`.
-        undecoded : mapping of str to str
-            As of `reading_notes`, by topic.
-        """
+        """Set `reading_notes`, for example to those of another process that read the same recording."""
         self._warnings, self._undecoded = list(warnings), dict(undecoded)
 
     def left_out(self, topic: str, number: int, why: str) -> str:
-        """Sentence about messages that cannot be decoded.
-
-        Parameters
-        ----------
-        topic : str
-            Name of the topic.
-        number : int
-            Messages left out.
-        why : str
-            The reason.
-
-        Returns
-        -------
-        str
-            The sentence.
-        """
+        """Sentence about messages that cannot be decoded."""
         return f"{self.path}: {topic}: {count(number, 'message')} left out that cannot be decoded ({why})"
 
     @property
@@ -201,68 +145,20 @@ class Bag:
         return [printable(warning) for warning in (*self._warnings, *self._undecoded.values())]
 
     def fields(self, type_name: str) -> Mapping[str, FieldType]:
-        """Fields of a type that a readable topic has or uses.
-
-        Parameters
-        ----------
-        type_name : str
-            As package/msg/Name.
-
-        Returns
-        -------
-        mapping of str to FieldType
-            Field name -> FieldType.
-
-        Raises
-        ------
-        SignalError
-            The type is not defined in the recording.
-        """
+        """Fields of a type that a readable topic has or uses."""
         for channel in self._every_channel():
             if channel.counted and type_name in channel.definition.types:
                 return channel.definition.fields(type_name)
         raise SignalError(f"{type_name}: not defined in {self.path}; check the type")
 
     def type_fields(self, topic: str) -> TypeFields:
-        """`fields` as one topic's own schema defines them.
-
-        Parameters
-        ----------
-        topic : str
-            Name of the topic.
-
-        Returns
-        -------
-        callable
-            Type name -> {field name: FieldType}.
-
-        Raises
-        ------
-        BagError
-            As `messages`.
-        """
+        """`fields` as one topic's own schema defines them."""
         self._require(topic)
         channels = (channel for channel in self._every_channel() if channel.topic == topic and channel.counted)
         return next(channels).definition.fields
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
-        """Decoded messages in order of log time, ties in file order, over all parts.
-
-        Parameters
-        ----------
-        topics : iterable of str
-            Names.
-
-        Returns
-        -------
-        iterator of (str, int, object)
-            Topic, log time in ns, message.
-
-        Raises
-        ------
-        BagError
-            A topic is not there (the sentence names those that are) or cannot be decoded (it says why).
-        """
+        """Decoded messages in order of log time, ties in file order, over all parts."""
         self.walk()
         wanted = self._required(topics)
         return self._decoded([_of(channels, wanted, counted=True) for channels in self._channels])
@@ -270,65 +166,18 @@ class Bag:
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
     ) -> Columns:
-        """Numbers at some paths of each topic, read block by block; see `read_columns`.
-
-        Parameters
-        ----------
-        topics : sequence of str
-            Names.
-        paths : sequence of sequence of FieldPath
-            Per topic the paths to read.
-        progress : Progress, optional
-            Wraps what goes through the messages, given their number.
-
-        Returns
-        -------
-        Columns
-            In order of arrival.
-        """
+        """Numbers at some paths of each topic, read block by block; see `read_columns`."""
         return read_columns(self, topics, paths, progress)
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
-        """Facts about every topic; reads the recording once, and decodes one message of each topic.
-
-        Parameters
-        ----------
-        progress : Progress, optional
-            Wraps the messages, given their number.
-
-        Returns
-        -------
-        list of TopicFacts
-            One per topic.
-
-        Raises
-        ------
-        BagError
-            The recording cannot be read any more.
-        """
+        """Facts about every topic; reads the recording once, and decodes one message of each topic."""
         messages: Iterable[Any] = self.raw_messages(topic for topic in self.topics if topic not in self._too_late)
         if progress is not None:
             messages = progress(messages, sum(info.count for info in self.topics.values()))
         return topic_facts(self.topics, messages)
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
-        """Messages as recorded, of these topics or of all, also those that cannot be decoded; same order.
-
-        Parameters
-        ----------
-        topics : iterable of str, optional
-            Names; default all.
-
-        Returns
-        -------
-        iterator of RawMessage
-            In the order of `messages`.
-
-        Raises
-        ------
-        BagError
-            A topic is not there (the sentence names those that are), or has log times that cannot be kept.
-        """
+        """Messages as recorded, of these topics or of all, also those that cannot be decoded; same order."""
         self.walk()
         wanted = set(self.topics if topics is None else topics)
         for topic in sorted(wanted):

@@ -51,66 +51,16 @@ class Blocks(Recording, Protocol):
     """A recording whose files are read block by block: `Bag`."""
 
     def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
-        """Each file, and its channels that count for some topics.
-
-        Parameters
-        ----------
-        topics : iterable of str
-            Names.
-
-        Returns
-        -------
-        list of (Contents, dict of int to RecordedChannel)
-            Files in order; channels by their number in the file.
-        """
+        """Each file, and its channels that count for some topics."""
 
     def left_out(self, topic: str, number: int, why: str) -> str:
-        """Sentence about messages that cannot be decoded.
-
-        Parameters
-        ----------
-        topic : str
-            Name of the topic.
-        number : int
-            Messages left out.
-        why : str
-            The reason.
-
-        Returns
-        -------
-        str
-            The sentence.
-        """
+        """Sentence about messages that cannot be decoded."""
 
 
 def read_columns(
     bag: Blocks, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
 ) -> Columns:
-    """Read some paths of each topic; messages that cannot be decoded are left out, and the bag warns of them.
-
-    Parameters
-    ----------
-    bag : Blocks
-        The recording.
-    topics : sequence of str
-        Names.
-    paths : sequence of sequence of FieldPath
-        Per topic the paths to read.
-    progress : Progress, optional
-        Wraps what goes through the messages, given their number.
-
-    Returns
-    -------
-    Columns
-        In order of arrival.
-
-    Raises
-    ------
-    BagError
-        A topic is not there or cannot be read.
-    RepeatedNamesError
-        What a path gives depends on the order of the messages.
-    """
+    """Read some paths of each topic; messages that cannot be decoded are left out, and the bag warns of them."""
     try:
         return _Reading(bag, topics, paths).run(progress)
     except IndexMismatchError:
@@ -122,25 +72,7 @@ def read_columns(
 
 
 def in_reach(path: Path, log_time: int) -> int:
-    """Check that a log time can be kept as a 64-bit integer.
-
-    Parameters
-    ----------
-    path : Path
-        The recording, for the error.
-    log_time : int
-        Log time, ns.
-
-    Returns
-    -------
-    int
-        The same log time.
-
-    Raises
-    ------
-    BagError
-        It is past the year 2262.
-    """
+    """Check that a log time can be kept as a 64-bit integer."""
     if log_time > LATEST:
         raise BagError(
             f"{path}: a message has a log time of {log_time} ns, which is past the year 2262; "

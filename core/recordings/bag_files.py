@@ -22,40 +22,13 @@ _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.(?:mcap|db3|bag)")
 
 
 def stem_and_index(path: Path) -> tuple[str, int] | None:
-    """(`name`, 3) of `name_3.mcap`; None for other names.
-
-    Parameters
-    ----------
-    path : Path
-        A file.
-
-    Returns
-    -------
-    (str, int) or None
-        (`name`, 3) for `name_3.mcap`; None for other names.
-    """
+    """(`name`, 3) of `name_3.mcap`; None for other names."""
     match = _PART.fullmatch(path.name)
     return (match["stem"], int(match["index"])) if match else None
 
 
 def listed_parts(folder: Path) -> list[Path] | None:
-    """Parts in the order of the folder's metadata.yaml, there or not; None without a usable one.
-
-    Parameters
-    ----------
-    folder : Path
-        The recording.
-
-    Returns
-    -------
-    list of Path or None
-        None without a usable metadata.yaml.
-
-    Raises
-    ------
-    BagError
-        metadata.yaml says that the recording is in another storage, or that its files are compressed as a whole.
-    """
+    """Parts in the order of the folder's metadata.yaml, there or not; None without a usable one."""
     import yaml
 
     path = folder / "metadata.yaml"
@@ -78,25 +51,6 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
     """Files of a folder that is one recording.
 
     Without metadata.yaml the parts are the folder's `<stem>_<i>.mcap`, `.db3` or `.bag` of one stem in natural order.
-
-    Parameters
-    ----------
-    folder : Path
-        The recording.
-
-    Returns
-    -------
-    list of Path
-        Parts in order.
-    bool
-        Whether metadata.yaml lists them.
-    list of str
-        Warnings.
-
-    Raises
-    ------
-    BagError
-        The folder holds no recording, or several; the sentence names them.
     """
     try:
         inside = sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=natural)

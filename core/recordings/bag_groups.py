@@ -34,23 +34,6 @@ def group_bags(paths: Sequence[Path], indexed: bool = False) -> list[Bag]:
       before ends, and overlaps it by no more than 10 % of the shorter (messages at a seam may be out of order).
 
     In doubt files stay apart: that loses the one transition at a seam, while joining two runs would invent one.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Files and folders.
-    indexed : bool, default False
-        As in `Bag`.
-
-    Returns
-    -------
-    list of Bag
-        One per recording.
-
-    Raises
-    ------
-    BagError
-        A file cannot be read.
     """
     order: list[tuple[Path, str]] = []
     files: dict[tuple[Path, str], list[Path]] = {}

@@ -24,19 +24,7 @@ _LARGEST = 1 << 20  # bytes of one metadata record that is read
 
 
 def metadata_pairs(recording: str | os.PathLike[str]) -> dict[str, str]:
-    """Pairs of a recording's metadata.yaml (`custom_data`) and of its first MCAP file's metadata records.
-
-    Parameters
-    ----------
-    recording : path
-        MCAP file, or the folder of a recording.
-
-    Returns
-    -------
-    dict of str to str
-        Under a record's own key, and under `record name/key`; metadata.yaml comes first. Empty if there are none, or
-        if they cannot be read.
-    """
+    """Pairs of a recording's metadata.yaml (`custom_data`) and of its first MCAP file's metadata records."""
     path = Path(recording)
     folder = path if path.is_dir() else path.parent
     pairs = _custom_data(folder / "metadata.yaml")

@@ -21,18 +21,7 @@ from uncertain_lti.recordings.message_types import normal_name
 
 
 def not_one_recording(parts: Sequence[Contents]) -> str:
-    """Say why files are not the consecutive parts of one recording.
-
-    Parameters
-    ----------
-    parts : sequence of Contents
-        What is known of each file, in order.
-
-    Returns
-    -------
-    str
-        The reason; "" if they may be.
-    """
+    """Say why files are not the consecutive parts of one recording."""
     pause: int | None = None
     for before, after in itertools.pairwise(parts):
         names = f"{before.path.name} and {after.path.name}"

@@ -73,12 +73,7 @@ class RepeatedNamesError(Exception):
 class Failure(NamedTuple):
     """A message that cannot be decoded.
 
-    Parameters
-    ----------
-    row : int
-        Which one of those given.
-    why : str
-        The reason.
+    `row`: which one of those given; `why`: the reason.
     """
 
     row: int
@@ -187,14 +182,7 @@ class _Shape:
 class Messages(NamedTuple):
     """Encoded messages data[begin:end]; SLACK bytes around each can be read as well.
 
-    Parameters
-    ----------
-    data : bytearray
-        A buffer with all of them.
-    begin : array (messages,) of int
-        Where each begins.
-    end : array (messages,) of int
-        Where each ends.
+    `data`: A buffer with all of them; `begin` (messages,): where each begins; `end` (messages,): where each ends.
     """
 
     data: bytearray
@@ -202,18 +190,7 @@ class Messages(NamedTuple):
     end: Integers
 
     def take(self, which: Mask | Integers | slice) -> Messages:
-        """Some of the messages.
-
-        Parameters
-        ----------
-        which : array of bool or int, or slice
-            Which.
-
-        Returns
-        -------
-        Messages
-            On the same buffer.
-        """
+        """Some of the messages."""
         return Messages(self.data, self.begin[which], self.end[which])
 
 
@@ -369,17 +346,7 @@ class _Some:
 def numbers_at(data: bytearray, kind: str) -> NDArray[Any]:
     """Numbers of this kind that begin at every byte of a buffer.
 
-    Parameters
-    ----------
-    data : bytearray
-        The buffer.
-    kind : str
-        Type code of numpy with its byte order, `<f8` for example.
-
-    Returns
-    -------
-    array (bytes - size + 1,)
-        A view.
+    Returns (bytes - size + 1,): A view.
     """
     size = np.dtype(kind).itemsize
     numbers: NDArray[Any] = np.ndarray((len(data) - size + 1,), kind, data, strides=(1,))
@@ -471,12 +438,7 @@ def _moves(numbers: Sequence[Number]) -> list[_Move]:
 class FieldReader:
     """Reads the paths of one topic from its messages; learns their layouts as it meets them.
 
-    Parameters
-    ----------
-    definition : Definition
-        Of the messages.
-    paths : sequence of FieldPath
-        To read; checked against the type.
+    `definition`: of the messages; `paths`: to read; checked against the type.
     """
 
     def __init__(self, definition: Definition, paths: Sequence[FieldPath]) -> None:
@@ -496,24 +458,8 @@ class FieldReader:
     def read(self, messages: Messages, values: Values, stamps: Integers) -> list[Failure]:
         """Fill in a row of values and a stamp for each message.
 
-        Parameters
-        ----------
-        messages : Messages
-            To read.
-        values : array (messages, paths)
-            Takes the values.
-        stamps : array (messages,) of int
-            Takes the header stamps, ns; NO_STAMP for none.
-
-        Returns
-        -------
-        list of Failure
-            The messages that cannot be decoded.
-
-        Raises
-        ------
-        RepeatedNamesError
-            What a path gives depends on the order of the messages.
+        `values` (messages, paths): takes the values; `stamps` (messages,): takes the header stamps, ns; NO_STAMP for
+        none.
         """
         with np.errstate(all="ignore"):  # a signalling NaN is read like any other
             return self._read_all(messages, values, stamps)

@@ -59,14 +59,8 @@ class CutError(UnfitError):
 class Wanted:
     """What paths want of one value of a message.
 
-    Parameters
-    ----------
-    fields, elements, named : dict of Wanted
-        Of its fields by name, and of its elements by position or by name.
-    goals : list of (int, int)
-        (path, part) that the value itself is for.
-    every : list of int
-        Paths that take all elements, part after part.
+    `fields, elements, named`: of its fields by name, and of its elements by position or by name; `goals`: (path, part)
+    that the value itself is for; `every`: paths that take all elements, part after part.
     """
 
     fields: dict[str, Wanted] = field(default_factory=dict)
@@ -77,29 +71,7 @@ class Wanted:
 
 
 def wanted(type_name: str, paths: Sequence[FieldPath], fields: TypeFields) -> Wanted:
-    """What these paths, and the header stamp, want of a message.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-    paths : sequence of FieldPath
-        To read; a path is meant by its position.
-    fields : callable
-        Type name -> {field name: FieldType}.
-
-    Returns
-    -------
-    Wanted
-        Of the message.
-
-    Raises
-    ------
-    SignalError
-        A path does not lead to a number of this type.
-    UnfitError
-        The header stamp is none.
-    """
+    """What these paths, and the header stamp, want of a message."""
     top = Wanted()
     for number, path in enumerate(paths):
         path.check("", type_name, fields)
@@ -150,16 +122,8 @@ class Role(Enum):
 class Piece(NamedTuple):
     """A stretch of a message; places count from its first byte.
 
-    Parameters
-    ----------
-    role : Role
-        What it holds.
-    at : int
-        Where it begins, with its length if it has one.
-    start, end : int
-        Where its content begins, and where that ends.
-    size : int
-        Bytes of one element.
+    `role`: what it holds; `at`: where it begins, with its length if it has one; `start, end`: where its content begins,
+    and where that ends; `size`: bytes of one element.
     """
 
     role: Role
@@ -177,14 +141,7 @@ class Piece(NamedTuple):
 class Number(NamedTuple):
     """A wanted number.
 
-    Parameters
-    ----------
-    at : int
-        Where it stands.
-    code : str
-        Its type, of `CODES`.
-    goal : (int, int)
-        Path and part that it is for.
+    `at`: where it stands; `code`: its type, of `CODES`; `goal`: path and part that it is for.
     """
 
     at: int
@@ -195,34 +152,10 @@ class Number(NamedTuple):
 class Walk:
     """One pass over a message, which notes every piece of it, and where the wanted numbers stand.
 
-    Parameters
-    ----------
-    data : bytes
-        Serialised message.
-    fields : callable
-        Type name -> {field name: FieldType}.
-    at : int, default ENCAPSULATION
-        Where to begin.
-
-    Attributes
-    ----------
-    pieces : list of Piece
-        In order.
-    numbers : list of Number
-        The wanted ones that are there.
-    whole : dict of int to int
-        Path that takes a whole array -> its length.
-    reserved : int
-        Bytes that may stand behind the message, besides `PADDING`.
-    odd : bool
-        Whether a string has not even a closing zero.
-    repeated : bool
-        Whether a name that a path looks up stands twice.
-
-    Raises
-    ------
-    UnfitError
-        The data is no plain CDR.
+    `data`: serialised message; `fields`: type name -> {field name: FieldType}; `at`: where to begin; `pieces`: in
+    order; `numbers`: the wanted ones that are there; `whole`: path that takes a whole array -> its length; `reserved`:
+    bytes that may stand behind the message, besides `PADDING`; `odd`: whether a string has not even a closing zero;
+    `repeated`: whether a name that a path looks up stands twice.
     """
 
     def __init__(self, data: bytes, fields: TypeFields, at: int = ENCAPSULATION) -> None:
@@ -249,20 +182,7 @@ class Walk:
         return any(max(self._data[p.start : p.end]) > 1 for p in self.pieces if p.role is Role.TRUTHS)
 
     def message(self, type_name: str, wanted: Wanted | None = None) -> None:
-        """Walk a message, or one inside.
-
-        Parameters
-        ----------
-        type_name : str
-            As package/msg/Name.
-        wanted : Wanted, optional
-            What to look for.
-
-        Raises
-        ------
-        UnfitError
-            It does not fit the definition, has too many parts, or holds something that is not read.
-        """
+        """Walk a message, or one inside."""
         fields = self._fields(type_name)
         if not fields:
             self._numbers("B", 1, {})  # an empty message is one byte long

@@ -25,44 +25,12 @@ _OTHERS: Mapping[bytes, Callable[[Path], Contents]] = {
 
 
 def scan(path: Path) -> Contents:
-    """Go through a file once and note where its messages are.
-
-    Parameters
-    ----------
-    path : Path
-        MCAP file, rosbag2 database or ROS 1 bag, whole or cut.
-
-    Returns
-    -------
-    Contents
-        Where its messages are.
-
-    Raises
-    ------
-    BagError
-        The file is none of these, or the operating system does not let it be read.
-    """
+    """Go through a file once and note where its messages are."""
     return (_other(path) or mcap_scan.scan)(path)
 
 
 def outline_or_scan(path: Path) -> Contents:
-    """What the index of an MCAP file states, or else what is found by `scan`.
-
-    Parameters
-    ----------
-    path : Path
-        As for `scan`.
-
-    Returns
-    -------
-    Contents
-        What is known of the file.
-
-    Raises
-    ------
-    BagError
-        As `scan`.
-    """
+    """What the index of an MCAP file states, or else what is found by `scan`."""
     return (_other(path) or mcap_index.outline_or_scan)(path)
 
 

@@ -30,20 +30,11 @@ from uncertain_lti.signals.table_layout import TableLayout
 class Format:
     """One kind of recording.
 
-    Parameters
-    ----------
-    name : str
-        What it is called.
-    recognises : callable
-        Takes a path, and returns whether this format reads it.
-    open : callable
-        Takes the path of one recording, its files in order where they are known (else none), and whether an index may
-        be believed until messages are read; returns the `Recording`.
-    group : callable
-        Takes paths that a user named together, and the same flag; returns the recordings they are, in order.
-    laid_out : callable, optional
-        Takes a path, and what a signals file says of the columns of tables; returns the recordings in the file. None
-        for a format in which a file says that itself.
+    `name`: what it is called; `recognises`: takes a path, and returns whether this format reads it; `open`: takes the
+    path of one recording, its files in order where they are known (else none), and whether an index may be believed
+    until messages are read; returns the `Recording`; `group`: takes paths that a user named together, and the same
+    flag; returns the recordings they are, in order; `laid_out`: takes a path, and what a signals file says of the
+    columns of tables; returns the recordings in the file. None for a format in which a file says that itself.
     """
 
     name: str
@@ -61,18 +52,7 @@ FORMATS: list[Format] = [
 
 
 def format_of(path: Path) -> Format:
-    """Find the format that reads a file or folder.
-
-    Parameters
-    ----------
-    path : Path
-        File or folder, there or not.
-
-    Returns
-    -------
-    Format
-        The first that recognises it.
-    """
+    """Find the format that reads a file or folder."""
     return next(format for format in FORMATS if format.recognises(path))
 
 
@@ -82,29 +62,7 @@ def open_recording(
     indexed: bool = False,
     layout: TableLayout | None = None,
 ) -> Recording:
-    """Open one recording.
-
-    Parameters
-    ----------
-    path : path
-        File or folder; with parts, the name of the recording.
-    parts : sequence of path, optional
-        Its files in order, where they are known.
-    indexed : bool, default False
-        Believe an index until messages are read, as `Bag` does.
-    layout : TableLayout, optional
-        What a signals file says of the columns of tables.
-
-    Returns
-    -------
-    Recording
-        In the format that recognises the path.
-
-    Raises
-    ------
-    BagError
-        There is no recording, or no message of it can be read; or there are several.
-    """
+    """Open one recording."""
     format = format_of(Path(path))
     if layout is not None and format.laid_out is not None:
         recordings = format.laid_out(Path(path), layout)
@@ -122,25 +80,6 @@ def group_recordings(
 
     A folder is one recording. Files are one recording each, except the parts of a split bag (`group_bags`), and a table
     with a column that tells the runs in it apart.
-
-    Parameters
-    ----------
-    paths : iterable of path
-        Files and folders.
-    indexed : bool, default False
-        As in `open_recording`.
-    layout : TableLayout, optional
-        Likewise.
-
-    Returns
-    -------
-    list of Recording
-        One per recording.
-
-    Raises
-    ------
-    BagError
-        A file cannot be read, or is named twice.
     """
     recordings: list[Recording] = []
     for format, run in itertools.groupby(map(Path, paths), format_of):

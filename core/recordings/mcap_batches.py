@@ -67,18 +67,9 @@ class Batch:
 
     data[begin:end] is an encoded message. SLACK bytes before and after every message can be read as well.
 
-    Parameters
-    ----------
-    data : bytearray
-        A buffer that is used again for the next batch.
-    channel : array (messages,) of uint16
-        Number of the channel in the file.
-    log_time : array (messages,) of uint64
-        Log time, ns.
-    begin : array (messages,) of int
-        Where each message begins.
-    end : array (messages,) of int
-        Where it ends.
+    `data`: A buffer that is used again for the next batch; `channel` (messages,): number of the channel in the file;
+    `log_time` (messages,): log time, ns; `begin` (messages,): where each message begins; `end` (messages,): where it
+    ends.
     """
 
     data: bytearray
@@ -89,27 +80,7 @@ class Batch:
 
 
 def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
-    """Messages of these channels, some MiB at a time, in file order; only blocks that hold one are read.
-
-    Parameters
-    ----------
-    contents : Contents
-        The file.
-    channels : collection of int
-        Numbers of the channels in the file.
-
-    Yields
-    ------
-    Batch
-        Some MiB of messages.
-
-    Raises
-    ------
-    IndexMismatchError
-        The contents come from an index, and the file is not what that states.
-    BagError
-        The file changed, or cannot be read any more.
-    """
+    """Messages of these channels, some MiB at a time, in file order; only blocks that hold one are read."""
     wanted = np.zeros(1 << 16, dtype=bool)
     wanted[list(channels)] = True
     missing = {channel: contents.tally[channel].count for channel in channels if channel in contents.tally}

@@ -84,23 +84,7 @@ class _Source:
 
 
 def profile_of(path: Path) -> str:
-    """The profile that a file states in its first record; "" where it states none.
-
-    Parameters
-    ----------
-    path : Path
-        An MCAP file.
-
-    Returns
-    -------
-    str
-        The profile, or an empty text.
-
-    Raises
-    ------
-    BagError
-        The file cannot be read.
-    """
+    """The profile that a file states in its first record; "" where it states none."""
     with _Source(path) as source:
         head = source.at(len(MAGIC), RECORD.size)
         if len(head) < RECORD.size:
@@ -114,17 +98,8 @@ def profile_of(path: Path) -> str:
 class Copier:
     """Copies whole files, one after the other, to one writer.
 
-    Parameters
-    ----------
-    writer : McapWriter
-        Gets the copies.
-
-    Attributes
-    ----------
-    notes : list of str
-        What could not be copied, each one sentence that begins with the file.
-    unconverted : dict of Path to int
-        Messages of files that are no MCAP which could not be converted, and so not be copied.
+    `writer`: gets the copies; `notes`: what could not be copied, each one sentence that begins with the file;
+    `unconverted`: messages of files that are no MCAP which could not be converted, and so not be copied.
     """
 
     def __init__(self, writer: McapWriter) -> None:
@@ -135,22 +110,7 @@ class Copier:
         self.notes: list[str] = []
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Number of a schema in the copy, which has it or gets it.
-
-        Parameters
-        ----------
-        name : str
-            As package/msg/Name.
-        encoding : str
-            `ros2msg`, for example.
-        data : bytes
-            Its text.
-
-        Returns
-        -------
-        int
-            The number.
-        """
+        """Number of a schema in the copy, which has it or gets it."""
         for number, there in self._schemas.items():
             if there == (name, encoding, data):
                 return number
@@ -163,26 +123,7 @@ class Copier:
         return number
 
     def channel(self, schema: int, topic: str, encoding: str, metadata: Mapping[str, str], preferred: int = 1) -> int:
-        """Declare a new channel in the copy.
-
-        Parameters
-        ----------
-        schema : int
-            Number of its schema in the copy; 0 for none.
-        topic : str
-            Name of its topic.
-        encoding : str
-            Of its messages.
-        metadata : mapping of str to str
-            To be stored with it.
-        preferred : int, default 1
-            The number to take where it is free.
-
-        Returns
-        -------
-        int
-            The number.
-        """
+        """Declare a new channel in the copy."""
         number = _free(self._channels, preferred)
         self._channels[number] = (schema, topic, encoding, dict(metadata))
         self._writer.declare_channel(number, *self._channels[number])
@@ -192,16 +133,6 @@ class Copier:
         """Declare what a file declares.
 
         A channel that the copy has already, of another part of the recording, is the same one.
-
-        Parameters
-        ----------
-        contents : Contents
-            The file.
-
-        Returns
-        -------
-        dict of int to int
-            Number in the file -> number in the copy, of its channels.
         """
         known: dict[_Schema, list[int]] = {}
         for number, schema in self._schemas.items():
@@ -221,25 +152,7 @@ class Copier:
         return channels
 
     def copy(self, contents: Contents, channels: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-        """Copy a file.
-
-        Parameters
-        ----------
-        contents : Contents
-            The file.
-        channels : mapping of int to int
-            What `declare` returned for it.
-
-        Yields
-        ------
-        (int, int)
-            After each block, its messages and its greatest log time, ns.
-
-        Raises
-        ------
-        BagError
-            It cannot be read any more, or changed.
-        """
+        """Copy a file."""
         same = {number: self._is_same(contents, number, channels) for number in contents.channels}
         with _Source(contents.path) as source:
             blocks = ((block.offset, block) for block in contents.blocks)

@@ -55,23 +55,7 @@ class _NoIndexError(Exception):
 
 
 def outline(path: Path) -> Contents | None:
-    """Contents of a file by its summary; None where the file has to be walked (`scan`).
-
-    Parameters
-    ----------
-    path : Path
-        An MCAP file.
-
-    Returns
-    -------
-    Contents or None
-        The contents, or None.
-
-    Raises
-    ------
-    BagError
-        The operating system does not let the file be read.
-    """
+    """Contents of a file by its summary; None where the file has to be walked (`scan`)."""
     try:
         with open(path, "rb", buffering=0) as stream:
             size = stream.seek(0, 2)
@@ -173,16 +157,5 @@ def _block(index: bytes, data_end: int) -> Block:
 
 
 def outline_or_scan(path: Path) -> Contents:
-    """What the index of a file states, or else what is found by walking it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Contents
-        What is known of the file.
-    """
+    """What the index of a file states, or else what is found by walking it."""
     return outline(path) or scan(path)

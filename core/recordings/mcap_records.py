@@ -50,29 +50,12 @@ _MESSAGE_HEAD = struct.Struct("<BQHIQQ").pack
 class Block(NamedTuple):
     """A stretch of a file that is read at once: bytes `offset` to `offset + size`.
 
-    Parameters
-    ----------
-    offset : int
-        First byte.
-    size : int
-        Bytes in the file.
-    compression : str
-        Empty where the bytes are records as they are.
-    length : int
-        Bytes of the records.
-    start : int
-        Smallest log time, ns.
-    end : int
-        Largest log time, ns.
-    channels : frozenset of int
-        Those that have a message here.
-    unchecked : int, default 0
-        Of a chunk that was found in an index (`mcap_index.outline`), bytes in front of its records, which are still to
-        be compared with the block, and the records with their checksum; 0 otherwise.
-    indexed : int, default 0
-        Of such a chunk, bytes behind its records, which say where its messages are; 0 otherwise.
-    cut : bool, default False
-        The file ends within it.
+    `offset`: first byte; `size`: bytes in the file; `compression`: empty where the bytes are records as they are;
+    `length`: bytes of the records; `start`: smallest log time, ns; `end`: largest log time, ns; `channels`: those that
+    have a message here; `unchecked`: of a chunk that was found in an index (`mcap_index.outline`), bytes in front of
+    its records, which are still to be compared with the block, and the records with their checksum; 0 otherwise;
+    `indexed`: of such a chunk, bytes behind its records, which say where its messages are; 0 otherwise; `cut`: the file
+    ends within it.
     """
 
     offset: int
@@ -91,14 +74,7 @@ class Block(NamedTuple):
 class Tally:
     """Messages of one channel.
 
-    Parameters
-    ----------
-    count : int
-        How many.
-    first : int
-        First log time, ns.
-    last : int
-        Last log time, ns.
+    `count`: how many; `first`: first log time, ns; `last`: last log time, ns.
     """
 
     count: int
@@ -110,29 +86,11 @@ class Tally:
 class Contents:
     """What `scan` found in a file.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    size : int
-        Its bytes.
-    blocks : list of Block, optional
-        In file order.
-    channels : dict of int to Channel, optional
-        By number.
-    schemas : dict of int to Schema, optional
-        By number.
-    tally : dict of int to Tally, optional
-        By number of the channel.
-    warnings : list of str, optional
-        Sentences that begin with the path.
-    indexed : bool, default False
-        The file was not walked, and this is only what its index states (`mcap_index.outline`): first and last of a
-        tally are those of the chunks that hold the channel.
-    summed : bool, default False
-        The file has a checksum over everything, which was not checked.
-    others : array of int, optional
-        Where attachments, metadata and private records begin, in file order; empty when the file was not walked.
+    `path`: the file; `size`: its bytes; `blocks`: in file order; `channels`: by number; `schemas`: by number; `tally`:
+    by number of the channel; `warnings`: sentences that begin with the path; `indexed`: the file was not walked, and
+    this is only what its index states (`mcap_index.outline`): first and last of a tally are those of the chunks that
+    hold the channel; `summed`: the file has a checksum over everything, which was not checked; `others`: where
+    attachments, metadata and private records begin, in file order; empty when the file was not walked.
     """
 
     path: Path
@@ -155,48 +113,12 @@ class Contents:
         return sum(entry.count for entry in self.tally.values())
 
     def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
-        """Records of one block, not compressed.
-
-        Parameters
-        ----------
-        block : Block
-            Of this file.
-        channels : collection of int, optional
-            Channels that are wanted; what is converted leaves the others out.
-
-        Returns
-        -------
-        bytes
-            The records.
-
-        Raises
-        ------
-        BagError
-            The file changed, or cannot be read any more.
-        """
+        """Records of one block, not compressed."""
         return read_block(self.path, block)
 
 
 def stored_bytes(path: Path, block: Block) -> bytes:
-    """Bytes of a block as they are in the file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    block : Block
-        Of the file.
-
-    Returns
-    -------
-    bytes
-        Compressed where the file is; fewer than the block has where the file changed.
-
-    Raises
-    ------
-    BagError
-        The file cannot be read any more.
-    """
+    """Bytes of a block as they are in the file."""
     try:
         with open(path, "rb", buffering=0) as stream:
             stream.seek(block.offset)
@@ -206,25 +128,7 @@ def stored_bytes(path: Path, block: Block) -> bytes:
 
 
 def read_block(path: Path, block: Block) -> bytes:
-    """Records of a block that `scan` found.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    block : Block
-        Of the file.
-
-    Returns
-    -------
-    bytes
-        The records, not compressed.
-
-    Raises
-    ------
-    BagError
-        The file changed, or cannot be read any more.
-    """
+    """Records of a block that `scan` found."""
     assert not block.unchecked
     records, _ = inflate(block.compression, memoryview(stored_bytes(path, block)), block.length)
     if len(records) < block.length:
@@ -233,43 +137,13 @@ def read_block(path: Path, block: Block) -> bytes:
 
 
 def message_record(channel: int, sequence: int, log_time: int, publish_time: int, data: bytes | memoryview) -> bytes:
-    """One message as an MCAP file has it.
-
-    Parameters
-    ----------
-    channel : int
-        Number of its channel.
-    sequence : int
-        Its number on the channel.
-    log_time : int
-        Log time, ns.
-    publish_time : int
-        Publish time, ns.
-    data : bytes or memoryview
-        Serialised message.
-
-    Returns
-    -------
-    bytes
-        The record.
-    """
+    """One message as an MCAP file has it."""
     head = _MESSAGE_HEAD(_MESSAGE, MESSAGE.size + len(data), channel, sequence & 0xFFFFFFFF, log_time, publish_time)
     return b"".join((head, data))
 
 
 def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:
-    """Messages among some records; the data of each is `records[begin:end]`.
-
-    Parameters
-    ----------
-    records : bytes
-        Of `read_block`.
-
-    Yields
-    ------
-    (int, int, int, int, int)
-        Channel, log time and publish time in ns, begin, end.
-    """
+    """Messages among some records; the data of each is `records[begin:end]`."""
     for opcode, begin, end in walk(records):
         if opcode == Opcode.MESSAGE and end - begin >= MESSAGE.size:
             channel, _, log_time, publish_time = MESSAGE.unpack_from(records, begin)
@@ -277,18 +151,7 @@ def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:
 
 
 def walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
-    """Whole records, until the first one that is cut.
-
-    Parameters
-    ----------
-    records : bytes or memoryview
-        As they are in a file or a chunk.
-
-    Yields
-    ------
-    (int, int, int)
-        Opcode, begin and end of the content.
-    """
+    """Whole records, until the first one that is cut."""
     position, size, header, unpack = 0, len(records), RECORD.size, RECORD.unpack_from
     while position + header <= size:
         opcode, length = unpack(records, position)
@@ -300,24 +163,7 @@ def walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
 
 
 def inflate(compression: str, data: memoryview, limit: int) -> tuple[bytes | memoryview, str]:
-    """Decompress with a limit, whatever the data claims of itself.
-
-    Parameters
-    ----------
-    compression : str
-        `zstd`, `lz4`, or empty for none.
-    data : memoryview
-        What was compressed.
-    limit : int
-        Bytes to give at most, and one more.
-
-    Returns
-    -------
-    bytes or memoryview
-        As far as it went.
-    str
-        What went wrong; empty where nothing did.
-    """
+    """Decompress with a limit, whatever the data claims of itself."""
     if not compression:
         return data[: limit + 1], ""
     if compression == "zstd":
@@ -354,20 +200,7 @@ class _Exact(ReadDataStream):
 
 
 def parse(kind: type[Any], content: bytes | memoryview) -> Any:
-    """Content of one record.
-
-    Parameters
-    ----------
-    kind : type
-        Record class of the mcap package.
-    content : bytes or memoryview
-        Its bytes.
-
-    Returns
-    -------
-    object
-        The record, or None where it contradicts itself.
-    """
+    """Content of one record."""
     try:
         return kind.read(_Exact(BytesIO(content)))
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
@@ -375,34 +208,10 @@ def parse(kind: type[Any], content: bytes | memoryview) -> Any:
 
 
 def count(number: int, what: str) -> str:
-    """A count for a sentence: `1 message`, `61 340 messages`.
-
-    Parameters
-    ----------
-    number : int
-        How many.
-    what : str
-        The noun in the singular.
-
-    Returns
-    -------
-    str
-        Thousands apart.
-    """
+    """A count for a sentence: `1 message`, `61 340 messages`."""
     return f"{number:,}".replace(",", " ") + f" {what}{'' if number == 1 else 's'}"
 
 
 def seconds(time_ns: int) -> str:
-    """Nanoseconds written as seconds, exact to the millisecond.
-
-    Parameters
-    ----------
-    time_ns : int
-        A time of zero or more, ns.
-
-    Returns
-    -------
-    str
-        Cut after the millisecond.
-    """
+    """Nanoseconds written as seconds, exact to the millisecond."""
     return f"{time_ns // 10**9}.{time_ns % 10**9 // 10**6:03d}"

@@ -69,55 +69,17 @@ _LARGEST_DEFINITIONS = 1 << 26  # bytes, all of a file
 
 
 def most_records(size: int) -> int:
-    """Records that compressed chunks may hold together; one of a recording takes several bytes.
-
-    Parameters
-    ----------
-    size : int
-        Bytes of the file.
-
-    Returns
-    -------
-    int
-        At most this many.
-    """
+    """Records that compressed chunks may hold together; one of a recording takes several bytes."""
     return max(_LEAST_RECORDS, size)
 
 
 def most_inflated(size: int) -> int:
-    """Bytes that compressed chunks may have together when they are decompressed.
-
-    Parameters
-    ----------
-    size : int
-        Bytes of the file.
-
-    Returns
-    -------
-    int
-        At most this many.
-    """
+    """Bytes that compressed chunks may have together when they are decompressed."""
     return max(_LEAST_INFLATED, _LARGEST_RATIO * size)
 
 
 def scan(path: Path) -> Contents:
-    """Walk a file once and note where its messages are.
-
-    Parameters
-    ----------
-    path : Path
-        An MCAP file, whole or cut.
-
-    Returns
-    -------
-    Contents
-        Where its messages are.
-
-    Raises
-    ------
-    BagError
-        The file is not MCAP, or the operating system does not let it be read.
-    """
+    """Walk a file once and note where its messages are."""
     try:
         with open(path, "rb", buffering=1 << 18) as stream:
             size = stream.seek(0, 2)

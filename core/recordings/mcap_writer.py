@@ -47,49 +47,13 @@ def _record(opcode: int, body: bytes) -> bytes:
 
 
 def schema_record(number: int, name: str, encoding: str, data: bytes) -> bytes:
-    """A schema as it is in a file.
-
-    Parameters
-    ----------
-    number : int
-        Its own.
-    name : str
-        Of the type.
-    encoding : str
-        Of the text.
-    data : bytes
-        The text.
-
-    Returns
-    -------
-    bytes
-        With its opcode and its length.
-    """
+    """A schema as it is in a file."""
     body = struct.pack("<H", number) + _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
     return _record(_SCHEMA, body)
 
 
 def channel_record(number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
-    """A channel as it is in a file.
-
-    Parameters
-    ----------
-    number : int
-        Its own.
-    schema : int
-        Number of its schema; 0 for none.
-    topic : str
-        Name of its topic.
-    encoding : str
-        Of its messages.
-    metadata : mapping of str to str
-        Stored with it.
-
-    Returns
-    -------
-    bytes
-        With its opcode and its length.
-    """
+    """A channel as it is in a file."""
     body = struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + _map(metadata)
     return _record(_CHANNEL, body)
 
@@ -111,16 +75,8 @@ def _compressor(name: str | None) -> tuple[str, Callable[[bytes], bytes]]:
 class McapWriter:
     """Records to an open binary file, one after the other; `finish` ends it.
 
-    Parameters
-    ----------
-    stream : binary stream
-        Open for writing; it stays open.
-    library : str
-        Who writes.
-    profile : str, default "ros2"
-        MCAP profile of the file.
-    compression : str, optional
-        Of the chunks made here: zstd, lz4 or "" for none; default zstd where it is installed.
+    `stream`: open for writing; it stays open; `library`: who writes; `profile`: MCAP profile of the file;
+    `compression`: of the chunks made here: zstd, lz4 or "" for none; default zstd where it is installed.
     """
 
     def __init__(self, stream: BinaryIO, library: str, profile: str = "ros2", compression: str | None = None) -> None:
@@ -141,87 +97,28 @@ class McapWriter:
         self._write(MAGIC + _record(_HEADER, _text(profile) + _text(library)))
 
     def metadata(self, name: str, pairs: Mapping[str, str]) -> None:
-        """Add named texts.
-
-        Parameters
-        ----------
-        name : str
-            Of the metadata record.
-        pairs : mapping of str to str
-            Its texts.
-        """
+        """Add named texts."""
         self.copied_metadata(_text(name) + _map(pairs), name)
 
     def channel(self, topic: str, type_name: str, definition: str) -> int:
-        """Declare a topic with CDR messages of a type that is defined as in .msg files.
-
-        Parameters
-        ----------
-        topic : str
-            Its name.
-        type_name : str
-            As package/msg/Name.
-        definition : str
-            Text of the type and of all it uses.
-
-        Returns
-        -------
-        int
-            Number of the channel.
-        """
+        """Declare a topic with CDR messages of a type that is defined as in .msg files."""
         schema, number = max(self._schemas, default=0) + 1, max(self._channels, default=0) + 1
         self.declare_schema(schema, type_name, "ros2msg", definition.encode())
         self.declare_channel(number, schema, topic, "cdr", {})
         return number
 
     def declare_schema(self, number: int, name: str, encoding: str, data: bytes) -> None:
-        """Declare a schema.
-
-        Parameters
-        ----------
-        number : int
-            One that no schema has yet.
-        name : str
-            Of the type.
-        encoding : str
-            Of the text.
-        data : bytes
-            The text.
-        """
+        """Declare a schema."""
         self._schemas[number] = schema_record(number, name, encoding, data)
         self._write(self._schemas[number])
 
     def declare_channel(self, number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> None:
-        """Declare a channel.
-
-        Parameters
-        ----------
-        number : int
-            One that no channel has yet.
-        schema : int
-            Number of its schema; 0 for none.
-        topic : str
-            Name of its topic.
-        encoding : str
-            Of its messages.
-        metadata : mapping of str to str
-            To be stored with it.
-        """
+        """Declare a channel."""
         self._channels[number] = channel_record(number, schema, topic, encoding, metadata)
         self._write(self._channels[number])
 
     def message(self, channel: int, log_time: int, data: bytes) -> None:
-        """Add one message.
-
-        Parameters
-        ----------
-        channel : int
-            Its number.
-        log_time : int
-            Log time, ns, not less than the one before; also the publish time.
-        data : bytes
-            Serialised message.
-        """
+        """Add one message."""
         if not self._parts:
             self._begin_of_chunk = log_time
         self._end_of_chunk = log_time
@@ -241,49 +138,19 @@ class McapWriter:
         span: tuple[int, int],
         packed: tuple[str, bytes] | None = None,
     ) -> None:
-        """Add a chunk of records that stand as they are.
-
-        Parameters
-        ----------
-        records : bytes
-            As they are in the chunk, not compressed.
-        index : mapping of int to bytes
-            Per channel the log time and the place of each of its messages in the records, as `INDEX_ENTRY`.
-        span : (int, int)
-            Smallest and largest log time, ns.
-        packed : (str, bytes), optional
-            The name of a compression, and the records compressed by it.
-        """
+        """Add a chunk of records that stand as they are."""
         self._end_chunk()
         self._write_chunk(records, index, span, packed)
 
     def copied_metadata(self, body: bytes, name: str) -> None:
-        """Add a metadata record.
-
-        Parameters
-        ----------
-        body : bytes
-            Its content.
-        name : str
-            Its name, which is part of the content.
-        """
+        """Add a metadata record."""
         self._end_chunk()
         record = _record(_METADATA, body)
         self._metadata.append(_record(_METADATA_INDEX, struct.pack("<QQ", self._at, len(record)) + _text(name)))
         self._write(record)
 
     def copied_attachment(self, pieces: Iterable[bytes], length: int, head: tuple[int, int, int, str, str]) -> None:
-        """Add an attachment.
-
-        Parameters
-        ----------
-        pieces : iterable of bytes
-            Its content, piece by piece.
-        length : int
-            Bytes of all pieces.
-        head : (int, int, int, str, str)
-            Log time and time of creation, ns, size of its data, its name and its media type.
-        """
+        """Add an attachment."""
         self._end_chunk()
         start = self._at
         self._write(struct.pack("<BQ", _ATTACHMENT, length))
@@ -294,15 +161,7 @@ class McapWriter:
         self._attachments.append(_record(_ATTACHMENT_INDEX, body + _text(name) + _text(media_type)))
 
     def copied_record(self, opcode: int, body: bytes) -> None:
-        """Add a record that no index knows, for example a private one.
-
-        Parameters
-        ----------
-        opcode : int
-            Its kind.
-        body : bytes
-            Its content.
-        """
+        """Add a record that no index knows, for example a private one."""
         self._end_chunk()
         self._write(_record(opcode, body))
 

@@ -51,21 +51,9 @@ class UnreadableError(Exception):
 class MessageReader:
     """Stamp and values of the messages of one topic.
 
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-    paths : sequence of FieldPath
-        Checked against the type.
-    type_fields : callable
-        Type name -> {field name: FieldType}.
-    decode : callable
-        Serialised message -> message; may raise anything where that is not one.
-
-    Attributes
-    ----------
-    decoded : int
-        Messages that fitted no layout.
+    `type_name`: as package/msg/Name; `paths`: checked against the type; `type_fields`: type name -> {field name:
+    FieldType}; `decode`: serialised message -> message; may raise anything where that is not one; `decoded`: messages
+    that fitted no layout.
     """
 
     type_name: str = cython.declare(object, visibility="readonly")
@@ -93,25 +81,7 @@ class MessageReader:
         self._budget = _BUDGET
 
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]]:
-        """Header stamp and one value per path.
-
-        Parameters
-        ----------
-        data : bytes
-            Serialised message.
-
-        Returns
-        -------
-        int or None
-            Stamp, ns; None without a header, or where it is zero.
-        sequence of float
-            Values.
-
-        Raises
-        ------
-        UnreadableError
-            The bytes are no message of the type, or a wanted field cannot be read; says why.
-        """
+        """Header stamp and one value per path."""
         layout: _Layout
         for position, layout in enumerate(self._layouts):
             if (found := layout.read(data)) is not None:

@@ -54,18 +54,8 @@ _KINDS: Mapping[str, Any] = dict.fromkeys(CODES, "number") | {"bool": "bool", "s
 class Definition:
     """How messages of one schema are decoded.
 
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-    types : mapping of str to object
-        Parsed definitions of the type and of all it uses.
-    store : Typestore
-        Where they are registered.
-    reason : str, default ""
-        Why messages cannot be decoded; empty where they can.
-    note : str, default ""
-        What the reader had to add.
+    `type_name`: as package/msg/Name; `types`: parsed definitions of the type and of all it uses; `store`: where they
+    are registered; `reason`: why messages cannot be decoded; empty where they can; `note`: what the reader had to add.
     """
 
     type_name: str
@@ -79,21 +69,6 @@ class Definition:
 
         Text that is no UTF-8, has no closing zero or one before its end, or has not even the length of one, is read as
         the middleware does.
-
-        Parameters
-        ----------
-        data : bytes
-            Serialised message.
-
-        Returns
-        -------
-        object
-            The message.
-
-        Raises
-        ------
-        BagError
-            It does not fit the definition.
         """
         try:
             message = self.decode_strictly(data)
@@ -112,23 +87,7 @@ class Definition:
             raise
 
     def decode_strictly(self, data: bytes) -> Any:
-        """Decode one CDR message whose text is as it should be.
-
-        Parameters
-        ----------
-        data : bytes
-            Serialised message.
-
-        Returns
-        -------
-        object
-            The message.
-
-        Raises
-        ------
-        BagError
-            It does not fit the definition.
-        """
+        """Decode one CDR message whose text is as it should be."""
         try:
             data = _plain(data)
             layout = self.store.get_msgdef(self.type_name)
@@ -145,18 +104,7 @@ class Definition:
         return message
 
     def from_ros1(self, data: bytes) -> bytes:
-        """One message of a ROS 1 bag as ROS 2 has it (`rosbags`); of a definition that `ros2_text` made.
-
-        Parameters
-        ----------
-        data : bytes
-            As in the bag.
-
-        Returns
-        -------
-        bytes
-            CDR; empty where it does not fit the definition, so that `decode` refuses it.
-        """
+        """One message of a ROS 1 bag as ROS 2 has it (`rosbags`); of a definition that `ros2_text` made."""
         if self._endless:
             return b""
         self.store.max_sequence_length = max(1, len(data))
@@ -254,18 +202,7 @@ class Definition:
         return fields if "stamp" in fields and fields["stamp"].type_name == "builtin_interfaces/msg/Time" else {}
 
     def stamp_ns(self, data: bytes) -> int | None:
-        """`header_stamp_ns` of an encoded message, read from its first bytes where the header is there.
-
-        Parameters
-        ----------
-        data : bytes
-            Serialised message.
-
-        Returns
-        -------
-        int or None
-            None where there is no header, the stamp is zero, or the message cannot be decoded.
-        """
+        """`header_stamp_ns` of an encoded message, read from its first bytes where the header is there."""
         if not self.has_header:
             return None
         if not self._header_first:
@@ -283,23 +220,7 @@ class Definition:
         return sec * 1_000_000_000 + nanosec or None
 
     def fields(self, type_name: str) -> Mapping[str, FieldType]:
-        """Fields of a type in this schema.
-
-        Parameters
-        ----------
-        type_name : str
-            As package/msg/Name.
-
-        Returns
-        -------
-        mapping of str to FieldType
-            Field name -> FieldType.
-
-        Raises
-        ------
-        SignalError
-            The type is not in the schema.
-        """
+        """Fields of a type in this schema."""
         if type_name not in self.types:
             raise SignalError(f"{type_name}: not defined with {self.type_name}; check the type")
         return {
@@ -367,18 +288,7 @@ def _plain(data: bytes, wanted: int = _LARGEST_MESSAGE) -> bytes:
 
 
 def normal_name(name: str) -> str:
-    """`pkg/msg/Type` also for `pkg/Type`.
-
-    Parameters
-    ----------
-    name : str
-        Name of a type.
-
-    Returns
-    -------
-    str
-        As package/msg/Name.
-    """
+    """`pkg/msg/Type` also for `pkg/Type`."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
@@ -389,20 +299,6 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
 
     Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it; likewise for
     types that a text uses and does not define.
-
-    Parameters
-    ----------
-    name : str
-        Of the type.
-    encoding : str
-        `ros2msg` or `ros2idl`.
-    text : bytes
-        Of the schema.
-
-    Returns
-    -------
-    Definition
-        Whether it can be used or not.
     """
     type_name = normal_name(name)
     types: dict[str, Any] = {}
@@ -431,38 +327,12 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
 
 
 def jazzy_text(type_name: str) -> str:
-    """Definition of a type of ROS 2 Jazzy and of all it uses, as in .msg files.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-
-    Returns
-    -------
-    str
-        The text.
-    """
+    """Definition of a type of ROS 2 Jazzy and of all it uses, as in .msg files."""
     return str(_jazzy().generate_msgdef(type_name, ros_version=2)[0])
 
 
 def distribution_text(type_name: str, distribution: str) -> tuple[str, str]:
-    """Definition of a type as a distribution of ROS 2 has it, for a recording that holds none.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-    distribution : str
-        For example `humble`; Jazzy is taken for one that is not known.
-
-    Returns
-    -------
-    text : str
-        As `jazzy_text`; empty where the distribution does not have the type.
-    words : str
-        What the distribution is called; empty likewise.
-    """
+    """Definition of a type as a distribution of ROS 2 has it, for a recording that holds none."""
     name = distribution.upper() if f"ROS2_{distribution.upper()}" in Stores.__members__ else "JAZZY"
     store = _store(name)
     if type_name not in store.fielddefs:
@@ -471,20 +341,7 @@ def distribution_text(type_name: str, distribution: str) -> tuple[str, str]:
 
 
 def ros2_text(type_name: str, text: bytes) -> bytes:
-    """A definition in a ROS 1 bag as ROS 2 has it: without constants, and without the number in a header.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-    text : bytes
-        As in the bag.
-
-    Returns
-    -------
-    bytes
-        For `define`, whose messages `Definition.from_ros1` gives; the text itself where it cannot be used.
-    """
+    """A definition in a ROS 1 bag as ROS 2 has it: without constants, and without the number in a header."""
     try:
         if len(text) > _LARGEST_SCHEMA:
             return text
@@ -500,20 +357,7 @@ def ros2_text(type_name: str, text: bytes) -> bytes:
 
 
 def undefined(type_name: str, reason: str) -> Definition:
-    """Definition of something that is not decoded, for the reason given.
-
-    Parameters
-    ----------
-    type_name : str
-        As package/msg/Name.
-    reason : str
-        Why messages are not decoded.
-
-    Returns
-    -------
-    Definition
-        With that reason.
-    """
+    """Definition of something that is not decoded, for the reason given."""
     return Definition(type_name, {}, get_typestore(Stores.EMPTY), reason)
 
 
@@ -542,18 +386,7 @@ def _readable(encoding: str, text: bytes) -> str:
 
 
 def lines_of(text: bytes) -> int:
-    """Count the lines of a schema that are neither empty nor a comment alone; they are what takes time to read.
-
-    Parameters
-    ----------
-    text : bytes
-        The schema's text.
-
-    Returns
-    -------
-    int
-        How many there are.
-    """
+    """Count the lines of a schema that are neither empty nor a comment alone; they are what takes time to read."""
     return len(_LINE.findall(text))
 
 

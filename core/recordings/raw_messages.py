@@ -24,22 +24,10 @@ from uncertain_lti.recordings.message_types import Definition
 class RecordedChannel:
     """A channel as the file describes it: everything needed to write its messages again.
 
-    Parameters
-    ----------
-    topic : str
-        Name of its topic.
-    type : str
-        Message type, `pkg/msg/Type`.
-    encoding : str
-        Of its messages.
-    schema : Schema or None
-        Its record in the file; None without one.
-    metadata : mapping of str to str
-        What the recorder stored of the channel, QoS for example.
-    definition : Definition
-        How its messages are decoded.
-    counted : bool, default False
-        Whether its messages are those of its topic (see `Bag` on topics with several types).
+    `topic`: name of its topic; `type`: message type, `pkg/msg/Type`; `encoding`: of its messages; `schema`: its record
+    in the file; None without one; `metadata`: what the recorder stored of the channel, QoS for example; `definition`:
+    how its messages are decoded; `counted`: whether its messages are those of its topic (see `Bag` on topics with
+    several types).
     """
 
     topic: str
@@ -54,16 +42,8 @@ class RecordedChannel:
 class RawMessage(NamedTuple):
     """One message as recorded.
 
-    Parameters
-    ----------
-    log_time_ns : int
-        Log time, ns.
-    publish_time_ns : int
-        Publish time, ns.
-    data : bytes
-        Serialised message.
-    channel : RecordedChannel
-        What it was recorded on.
+    `log_time_ns`: log time, ns; `publish_time_ns`: publish time, ns; `data`: serialised message; `channel`: what it was
+    recorded on.
     """
 
     log_time_ns: int

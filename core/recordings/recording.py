@@ -27,24 +27,10 @@ from uncertain_lti.signals.field_types import TypeFields
 class TopicInfo:
     """What a recording holds of one topic.
 
-    Parameters
-    ----------
-    topic : str
-        Its name.
-    type : str
-        Message type, `pkg/msg/Type`.
-    count : int
-        Messages that count.
-    encoding : str
-        Of its messages; `cdr` is what can be decoded.
-    readable : bool
-        Whether its messages can be decoded.
-    reason : str
-        Why not, or which of its messages are left out; empty otherwise.
-    first : int or None
-        First log time, ns; None without a message.
-    last : int or None
-        Last log time, ns; None without a message.
+    `topic`: its name; `type`: message type, `pkg/msg/Type`; `count`: messages that count; `encoding`: of its messages;
+    `cdr` is what can be decoded; `readable`: whether its messages can be decoded; `reason`: why not, or which of its
+    messages are left out; empty otherwise; `first`: first log time, ns; None without a message; `last`: last log time,
+    ns; None without a message.
     """
 
     topic: str
@@ -61,23 +47,11 @@ class TopicInfo:
 class TopicFacts:
     """One topic as `uncertain-lti topics` shows it.
 
-    Parameters
-    ----------
-    info : TopicInfo
-        What the recording holds of it.
-    rate : float or None
-        That of the median log-time step, 1/s, or of the mean one where messages come in bursts; None where there is no
-        step or it is 0.
-    largest_gap : float or None
-        Longest log-time step, s; None where there is no step.
-    fields : tuple of str
-        Paths that can be signals; `data[0..99]` means `data[0]` to `data[99]`.
-    stamps : {"none", "usable", "zero", "mixed"}
-        Whether header stamps can be used.
-    stamp_offset : float or None
-        Median of log time less header stamp, s; None without a stamp.
-    bursts : bool, default False
-        Whether messages come in bursts, with most steps far shorter than the mean.
+    `info`: what the recording holds of it; `rate`: that of the median log-time step, 1/s, or of the mean one where
+    messages come in bursts; None where there is no step or it is 0; `largest_gap`: longest log-time step, s; None where
+    there is no step; `fields`: paths that can be signals; `data[0..99]` means `data[0]` to `data[99]`; `stamps`:
+    whether header stamps can be used; `stamp_offset`: median of log time less header stamp, s; None without a stamp;
+    `bursts`: whether messages come in bursts, with most steps far shorter than the mean.
     """
 
     info: TopicInfo
@@ -93,18 +67,9 @@ class TopicFacts:
 class Columns:
     """Messages of some topics in order of arrival.
 
-    Parameters
-    ----------
-    topic : array (messages,) of int
-        Positions in the topics asked for.
-    arrival : array (messages,) of int
-        Log time, ns.
-    stamp : array (messages,) of int
-        Header stamp, ns; -1 for no stamp.
-    values : list of array (messages of the topic, paths)
-        One array per topic.
-    alone : int, default 0
-        Messages that had to be decoded one by one.
+    `topic` (messages,): positions in the topics asked for; `arrival` (messages,): log time, ns; `stamp` (messages,):
+    header stamp, ns; -1 for no stamp; `values` (messages of the topic, paths): one array per topic; `alone`: messages
+    that had to be decoded one by one.
     """
 
     topic: NDArray[np.int64]
@@ -154,99 +119,21 @@ class Recording(Protocol):
         """Warnings so far, and sentences on messages left out by topic; what `restore_notes` takes."""
 
     def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
-        """Set `reading_notes`, for example to those of another process that read the same recording.
-
-        Parameters
-        ----------
-        warnings : sequence of str
-            Sentences.
-        undecoded : mapping of str to str
-            Topic -> sentence on its messages that are left out.
-        """
+        """Set `reading_notes`, for example to those of another process that read the same recording."""
 
     def walk(self) -> None:
         """Read what an index stated from the files themselves."""
 
     def type_fields(self, topic: str) -> TypeFields:
-        """Fields of message types as the topic's own definition has them.
-
-        Parameters
-        ----------
-        topic : str
-            Name of the topic.
-
-        Returns
-        -------
-        callable
-            Type name -> {field name: FieldType}.
-
-        Raises
-        ------
-        BagError
-            The topic is not there or cannot be decoded.
-        """
+        """Fields of message types as the topic's own definition has them."""
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
-        """Decoded messages in order of log time.
-
-        Parameters
-        ----------
-        topics : iterable of str
-            Names.
-
-        Returns
-        -------
-        iterator of (str, int, object)
-            Topic, log time in ns, message.
-
-        Raises
-        ------
-        BagError
-            A topic is not there or cannot be decoded.
-        """
+        """Decoded messages in order of log time."""
 
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
     ) -> Columns:
-        """Numbers at some paths of each topic as arrays: what `FieldPath.read` gives for each of `messages`.
-
-        Parameters
-        ----------
-        topics : sequence of str
-            Names.
-        paths : sequence of sequence of FieldPath
-            Per topic the paths to read.
-        progress : Progress, optional
-            Wraps what goes through the messages, given their number.
-
-        Returns
-        -------
-        Columns
-            In order of arrival.
-
-        Raises
-        ------
-        BagError
-            A topic is not there or cannot be decoded.
-        RepeatedNamesError
-            What a path gives depends on the order of the messages, so that `messages` has to be read.
-        """
+        """Numbers at some paths of each topic as arrays: what `FieldPath.read` gives for each of `messages`."""
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
-        """Rates, gaps, stamps and fields of every topic, for a person who looks for signals.
-
-        Parameters
-        ----------
-        progress : Progress, optional
-            Wraps the messages, given their number.
-
-        Returns
-        -------
-        list of TopicFacts
-            One per topic.
-
-        Raises
-        ------
-        BagError
-            The recording cannot be read any more.
-        """
+        """Rates, gaps, stamps and fields of every topic, for a person who looks for signals."""

@@ -70,10 +70,7 @@ class _DamagedError(Exception):
 class Ros1Bag(Contents):
     """What `scan_ros1` found in a file; offset and size of a block are those of a chunk's data.
 
-    Parameters
-    ----------
-    numbers : dict of int to int, optional
-        Connection in the file -> number of its channel.
+    `numbers`: connection in the file -> number of its channel.
     """
 
     numbers: dict[int, int] = field(default_factory=dict)
@@ -81,25 +78,7 @@ class Ros1Bag(Contents):
     converted: ClassVar[bool] = True
 
     def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
-        """Messages of one chunk as MCAP has them.
-
-        Parameters
-        ----------
-        block : Block
-            Of this file.
-        channels : collection of int, optional
-            Channels that are wanted; default all.
-
-        Returns
-        -------
-        bytes
-            The records.
-
-        Raises
-        ------
-        BagError
-            The file changed, or cannot be read any more.
-        """
+        """Messages of one chunk as MCAP has them."""
         data = stored_bytes(self.path, block)
         records, _ = _inflate(block.compression, data, block.length)
         if len(data) < block.size or len(records) < block.length:
@@ -122,23 +101,7 @@ class Ros1Bag(Contents):
 
 
 def scan_ros1(path: Path) -> Ros1Bag:
-    """Walk a bag once and note where its messages are.
-
-    Parameters
-    ----------
-    path : Path
-        A ROS 1 bag, whole or cut.
-
-    Returns
-    -------
-    Ros1Bag
-        Where its messages are.
-
-    Raises
-    ------
-    BagError
-        It is of another version or encrypted, or the operating system does not let it be read.
-    """
+    """Walk a bag once and note where its messages are."""
     try:
         with open(path, "rb", buffering=1 << 18) as stream:
             size = stream.seek(0, 2)

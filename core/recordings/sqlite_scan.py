@@ -50,10 +50,7 @@ _FEW = 100  # topics that are named to the database one by one
 class Database(Contents):
     """What `scan_database` found in a file; offset and size of a block are its first row and how many numbers it spans.
 
-    Parameters
-    ----------
-    numbers : dict of int to int, optional
-        Topic in the file -> number of its channel.
+    `numbers`: topic in the file -> number of its channel.
     """
 
     numbers: dict[int, int] = field(default_factory=dict)
@@ -61,25 +58,7 @@ class Database(Contents):
     converted: ClassVar[bool] = True
 
     def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
-        """Rows of one block as MCAP messages.
-
-        Parameters
-        ----------
-        block : Block
-            Of this file.
-        channels : collection of int, optional
-            Channels that are wanted; default all.
-
-        Returns
-        -------
-        bytes
-            The records.
-
-        Raises
-        ------
-        BagError
-            The file changed, or cannot be read any more.
-        """
+        """Rows of one block as MCAP messages."""
         kept = {topic: number for topic, number in self.numbers.items() if channels is None or number in channels}
         some = f"topic_id IN ({', '.join(map(str, kept))})" if len(kept) < min(len(self.numbers), _FEW) else "1"
         rows = f"SELECT {_COLUMNS} FROM messages NOT INDEXED WHERE id >= ? AND id < ? AND {some} ORDER BY id"
@@ -97,23 +76,7 @@ class Database(Contents):
 
 
 def scan_database(path: Path) -> Database:
-    """Go through a database once and note where its messages are.
-
-    Parameters
-    ----------
-    path : Path
-        A rosbag2 database, whole or damaged.
-
-    Returns
-    -------
-    Database
-        Where its messages are.
-
-    Raises
-    ------
-    BagError
-        It is no recording, or the operating system does not let it be read.
-    """
+    """Go through a database once and note where its messages are."""
     try:
         found = Database(path, path.stat().st_size)
     except OSError as error:

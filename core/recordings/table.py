@@ -42,18 +42,7 @@ _SECOND = 10**9
 
 
 def is_table(path: Path) -> bool:
-    """Whether a path names a table, or one run in it (`runs.csv[3]`).
-
-    Parameters
-    ----------
-    path : Path
-        The path, there or not.
-
-    Returns
-    -------
-    bool
-        By its suffix alone.
-    """
+    """Whether a path names a table, or one run in it (`runs.csv[3]`)."""
     return _file_and_run(path)[0].suffix.lower() in TABLES and not path.is_dir()
 
 
@@ -64,21 +53,8 @@ class Table:
     decide. Rows without a time are left out. A column is a field of the topic `/table`, by its name with everything but
     letters, digits and underscores replaced; a matrix is an array.
 
-    Parameters
-    ----------
-    path : Path
-        File; with `[run]` behind it, one run in it.
-    parts : sequence of Path, optional
-        Its file, where that is known.
-    indexed : bool, default False
-        As for every format; a table has no index.
-    layout : TableLayout, optional
-        Which columns are time and run.
-
-    Raises
-    ------
-    BagError
-        The file is no table, or has no time.
+    `path`: file; with `[run]` behind it, one run in it; `parts`: its file, where that is known; `indexed`: as for every
+    format; a table has no index; `layout`: which columns are time and run.
     """
 
     indexed = False
@@ -99,25 +75,7 @@ class Table:
 
     @classmethod
     def every_run(cls, path: Path, layout: TableLayout | None = None) -> list[Table]:
-        """Every run of a file; the file itself where the layout names no column for them.
-
-        Parameters
-        ----------
-        path : Path
-            As for `Table`.
-        layout : TableLayout, optional
-            Likewise.
-
-        Returns
-        -------
-        list of Table
-            In order of their first rows.
-
-        Raises
-        ------
-        BagError
-            As `Table`.
-        """
+        """Every run of a file; the file itself where the layout names no column for them."""
         layout = layout or TableLayout()
         file, run = _file_and_run(path)
         if run is not None or layout.runs is None:
@@ -185,38 +143,14 @@ class Table:
         return list(self._warnings), {}
 
     def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
-        """Set `reading_notes`.
-
-        Parameters
-        ----------
-        warnings : sequence of str
-            Sentences.
-        undecoded : mapping of str to str
-            Of no meaning here.
-        """
+        """Set `reading_notes`."""
         self._warnings = list(warnings)
 
     def walk(self) -> None:
         """Do nothing: there is no index."""
 
     def type_fields(self, topic: str) -> TypeFields:
-        """Columns as fields.
-
-        Parameters
-        ----------
-        topic : str
-            `/table`.
-
-        Returns
-        -------
-        callable
-            Type name -> {field name: FieldType}.
-
-        Raises
-        ------
-        BagError
-            It is another topic.
-        """
+        """Columns as fields."""
         self._require([topic])
         fields = {name: _field_type(column) for name, column in self.columns_by_field.items()}
 
@@ -228,23 +162,7 @@ class Table:
         return of
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
-        """Rows, one after the other.
-
-        Parameters
-        ----------
-        topics : iterable of str
-            `/table`.
-
-        Returns
-        -------
-        iterator of (str, int, object)
-            Topic, time in ns, row.
-
-        Raises
-        ------
-        BagError
-            It is another topic.
-        """
+        """Rows, one after the other."""
         if not self._require(topics):
             return iter(())
         names, columns = list(self.columns_by_field), list(self.columns_by_field.values())
@@ -256,27 +174,7 @@ class Table:
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
     ) -> Columns:
-        """Numbers at some paths.
-
-        Parameters
-        ----------
-        topics : sequence of str
-            `/table`.
-        paths : sequence of sequence of FieldPath
-            Columns.
-        progress : Progress, optional
-            Wraps the rows, given their number.
-
-        Returns
-        -------
-        Columns
-            In order of the file.
-
-        Raises
-        ------
-        BagError
-            It is another topic.
-        """
+        """Numbers at some paths."""
         self._require(topics)
         number = len(self.times)
         if not topics:
@@ -292,18 +190,7 @@ class Table:
         return Columns(np.zeros(number, dtype=np.int64), self.times, none, [values])
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
-        """Rate, gaps and columns.
-
-        Parameters
-        ----------
-        progress : Progress, optional
-            Of no use here.
-
-        Returns
-        -------
-        list of TopicFacts
-            Of the one topic.
-        """
+        """Rate, gaps and columns."""
         steps = np.diff(self.times)
         step = float(np.median(steps)) if len(steps) else 0.0
         fields = []

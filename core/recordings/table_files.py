@@ -47,14 +47,9 @@ Column = NDArray[Any]
 class RawTable:
     """What a file holds.
 
-    Parameters
-    ----------
-    columns : mapping of str to array
-        By the names in the file, in their order.
-    notes : list of str, optional
-        What was left out or changed, each a part of a sentence.
-    exact : callable, optional
-        Takes the name of a column of numbers, and returns the text of its cells; None where there is no text.
+    `columns`: by the names in the file, in their order; `notes`: what was left out or changed, each a part of a
+    sentence; `exact`: takes the name of a column of numbers, and returns the text of its cells; None where there is no
+    text.
     """
 
     columns: Mapping[str, Column]
@@ -63,23 +58,7 @@ class RawTable:
 
 
 def read_table(path: Path) -> RawTable:
-    """Read a file by its suffix.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    RawTable
-        Its columns, of one length.
-
-    Raises
-    ------
-    BagError
-        It is not what its suffix says, holds no table, or takes a package that is not installed.
-    """
+    """Read a file by its suffix."""
     try:
         if not path.stat().st_size:
             raise BagError(f"{path}: the file is empty; record or copy it again")

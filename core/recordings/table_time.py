@@ -43,46 +43,13 @@ _INEXACT = 10**15  # ns, above which a float of seconds does not keep each
 
 
 def field_name(column: str) -> str:
-    """Name of a column as a field path takes it: `Speed [rpm]` is `Speed_rpm`.
-
-    Parameters
-    ----------
-    column : str
-        As in the file.
-
-    Returns
-    -------
-    str
-        Letters, digits and underscores.
-    """
+    """Name of a column as a field path takes it: `Speed [rpm]` is `Speed_rpm`."""
     name = re.sub(r"\W+", "_", column).strip("_") or "column"
     return name if re.match(r"[A-Za-z_]", name) else f"c_{name}"
 
 
 def find_column(path: object, wanted: str, columns: Sequence[str], what: str) -> str:
-    """Find a column by its name in the file or as a field.
-
-    Parameters
-    ----------
-    path : object
-        The file, for the error.
-    wanted : str
-        The name.
-    columns : sequence of str
-        Names in the file.
-    what : str
-        What it is wanted for, for the error.
-
-    Returns
-    -------
-    str
-        The name in the file.
-
-    Raises
-    ------
-    BagError
-        There is none.
-    """
+    """Find a column by its name in the file or as a field."""
     for name in columns:
         if wanted in (name, field_name(name)):
             return name
@@ -95,28 +62,7 @@ def find_column(path: object, wanted: str, columns: Sequence[str], what: str) ->
 def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, NDArray[np.int64], str]:
     """Instants of the rows.
 
-    Parameters
-    ----------
-    path : object
-        The file, for errors.
-    table : RawTable
-        Its columns.
-    layout : TableLayout
-        What the signals file says.
-
-    Returns
-    -------
-    column : str
-        Name of the time column in the file.
-    times : array (rows,) of int
-        ns; `NO_TIME` where a row has none.
-    words : str
-        How the time was found, where the layout does not say so; else empty.
-
-    Raises
-    ------
-    BagError
-        No column is a time, or its cells are none.
+    Returns (rows,): ns; `NO_TIME` where a row has none.
     """
     names = list(table.columns)
     words = ""

@@ -28,23 +28,6 @@ def topic_facts(topics: Mapping[str, TopicInfo], messages: Iterable[RawMessage])
     """Facts about every topic of a recording; reads its messages once, and decodes one of each topic.
 
     Field paths are taken from the longest message of a topic, so that its arrays have their lengths.
-
-    Parameters
-    ----------
-    topics : mapping of str to TopicInfo
-        Topics of the recording.
-    messages : iterable of RawMessage
-        All of its messages.
-
-    Returns
-    -------
-    list of TopicFacts
-        One per topic.
-
-    Raises
-    ------
-    BagError
-        The recording cannot be read any more.
     """
     times: dict[str, array[int]] = {topic: array("Q") for topic in topics}
     offsets: dict[str, array[float]] = {topic: array("d") for topic in topics}
@@ -94,23 +77,6 @@ def _facts(
 
 
 def usual_step(middle: float, span: float, steps: int) -> tuple[float, bool]:
-    """Step that a topic's rate is that of: the median one, or the mean where most messages come in bursts.
-
-    Parameters
-    ----------
-    middle : float
-        Median step, ns.
-    span : float
-        From the first message to the last, ns.
-    steps : int
-        Number of steps.
-
-    Returns
-    -------
-    step : float
-        ns.
-    bursts : bool
-        Whether it is the mean one, as the median is less than a tenth of it.
-    """
+    """Step that a topic's rate is that of: the median one, or the mean where most messages come in bursts."""
     mean = span / steps
     return (mean, True) if 0 <= middle * _BURSTS < mean else (middle, False)

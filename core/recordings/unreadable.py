@@ -25,20 +25,7 @@ TABLES = (".csv", ".tsv", ".parquet", ".feather", ".mat", ".npz")
 
 
 def not_mcap(path: Path, head: bytes) -> BagError:
-    """The error that says what a file is whose first bytes are not those of MCAP.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    head : bytes
-        Its first bytes.
-
-    Returns
-    -------
-    BagError
-        To be raised.
-    """
+    """The error that says what a file is whose first bytes are not those of MCAP."""
     if not head:
         return BagError(f"{path}: the file is empty; record or copy it again")
     if MAGIC.startswith(head):
@@ -71,18 +58,7 @@ def not_mcap(path: Path, head: bytes) -> BagError:
 
 
 def missing(path: Path) -> BagError:
-    """The error for a path that is not there; names the recordings in the same folder.
-
-    Parameters
-    ----------
-    path : Path
-        The path.
-
-    Returns
-    -------
-    BagError
-        To be raised.
-    """
+    """The error for a path that is not there; names the recordings in the same folder."""
     there: list[Path] = []
     if path.parent.is_dir():
         there = sorted((p for p in path.parent.iterdir() if p.suffix in (*SUFFIXES, *TABLES)), key=natural)
@@ -91,20 +67,7 @@ def missing(path: Path) -> BagError:
 
 
 def os_error(path: Path, error: OSError) -> BagError:
-    """One sentence for a file that the operating system does not hand out.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    error : OSError
-        What the operating system raised.
-
-    Returns
-    -------
-    BagError
-        To be raised.
-    """
+    """One sentence for a file that the operating system does not hand out."""
     if isinstance(error, PermissionError):
         return BagError(f"{path}: no permission to read it; let its owner allow it with chmod +r")
     if isinstance(error, FileNotFoundError):
@@ -120,20 +83,7 @@ def _compressed(path: Path) -> BagError:
 
 
 def no_recording(folder: Path, inside: list[Path]) -> BagError:
-    """The error for a folder without a recording; says what is in it instead.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder.
-    inside : list of Path
-        What is in it.
-
-    Returns
-    -------
-    BagError
-        To be raised.
-    """
+    """The error for a folder without a recording; says what is in it instead."""
     for part in inside:
         if part.name.endswith(tuple(f"{suffix}.{zstd}" for suffix in SUFFIXES for zstd in ("zstd", "zst"))):
             return _compressed(part)
@@ -148,18 +98,5 @@ def no_recording(folder: Path, inside: list[Path]) -> BagError:
 
 
 def file_names(paths: list[Path], limit: int = 12) -> str:
-    """Names of files in one sentence.
-
-    Parameters
-    ----------
-    paths : list of Path
-        The files.
-    limit : int, default 12
-        Names at most.
-
-    Returns
-    -------
-    str
-        Names, and how many more there are.
-    """
+    """Names of files in one sentence."""
     return shortlist([path.name for path in paths], limit)

@@ -25,20 +25,7 @@ _MOST = 6
 
 
 def envelope_text(recording: Mapping[str, Any], states: Sequence[str]) -> str:
-    """What is seen of a recording between its bounds.
-
-    Parameters
-    ----------
-    recording : mapping
-        Of the findings.
-    states : sequence of str
-        Names of the states that are drawn.
-
-    Returns
-    -------
-    str
-        Which of them leave their bounds, how often and when, and the alarms.
-    """
+    """What is seen of a recording between its bounds."""
     if not recording["verdicts"]:
         return "No sample has a verdict."
     bad = sorted((s for s in states if recording["states"][s]["violations"]), key=_violations(recording))
@@ -67,18 +54,7 @@ def _outside(recording: Mapping[str, Any], name: str) -> str:
 
 
 def episode_text(episode: Mapping[str, Any]) -> str:
-    """An episode in a phrase.
-
-    Parameters
-    ----------
-    episode : mapping
-        Of the findings.
-
-    Returns
-    -------
-    str
-        When, how many verdicts were violated, and the alarm.
-    """
+    """An episode in a phrase."""
     first, last = episode["first"]["t"], episode["last"]["t"]
     when = f"at {first:.8g} s" if first == last else f"from {first:.8g} s to {last:.8g} s"
     count = plural(episode["verdicts_violated"], "verdict")
@@ -86,37 +62,13 @@ def episode_text(episode: Mapping[str, Any]) -> str:
 
 
 def beginning_text(episode: Mapping[str, Any]) -> str:
-    """Which states leave their bounds first in an episode.
-
-    Parameters
-    ----------
-    episode : mapping
-        Of the findings.
-
-    Returns
-    -------
-    str
-        Their names.
-    """
+    """Which states leave their bounds first in an episode."""
     first = [shortened(name) for name, state in episode["states"].items() if state["first"] == episode["first"]["t"]]
     return f"Outside its bounds first: {shortlist(first, _MOST)}."
 
 
 def utilisation_text(recording: Mapping[str, Any], states: Sequence[str]) -> str:
-    """What is seen of the utilisation of a recording.
-
-    Parameters
-    ----------
-    recording : mapping
-        Of the findings.
-    states : sequence of str
-        Names of the states that are drawn.
-
-    Returns
-    -------
-    str
-        The worst utilisation of each violated state.
-    """
+    """What is seen of the utilisation of a recording."""
     bad = sorted((s for s in states if recording["states"][s]["violations"]), key=_violations(recording))
     if not bad:
         return "Every state stays between -1 and 1." if recording["verdicts"] else "No sample has a verdict."
@@ -128,18 +80,7 @@ def utilisation_text(recording: Mapping[str, Any], states: Sequence[str]) -> str
 
 
 def coverage_text(recordings: Sequence[Mapping[str, Any]]) -> str:
-    """What is seen of the violated shares of recordings.
-
-    Parameters
-    ----------
-    recordings : sequence of mapping
-        Of the findings.
-
-    Returns
-    -------
-    str
-        The recordings with the largest shares.
-    """
+    """What is seen of the violated shares of recordings."""
     judged = [r for r in recordings if r["verdicts"]]
     bad = sorted((r for r in judged if r["violated"]), key=lambda r: -r["violated"] / r["verdicts"])
     if not bad:
@@ -153,19 +94,7 @@ def coverage_text(recordings: Sequence[Mapping[str, Any]]) -> str:
 def budget_text(model: UncertainLTI, shares: Any, columns: Sequence[str]) -> str:
     """What is seen of the widths' budget.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-    shares : array (n, columns)
-        Of `width_budget`.
-    columns : sequence of str
-        Names of the columns.
-
-    Returns
-    -------
-    str
-        For each state, what adds most to its width.
+    `shares` (n, columns): of `width_budget`.
     """
     most = [
         f"{shortened(name)} {row.max():.0%} from {shortened(columns[int(row.argmax())])}"
@@ -176,18 +105,7 @@ def budget_text(model: UncertainLTI, shares: Any, columns: Sequence[str]) -> str
 
 
 def matrices_text(model: UncertainLTI) -> str:
-    """What is seen of the matrices of a model without a schedule.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    str
-        Its largest element and half-width, and how many elements have no known sign.
-    """
+    """What is seen of the matrices of a model without a schedule."""
     nominal, half, columns = elements(model)
     nominal, half = (values[:, : model.n + model.m] for values in (nominal, half))
     parts = []

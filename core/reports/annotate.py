@@ -59,18 +59,9 @@ _SMALL = 1 << 18  # bytes of verdicts that wait for more
 class Annotated:
     """What `annotate` wrote.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    messages : int
-        Messages of the recording that were copied.
-    verdicts : int
-        Clock messages with a verdict, or with the reason why there is none.
-    topics : str
-        What the names of the monitor's topics begin with.
-    notes : tuple of str
-        What the reader should know, a sentence each.
+    `path`: the file; `messages`: messages of the recording that were copied; `verdicts`: clock messages with a verdict,
+    or with the reason why there is none; `topics`: what the names of the monitor's topics begin with; `notes`: what the
+    reader should know, a sentence each.
     """
 
     path: Path
@@ -84,24 +75,6 @@ def targets(output: str | os.PathLike[str], bags: Sequence[Recording]) -> list[P
     """Where annotated copies of these recordings go: a file `*.mcap` for one, any other path is a folder.
 
     In a folder, which is made, the copy of `run.mcap` is `run_annotated.mcap`.
-
-    Parameters
-    ----------
-    output : path
-        What the user named.
-    bags : sequence of Recording
-        The recordings.
-
-    Returns
-    -------
-    list of Path
-        One path per recording, none of which exists.
-
-    Raises
-    ------
-    BagError
-        A recording is a table; or a file would take the place of another one or lie among the parts of a recording, or
-        is one for several.
     """
     path = Path(output)
     for bag in bags:
@@ -147,40 +120,7 @@ def annotate(
     rule: AlarmRule | None = None,
     progress: Progress | None = None,
 ) -> Annotated:
-    """Write a copy of a recording with the verdicts added; block by block, whatever its size.
-
-    Parameters
-    ----------
-    parts : iterable of path
-        Files of the recording in order; together they become one file.
-    verdicts : Verdicts
-        Of `EnvelopeMonitor.check`.
-    decisions : Decisions
-        Of the same reading (`reading.read_as_fitted_with_decisions`).
-    output : path
-        MCAP file to write; it gets this name once it is whole.
-    model : UncertainLTI
-        What was checked with, for the record.
-    model_file : path, default ""
-        Its file, for the record.
-    rule : AlarmRule, optional
-        The alarm rule of the check, for the record; default the model's.
-    progress : callable, optional
-        As for `read_transients`.
-
-    Returns
-    -------
-    Annotated
-        Where topics of the monitor's name are in the recording, as in one of a live monitor, those written here bear
-        another, and a note says so.
-
-    Raises
-    ------
-    BagError
-        A part cannot be read, or the output cannot be written.
-    ModelError
-        A state's name cannot be sent.
-    """
+    """Write a copy of a recording with the verdicts added; block by block, whatever its size."""
     output = Path(output)
     contents = [scan(Path(part)) for part in parts]
     try:

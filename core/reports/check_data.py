@@ -48,20 +48,6 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     sample its `regime`, a position in `regimes`. `frozen` and `repeats` have the exact repeats that raised the alarm,
     and others longer than any of the fit, each from its last fresh sample. `explained` says of alarms what they look
     like.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model checked with.
-    verdicts : Verdicts
-        Of `EnvelopeMonitor.check`.
-    samples : bool, default True
-        Whether a verdict per sample is among it.
-
-    Returns
-    -------
-    dict
-        Plain data for JSON.
     """
     transient = verdicts.transient
     t = transient.t_ns
@@ -246,18 +232,7 @@ def _horizons(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
 
 
 def outcome(recordings: Sequence[dict[str, Any]]) -> str:
-    """The outcome of several recordings: the first of OUTCOMES that one of them has.
-
-    Parameters
-    ----------
-    recordings : sequence of dict
-        Of `check_data`.
-
-    Returns
-    -------
-    str
-        One of OUTCOMES.
-    """
+    """The outcome of several recordings: the first of OUTCOMES that one of them has."""
     return next(o for o in OUTCOMES if o == OUTCOMES[-1] or any(r["outcome"] == o for r in recordings))
 
 

@@ -25,18 +25,7 @@ MOST_LIKENESSES = 3
 
 
 def check_text(data: dict[str, Any]) -> str:
-    """Summary of `check_data` for a person.
-
-    Parameters
-    ----------
-    data : dict
-        Of `check_data`.
-
-    Returns
-    -------
-    str
-        A table in recorded units, and when the alarm was raised.
-    """
+    """Summary of `check_data` for a person."""
     rows = []
     for name, s in data["states"].items():
         longest = s["longest_violation"]
@@ -89,18 +78,7 @@ def check_text(data: dict[str, Any]) -> str:
 
 
 def repeats_text(data: Mapping[str, Any]) -> list[str]:
-    """What `check_data` has of frozen states, and of other long repeats.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `check_data`.
-
-    Returns
-    -------
-    list of str
-        Lines without a full stop.
-    """
+    """What `check_data` has of frozen states, and of other long repeats."""
     lines = [f"FROZEN: {r['text']}, {r['why']}" for r in data["frozen"][:MOST_REPEATS]]
     if (more := len(data["frozen"]) - MOST_REPEATS) > 0:
         lines.append(f"  and {plural(more, 'more frozen repeat')}; --json has all")
@@ -113,18 +91,7 @@ def repeats_text(data: Mapping[str, Any]) -> list[str]:
 
 
 def likeness_text(data: Mapping[str, Any]) -> list[str]:
-    """What `check_data` says of alarms: what they look like, and where they point to.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `check_data`.
-
-    Returns
-    -------
-    list of str
-        Lines without a full stop; none if nothing can be said.
-    """
+    """What `check_data` says of alarms: what they look like, and where they point to."""
     told = [like for like in data["explained"] if like["text"]]
     lines = [f"the alarm from {like['t']:.4f} s {like['text']}" for like in told[:MOST_LIKENESSES]]
     return lines + [f"  and {plural(len(told) - len(lines), 'more alarm')}; --json has all"] * (len(told) > len(lines))

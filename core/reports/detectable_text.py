@@ -47,18 +47,7 @@ SHOWN = 6
 
 
 def detectable_data(validation: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The section on detectable faults of a model's validation, if it is one.
-
-    Parameters
-    ----------
-    validation : mapping
-        Of the model file.
-
-    Returns
-    -------
-    dict or None
-        As `Detectable.to_dict` makes it; None where there is none, or another program wrote something else.
-    """
+    """The section on detectable faults of a model's validation, if it is one."""
     try:
         data = validation["detectable"]
         faults = [
@@ -100,20 +89,7 @@ def _real(value: Any) -> float | None:
 
 
 def size_text(fault: Mapping[str, Any], interval: bool = True) -> str:
-    """The smallest detectable size of one fault.
-
-    Parameters
-    ----------
-    fault : mapping
-        Of `detectable_data`.
-    interval : bool, default True
-        Whether its interval follows.
-
-    Returns
-    -------
-    str
-        `7.5 (6.2 to 8.6)`, or how much of the largest is seen.
-    """
+    """The smallest detectable size of one fault."""
     if fault["refused"]:
         return "unknown"
     if fault["size"] is None:
@@ -134,18 +110,7 @@ def _size(fault: Mapping[str, Any], value: float | None) -> str:
 
 
 def detectable_tables(data: Mapping[str, Any]) -> list[tuple[tuple[str, ...], list[list[str]]]]:
-    """Tables of the smallest detectable faults.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `detectable_data`.
-
-    Returns
-    -------
-    list of (header, rows)
-        A row for each signal; none for kinds that were not looked for.
-    """
+    """Tables of the smallest detectable faults."""
     found = []
     for of, kinds in COLUMNS:
         faults = [f for f in data["faults"] if f["kind"] in kinds]
@@ -164,18 +129,7 @@ def detectable_tables(data: Mapping[str, Any]) -> list[tuple[tuple[str, ...], li
 
 
 def condition_text(data: Mapping[str, Any]) -> str:
-    """What the sizes hold for.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `detectable_data`.
-
-    Returns
-    -------
-    str
-        A clause.
-    """
+    """What the sizes hold for."""
     out = data["left_out"]
     without = f"; {plural(out, 'case')} with an alarm without a fault left out" if out else ""
     return (
@@ -186,18 +140,7 @@ def condition_text(data: Mapping[str, Any]) -> str:
 
 
 def detectable_text(data: Mapping[str, Any]) -> list[str]:
-    """What `validate` prints of them.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `detectable_data`.
-
-    Returns
-    -------
-    list of str
-        Lines and tables.
-    """
+    """What `validate` prints of them."""
     if data["refused"]:
         return [f"which faults are seen is not known: {data['refused']}"]
     lines = [condition_text(data)]
@@ -207,18 +150,7 @@ def detectable_text(data: Mapping[str, Any]) -> list[str]:
 
 
 def detectable_words(data: Mapping[str, Any]) -> list[str]:
-    """A short clause for each state and control, those of a first screen.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `detectable_data`.
-
-    Returns
-    -------
-    list of str
-        `fan_speed: off by 7.5 rpm, drifts by 60 rpm/s`, for example.
-    """
+    """A short clause for each state and control, those of a first screen."""
     words = []
     for signal in dict.fromkeys(f["signal"] for f in data["faults"] if f["of"] != "dynamics"):
         parts = []

@@ -36,20 +36,7 @@ LONGEST_NAME = 34
 
 
 def new_figure(width: float, height: float) -> Any:
-    """An empty figure that no window shows.
-
-    Parameters
-    ----------
-    width : float
-        Inches.
-    height : float
-        Inches.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Without axes.
-    """
+    """An empty figure that no window shows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -72,17 +59,7 @@ def _png(figure: Any) -> bytes:
 def between_rows(figure: Any, image: NDArray[np.uint8]) -> list[int]:
     """Where an image of a figure can be cut between two rows of its panels.
 
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        The figure.
-    image : array (height, width, 3) of uint8
-        Its pixels.
-
-    Returns
-    -------
-    list of int
-        Rows of pixels from the top, each in the middle of the widest blank stripe between two rows of panels.
+    `image` (height, width, 3): its pixels.
     """
     spans = sorted((axis.get_position().y0, axis.get_position().y1) for axis in figure.axes)
     joined: list[tuple[float, float]] = []
@@ -106,17 +83,7 @@ def between_rows(figure: Any, image: NDArray[np.uint8]) -> list[int]:
 def elements(model: UncertainLTI) -> tuple[Array, Array, list[str]]:
     """Elements of A and B side by side, with what the model has of drift and noise.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    nominal, half : array (n, columns), or (R, n, columns) with a schedule
-        Nominal elements and half-widths.
-    columns : list of str
-        What each column multiplies.
+    Returns (n, columns): nominal elements and half-widths.
     """
     nominal, half = [model.A, model.B], [model.dA, model.dB]
     columns = [short(name) for name in (*model.state_names, *model.control_names)]
@@ -129,64 +96,21 @@ def elements(model: UncertainLTI) -> tuple[Array, Array, list[str]]:
 
 
 def brief(value: float) -> str:
-    """A number in few letters.
-
-    Parameters
-    ----------
-    value : float
-        Any.
-
-    Returns
-    -------
-    str
-        Three digits, or one with an exponent.
-    """
+    """A number in few letters."""
     if 1e-3 <= abs(value) < 1e4:
         return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
     return f"{value:.0e}".replace("e-0", "e-").replace("e+0", "e")
 
 
 def patch(colour: str, alpha: float, label: str) -> Any:
-    """Entry of a legend for an area.
-
-    Parameters
-    ----------
-    colour : str
-        Of the area.
-    alpha : float
-        Its opacity.
-    label : str
-        What it means.
-
-    Returns
-    -------
-    matplotlib.patches.Patch
-        The entry.
-    """
+    """Entry of a legend for an area."""
     from matplotlib.patches import Patch
 
     return Patch(facecolor=colour, alpha=alpha, label=label, edgecolor="#999999", linewidth=0.3)
 
 
 def line(colour: Any, label: str, marker: str = "", edge: str | None = None) -> Any:
-    """Entry of a legend for a line, or for a mark.
-
-    Parameters
-    ----------
-    colour : str or tuple
-        Of the line.
-    label : str
-        What it means.
-    marker : str, default ""
-        The mark, in place of a line.
-    edge : str, optional
-        Colour of the edge of the mark; default its own.
-
-    Returns
-    -------
-    matplotlib.lines.Line2D
-        The entry.
-    """
+    """Entry of a legend for a line, or for a mark."""
     from matplotlib.lines import Line2D
 
     width = 0 if marker else 1
@@ -194,47 +118,17 @@ def line(colour: Any, label: str, marker: str = "", edge: str | None = None) -> 
 
 
 def no_ticks() -> Any:
-    """No ticks on an axis.
-
-    Returns
-    -------
-    matplotlib.ticker.NullLocator
-        For `set_minor_locator`.
-    """
+    """No ticks on an axis."""
     from matplotlib.ticker import NullLocator
 
     return NullLocator()
 
 
 def plain(text: str) -> str:
-    """Text of a file, which is never a formula and never a line break.
-
-    Parameters
-    ----------
-    text : str
-        Any.
-
-    Returns
-    -------
-    str
-        For matplotlib.
-    """
+    """Text of a file, which is never a formula and never a line break."""
     return " ".join(text.split()).replace("$", r"\$")
 
 
 def short(text: str, longest: int = LONGEST_NAME) -> str:
-    """A name of a file, with its middle left out where it is long.
-
-    Parameters
-    ----------
-    text : str
-        Any.
-    longest : int, default LONGEST_NAME
-        Letters at most.
-
-    Returns
-    -------
-    str
-        For matplotlib.
-    """
+    """A name of a file, with its middle left out where it is long."""
     return plain(shortened(" ".join(text.split()), longest))

@@ -28,17 +28,7 @@ PIXELS = 1200
 def forward(t: Array) -> tuple[Array, int]:
     """Times that never go back: after a step back the next pass follows the one before.
 
-    Parameters
-    ----------
-    t : array (samples,)
-        Times, s.
-
-    Returns
-    -------
-    array (samples,)
-        The same, or counted from 0 where there is a step back, s.
-    int
-        Steps back.
+    `t` (samples,): times, s; Returns (samples,): the same, or counted from 0 where there is a step back, s.
     """
     steps = np.diff(t)
     loops = int((steps < 0).sum())
@@ -52,10 +42,7 @@ def forward(t: Array) -> tuple[Array, int]:
 class TimeAxis:
     """Time axis of a recording: s since the first sample; the passes of a looped one follow each other.
 
-    Parameters
-    ----------
-    transient : Transient
-        The recording.
+    `transient`: the recording.
     """
 
     def __init__(self, transient: Transient) -> None:
@@ -71,22 +58,10 @@ class TimeAxis:
 class DrawnColumns:
     """What of a recording is drawn: its samples, or stretches of time with all of their samples.
 
-    Parameters
-    ----------
-    t : array (P,)
-        Where each is drawn, s.
-    starts : array (P,) of int
-        First sample of each.
-    stop : int
-        End of the last one.
-    binned : bool
-        Whether they are stretches of time, not samples.
-    judged, alarm : array (P,) of bool
-        Whether any of its samples has a verdict, and an alarm.
-    after : array (P,) of bool
-        Whether something lies between it and the one before.
-    edges : array (P, 2)
-        Begin and end of each, s.
+    `t` (P,): where each is drawn, s; `starts` (P,): first sample of each; `stop`: end of the last one; `binned`:
+    whether they are stretches of time, not samples; `judged, alarm` (P,): whether any of its samples has a verdict, and
+    an alarm; `after` (P,): whether something lies between it and the one before; `edges` (P, 2): begin and end of each,
+    s.
     """
 
     t: Array
@@ -102,21 +77,7 @@ class DrawnColumns:
     def of(cls, verdicts: Verdicts, t: Array, span: tuple[float, float] | None, always: bool = False) -> DrawnColumns:
         """Choose what is drawn of a recording.
 
-        Parameters
-        ----------
-        verdicts : Verdicts
-            The recording with its verdicts.
-        t : array (samples,)
-            Times, s, of its `TimeAxis`.
-        span : (float, float) or None
-            Begin and end of the part that is drawn, s; None for all of it.
-        always : bool, default False
-            Draw stretches of time even if every sample has room.
-
-        Returns
-        -------
-        DrawnColumns
-            Samples, or at most `PIXELS` stretches.
+        `t` (samples,): times, s, of its `TimeAxis`.
         """
         first, stop = 0, len(t)
         if span is not None:
@@ -150,23 +111,9 @@ class DrawnColumns:
     ) -> DrawnColumns:
         """Every sample if there are few; else stretches of samples, and every sample around some instants.
 
-        Parameters
-        ----------
-        t : array (samples,)
-            Times, s, of a `TimeAxis`.
-        segment : array (samples,) of int
-            Changes where two samples are not joined.
-        judged, alarm : array (samples,) of bool
-            Whether a sample has a verdict, and an alarm.
-        near : array (samples,) of bool
-            Instants that are worth every sample around them.
-        most : int
-            Stretches at most, more or less: one more begins at each change of the segment.
-
-        Returns
-        -------
-        DrawnColumns
-            In order of time.
+        `t` (samples,): times, s, of a `TimeAxis`; `segment` (samples,): changes where two samples are not joined;
+        `judged, alarm` (samples,): whether a sample has a verdict, and an alarm; `near` (samples,): instants that are
+        worth every sample around them.
         """
         count = len(t)
         broken = np.zeros(count, dtype=bool)
@@ -193,30 +140,14 @@ class DrawnColumns:
     def least(self, values: Array) -> Array:
         """Least value of each.
 
-        Parameters
-        ----------
-        values : array (samples,)
-            One value per sample of the recording.
-
-        Returns
-        -------
-        array (P,)
-            NaN only if there is no other value.
+        `values` (samples,): one value per sample of the recording; Returns (P,): naN only if there is no other value.
         """
         return self._reduced(np.fmin, values)
 
     def greatest(self, values: Array) -> Array:
         """Greatest value of each.
 
-        Parameters
-        ----------
-        values : array (samples,)
-            One value per sample of the recording.
-
-        Returns
-        -------
-        array (P,)
-            NaN only if there is no other value.
+        `values` (samples,): one value per sample of the recording; Returns (P,): naN only if there is no other value.
         """
         return self._reduced(np.fmax, values)
 
@@ -229,23 +160,8 @@ class DrawnColumns:
     def worst(self, verdicts: Verdicts, state: int, values: Array) -> tuple[Array, Array, Array]:
         """The worst sample of each in which a state is violated.
 
-        Parameters
-        ----------
-        verdicts : Verdicts
-            The recording with its verdicts.
-        state : int
-            Position of the state.
-        values : array (samples,)
-            The state.
-
-        Returns
-        -------
-        t : array (v,)
-            Where each is drawn, s.
-        values : array (v,)
-            Value of the worst sample.
-        utilisation : array (v,)
-            Its utilisation.
+        `values` (samples,): the state; Returns (v,): where each is drawn, s; Returns (v,): value of the worst sample;
+        Returns (v,): its utilisation.
         """
         flags, utilisation = verdicts.flags[:, state], verdicts.utilisation[:, state]
         bad = np.flatnonzero(self.greatest(flags) == 1.0)
@@ -259,27 +175,13 @@ class DrawnColumns:
     def broken(self, *values: Array) -> list[Array]:
         """Times and values with NaN wherever something lies between.
 
-        Parameters
-        ----------
-        *values : array (P,)
-            What is drawn over the times.
-
-        Returns
-        -------
-        list of array
-            Times, then the values, each with the same NaN inserted.
+        `*values` (P,): what is drawn over the times.
         """
         at = np.flatnonzero(self.after)
         return [np.insert(array, at, np.nan) for array in (self.t, *values)]
 
     def alarms(self) -> list[tuple[float, float]]:
-        """Each stretch of alarm, from the verdict that raised it to the one that ended it.
-
-        Returns
-        -------
-        list of (float, float)
-            Begin and length, s.
-        """
+        """Each stretch of alarm, from the verdict that raised it to the one that ended it."""
         if self.binned:
             return self.spans(self.alarm)
         runs = np.flatnonzero(np.diff(np.concatenate([[False], self.alarm, [False]]).astype(np.int8))).reshape(-1, 2)
@@ -288,15 +190,7 @@ class DrawnColumns:
     def spans(self, which: Mask) -> list[tuple[float, float]]:
         """Each run of what is marked.
 
-        Parameters
-        ----------
-        which : array (P,) of bool
-            What is marked.
-
-        Returns
-        -------
-        list of (float, float)
-            Begin and length, s.
+        `which` (P,): what is marked.
         """
         edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(np.int8))).reshape(-1, 2)
         return [(float(self.edges[a, 0]), float(self.edges[b - 1, 1] - self.edges[a, 0])) for a, b in edges]

@@ -413,17 +413,7 @@ def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) 
 def pixels(figure: Any, dpi: int = 110) -> NDArray[np.uint8]:
     """Draw a figure.
 
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        Of this module.
-    dpi : int, default 110
-        Dots per inch; a figure's size is in inches.
-
-    Returns
-    -------
-    array (height, width, 3) of uint8
-        Red, green and blue.
+    Returns (height, width, 3): red, green and blue.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names may be in any script

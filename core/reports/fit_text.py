@@ -27,18 +27,7 @@ from uncertain_lti.sampling.transient import Transient
 
 
 def recording_text(transient: Transient) -> str:
-    """One recording: what was read, and what of it is not used.
-
-    Parameters
-    ----------
-    transient : Transient
-        The recording.
-
-    Returns
-    -------
-    str
-        One line.
-    """
+    """One recording: what was read, and what of it is not used."""
     usable = int(transient.usable.sum())
     span = float(np.ptp(transient.t_ns)) * 1e-9 if len(transient) else 0.0
     text = (
@@ -49,20 +38,7 @@ def recording_text(transient: Transient) -> str:
 
 
 def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
-    """Summary of a fit: widths compared with what the states do, and what the user should know.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Of `fit`.
-    transients : sequence of Transient
-        What it was fitted to.
-
-    Returns
-    -------
-    str
-        A table in recorded units, and the notes of the fit.
-    """
+    """Summary of a fit: widths compared with what the states do, and what the user should know."""
     facts = model.fit_summary
     criterion = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}[facts["criterion"]]
     steps = [t.transitions() for t in transients]
@@ -99,18 +75,7 @@ def fit_text(model: UncertainLTI, transients: Sequence[Transient]) -> str:
 
 
 def schedule_text(choice: Mapping[str, Any]) -> str:
-    """How the number of knots of one signal was chosen.
-
-    Parameters
-    ----------
-    choice : mapping of str to object
-        One entry of `fit_summary["schedule"]`.
-
-    Returns
-    -------
-    str
-        A table of what was left out, and the choice; its reason is among the notes of the fit.
-    """
+    """How the number of knots of one signal was chosen."""
     rows, refused = [], []
     for c in choice["candidates"]:
         if "refused" in c:
@@ -132,18 +97,7 @@ def schedule_text(choice: Mapping[str, Any]) -> str:
 
 
 def horizons_text(choice: Mapping[str, Any]) -> str:
-    """How the horizons and their half-widths were chosen.
-
-    Parameters
-    ----------
-    choice : mapping of str to object
-        `fit_summary["horizon_choice"]`.
-
-    Returns
-    -------
-    str
-        A table of what was left out; the reason is among the notes of the fit.
-    """
+    """How the horizons and their half-widths were chosen."""
     rows = [
         [
             f"{c['steps']}{' (chosen)' if c['taken'] else ''}",
@@ -168,18 +122,7 @@ def _optimality_gap(facts: Mapping[str, Any]) -> str:
 
 
 def archive_text(model: UncertainLTI) -> str:
-    """Summary of a fit whose transitions were not all in memory.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Of `fit_archive`.
-
-    Returns
-    -------
-    str
-        A table in recorded units.
-    """
+    """Summary of a fit whose transitions were not all in memory."""
     facts = model.fit_summary
     rows = [
         [s.name + (f" [{s.unit}]" if s.unit else ""), number(a), number(b)]
@@ -203,22 +146,7 @@ WIDE = 0.3
 
 
 def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -> str:
-    """What to look at after a fit: the worry that weighs most, and the commands that tell more.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Of `fit`.
-    file : str
-        Its file, as it would be typed.
-    left_out : dict or None
-        What `leave_out_with_fit` returned.
-
-    Returns
-    -------
-    str
-        Lines.
-    """
+    """What to look at after a fit: the worry that weighs most, and the commands that tell more."""
     facts = model.fit_summary
     span = model.domain.x_max - model.domain.x_min
     share = np.asarray(facts["mean_width"]) / np.where(span > 0, span, np.inf)

@@ -102,24 +102,7 @@ nav a { margin-right: 1rem; } a { color: var(--link); }
 def html_report(
     model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any], progress: Progress | None = None
 ) -> str:
-    """The report as one page.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model checked with.
-    checked : sequence of Verdicts
-        One per recording, of `EnvelopeMonitor.check`.
-    facts : mapping
-        What `findings` returned for them.
-    progress : callable, optional
-        Wraps what goes through the sections, given their number.
-
-    Returns
-    -------
-    str
-        HTML with everything in it; no script.
-    """
+    """The report as one page."""
     name = os.path.basename(facts["model"]["file"]) or "model"
     title = f"{name}: may I rely on it, and what happened?"
     makers = [

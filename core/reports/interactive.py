@@ -46,18 +46,9 @@ _FARTHEST = 1000.0  # utilisation that is written
 class Series:
     """Values of one quantity over the times of a recording, as drawn; NaN parts two lines.
 
-    Parameters
-    ----------
-    least : array (P,)
-        Least value of each stretch, or each sample.
-    greatest : array (P,), optional
-        Greatest values; None if every stretch is one sample.
-    lower : array (P,), optional
-        Least lower bounds.
-    upper : array (P,), optional
-        Greatest upper bounds.
-    marked : array (P,), optional
-        The worst violated value of each stretch; NaN where none is.
+    `least` (P,): least value of each stretch, or each sample; `greatest` (P,): greatest values; None if every stretch
+    is one sample; `lower` (P,): least lower bounds; `upper` (P,): greatest upper bounds; `marked` (P,): the worst
+    violated value of each stretch; NaN where none is.
     """
 
     least: Array
@@ -71,24 +62,9 @@ class Series:
 class Panel:
     """One signal.
 
-    Parameters
-    ----------
-    title : str
-        Its name.
-    unit : str
-        Its unit, or empty.
-    time : int
-        Which of the recording's times it is drawn over.
-    values : Series
-        In recorded units.
-    word : str
-        What a single value is called.
-    rank : float, default 0.0
-        Panels with more are shown first.
-    utilisation : Series, optional
-        Where between the bounds it lay.
-    horizons : tuple of Series, default ()
-        The same by each of the recording's horizons.
+    `title`: its name; `unit`: its unit, or empty; `time`: which of the recording's times it is drawn over; `values`: in
+    recorded units; `word`: what a single value is called; `rank`: panels with more are shown first; `utilisation`:
+    where between the bounds it lay; `horizons`: the same by each of the recording's horizons.
     """
 
     title: str
@@ -105,20 +81,9 @@ class Panel:
 class PlottedRecording:
     """One recording as it is plotted.
 
-    Parameters
-    ----------
-    name : str
-        Its name.
-    note : str
-        A sentence below the heading.
-    times : list of array
-        s since the start; panels name one of them by its place.
-    panels : list of Panel
-        Its signals.
-    alarms, silent : list of (float, float)
-        Begin and end of each stretch of alarm, and of each without a verdict, s.
-    horizons : tuple of str, default ()
-        What each of the model's horizons is called.
+    `name`: its name; `note`: A sentence below the heading; `times`: s since the start; panels name one of them by its
+    place; `panels`: its signals; `alarms, silent`: begin and end of each stretch of alarm, and of each without a
+    verdict, s; `horizons`: what each of the model's horizons is called.
     """
 
     name: str
@@ -131,22 +96,7 @@ class PlottedRecording:
 
 
 def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) -> PlottedRecording:
-    """A recording that was checked: states between their bounds, controls, alarms.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model checked with.
-    verdicts : Verdicts
-        Of `EnvelopeMonitor.check`.
-    recordings : int, default 1
-        Recordings that share the page.
-
-    Returns
-    -------
-    PlottedRecording
-        Its panels, in the order of the model's signals.
-    """
+    """A recording that was checked: states between their bounds, controls, alarms."""
     transient = verdicts.transient
     axis = TimeAxis(transient)
     violated = verdicts.violated
@@ -178,37 +128,13 @@ def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) 
 
 
 def horizon_words(model: UncertainLTI) -> tuple[str, ...]:
-    """Each horizon of a model by its steps and, where the model knows its step, its time.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    tuple of str
-        Such as `40 steps (1 s)`.
-    """
+    """Each horizon of a model by its steps and, where the model knows its step, its time."""
     step = model.sampling.dt_median
     return tuple(f"{h} steps" + ("" if step is None else f" ({h * step:.3g} s)") for h in model.steps)
 
 
 def plotted_transient(transient: Transient, recordings: int = 1) -> PlottedRecording:
-    """The signals of a recording, without a model.
-
-    Parameters
-    ----------
-    transient : Transient
-        The recording, with the signals of a signals file.
-    recordings : int, default 1
-        Recordings that share the page.
-
-    Returns
-    -------
-    PlottedRecording
-        Its panels: states, then controls.
-    """
+    """The signals of a recording, without a model."""
     axis = TimeAxis(transient)
     none = np.zeros(len(axis.t), dtype=bool)
     count = transient.x.shape[1] + transient.u.shape[1]
@@ -230,21 +156,7 @@ def plotted_fields(
 ) -> PlottedRecording:
     """Numbers of messages over their time of arrival, without a signals file.
 
-    Parameters
-    ----------
-    name : str
-        Of the recording.
-    fields : sequence of (str, str, array (messages,), array (messages,))
-        Topic, path, time in s and value of each.
-    note : str
-        A sentence below the heading.
-    recordings : int, default 1
-        Recordings that share the page.
-
-    Returns
-    -------
-    PlottedRecording
-        A panel per field.
+    `fields` (messages,): topic, path, time in s and value of each.
     """
     times: list[Array] = []
     panels = []
@@ -259,20 +171,7 @@ def plotted_fields(
 
 
 def interactive_page(title: str, recordings: Sequence[PlottedRecording]) -> str:
-    """The page.
-
-    Parameters
-    ----------
-    title : str
-        Its heading.
-    recordings : sequence of PlottedRecording
-        What is plotted; the reader chooses one.
-
-    Returns
-    -------
-    str
-        HTML with everything in it.
-    """
+    """The page."""
     horizons = max((recording.horizons for recording in recordings), key=len, default=())
     data = {"recordings": [_packed(recording) for recording in recordings]}
     further = "".join(f'<option value="{k}">utilisation, {words}</option>' for k, words in enumerate(horizons))

@@ -40,20 +40,7 @@ def _colour(output: Output) -> str:
 
 
 def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any]:
-    """Layout of Foxglove and Lichtblick: bounds and samples of each state, utilisation, flags, alarm, diagnostics.
-
-    Parameters
-    ----------
-    states : sequence of Signal
-        States of the model (`model.signals.states`).
-    base : str, optional
-        What the names of the topics begin with; default that of the node.
-
-    Returns
-    -------
-    dict
-        The layout, as JSON takes it.
-    """
+    """Layout of Foxglove and Lichtblick: bounds and samples of each state, utilisation, flags, alarm, diagnostics."""
     panels: dict[str, Any] = {}
 
     def panel(kind: str, name: str, title: str, config: dict[str, Any]) -> str:
@@ -119,20 +106,7 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any
 
 
 def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
-    """Layout of PlotJuggler: bounds and samples of each state, utilisation, flags and alarm, in tabs.
-
-    Parameters
-    ----------
-    states : sequence of Signal
-        States of the model (`model.signals.states`).
-    base : str, optional
-        What the names of the topics begin with; default that of the node.
-
-    Returns
-    -------
-    str
-        XML.
-    """
+    """Layout of PlotJuggler: bounds and samples of each state, utilisation, flags and alarm, in tabs."""
     tabs: list[tuple[str, list[tuple[str, list[tuple[str, str]]]]]] = []
     for begin in range(0, len(states), _PAGE):
         page = states[begin : begin + _PAGE]
@@ -176,29 +150,7 @@ def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
 def write_layouts(
     model: UncertainLTI, foxglove: str | None, plotjuggler: str | None, base: str | None = None
 ) -> list[str]:
-    """Write one or both of the layouts, each whole or not at all.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Gives the states.
-    foxglove : path or None
-        JSON file for Foxglove and Lichtblick.
-    plotjuggler : path or None
-        XML file for PlotJuggler.
-    base : str, optional
-        What the names of the topics begin with; default that of the node.
-
-    Returns
-    -------
-    list of str
-        Paths written.
-
-    Raises
-    ------
-    ModelError
-        No file is named, or one cannot be written.
-    """
+    """Write one or both of the layouts, each whole or not at all."""
     wanted = [(foxglove, foxglove_text), (plotjuggler, plotjuggler_layout)]
     if foxglove is None and plotjuggler is None:
         raise ModelError("no layout is asked for; give --foxglove FILE.json, --plotjuggler FILE.xml or both")
@@ -219,20 +171,7 @@ def write_layouts(
 
 
 def foxglove_text(states: Sequence[Signal], base: str = NODE) -> str:
-    """`foxglove_layout` as text.
-
-    Parameters
-    ----------
-    states : sequence of Signal
-        States of the model (`model.signals.states`).
-    base : str, optional
-        What the names of the topics begin with; default that of the node.
-
-    Returns
-    -------
-    str
-        JSON, as a file holds it.
-    """
+    """`foxglove_layout` as text."""
     return json.dumps(foxglove_layout(states, base), indent=1, ensure_ascii=False) + "\n"
 
 

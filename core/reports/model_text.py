@@ -25,18 +25,7 @@ from uncertain_lti.reports.tables import number, table
 
 
 def model_text(model: UncertainLTI) -> str:
-    """Summary of a model file.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    str
-        Signals, matrices in 1/s of normalised quantities, domain, alarm rule and notes.
-    """
+    """Summary of a model file."""
     s, facts = model.sampling, model.fit_summary
     lines = [repr(model)]
     if s.clock:
@@ -88,18 +77,7 @@ def model_text(model: UncertainLTI) -> str:
 
 
 def horizon_widths_text(model: UncertainLTI) -> list[str]:
-    """Widths of the envelopes over several steps.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Of `fit`, or from a file.
-
-    Returns
-    -------
-    list of str
-        A table in recorded units; nothing without horizons.
-    """
+    """Widths of the envelopes over several steps."""
     if not (over := model.fit_summary.get("horizons")):
         return []
     rows = [[str(h["steps"]), number(h["seconds"]), h["widths"], *map(number, h["mean_width_recorded"])] for h in over]
@@ -139,18 +117,7 @@ def _scheduled_text(model: UncertainLTI) -> list[str]:
 
 
 def regimes_text(model: UncertainLTI) -> list[str]:
-    """The regimes of a scheduled model: data, mean widths when fitted, eigenvalues and time constants.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    list of str
-        A heading, tables, and what to know of regimes with little data; empty without a schedule.
-    """
+    """The regimes of a scheduled model: data, mean widths when fitted, eigenvalues and time constants."""
     if model.schedule is None:
         return []
     blocks = block_facts(model)
@@ -186,18 +153,7 @@ def _constant(value: float | None) -> str:
 
 
 def eigenvalues_text(model: UncertainLTI) -> str:
-    """Eigenvalues of A of a model without a schedule in one line.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Without a schedule; `regimes_text` has those of every block.
-
-    Returns
-    -------
-    str
-        Numbers with four digits, 1/s.
-    """
+    """Eigenvalues of A of a model without a schedule in one line."""
     return _eigenvalues([[float(v.real), float(v.imag)] for v in model.eigenvalues()])
 
 
@@ -209,16 +165,5 @@ def _eigenvalues(pairs: Sequence[Sequence[float]]) -> str:
 
 
 def dynamics_text(model: UncertainLTI) -> list[str]:
-    """How fast a fitted model is: eigenvalues in one line, or the regimes of a scheduled model.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    list of str
-        Lines.
-    """
+    """How fast a fitted model is: eigenvalues in one line, or the regimes of a scheduled model."""
     return regimes_text(model) or [f"eigenvalues of A [1/s]: {eigenvalues_text(model)}"]

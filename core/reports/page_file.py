@@ -24,54 +24,14 @@ IMAGES = {".png": b"\x89PNG", ".svg": b"<svg", ".pdf": b"%PDF"}
 
 
 def page_target(output: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Recording]) -> Path | None:
-    """Where the page goes; an older page is replaced, a recording or the model never.
-
-    Parameters
-    ----------
-    output : path or None
-        What the user named; None for no page.
-    model_file : str
-        The model, which is never replaced.
-    bags : sequence of Recording
-        The recordings, which are never replaced.
-
-    Returns
-    -------
-    Path or None
-        The path, or None if none is asked for.
-
-    Raises
-    ------
-    BagError
-        The place is one of them, or its folder is not there.
-    """
+    """Where the page goes; an older page is replaced, a recording or the model never."""
     if output is None:
         return None
     return _target(Path(output), model_file, bags, holds=b"<html", kind="page", example="report.html")
 
 
 def image_target(output: str | os.PathLike[str], model_file: str, bags: Sequence[Recording]) -> Path:
-    """Where an image goes; an older one of the same format is replaced, a recording or the model never.
-
-    Parameters
-    ----------
-    output : path
-        What the user named, with one of the endings `IMAGES`.
-    model_file : str
-        The model, which is never replaced; empty for none.
-    bags : sequence of Recording
-        The recordings, which are never replaced.
-
-    Returns
-    -------
-    Path
-        The path.
-
-    Raises
-    ------
-    BagError
-        The place is one of them, or its folder is not there.
-    """
+    """Where an image goes; an older one of the same format is replaced, a recording or the model never."""
     path = Path(output)
     return _target(path, model_file, bags, holds=IMAGES[path.suffix], kind="image", example="plot.png")
 
@@ -86,20 +46,7 @@ def _target(path: Path, model_file: str, bags: Sequence[Recording], *, holds: by
 
 
 def write_page(path: str | os.PathLike[str], page: str) -> None:
-    """Write a page, whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-    page : str
-        Its text; what UTF-8 cannot hold is replaced.
-
-    Raises
-    ------
-    BagError
-        The file cannot be written.
-    """
+    """Write a page, whole or not at all."""
     try:
         with whole_file(path) as stream:
             stream.write(page.encode("utf-8", "replace"))

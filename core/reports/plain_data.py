@@ -16,20 +16,7 @@ from typing import Any
 
 
 def numbers_of(value: Any, count: int) -> list[float] | None:
-    """Read numbers from a model file, in which anything may be written.
-
-    Parameters
-    ----------
-    value : object
-        What the file holds.
-    count : int
-        How many numbers are wanted.
-
-    Returns
-    -------
-    list of float or None
-        None if the value is not that.
-    """
+    """Read numbers from a model file, in which anything may be written."""
     if hasattr(value, "tolist"):  # of a model that was not written yet
         value = value.tolist()
     good = isinstance(value, (list, tuple)) and len(value) == count and all(isinstance(v, (int, float)) for v in value)
@@ -37,34 +24,12 @@ def numbers_of(value: Any, count: int) -> list[float] | None:
 
 
 def list_of(value: Any) -> list[Any]:
-    """Read a list from a model file, in which anything may be written.
-
-    Parameters
-    ----------
-    value : object
-        What the file holds.
-
-    Returns
-    -------
-    list
-        Empty if the value is no list.
-    """
+    """Read a list from a model file, in which anything may be written."""
     return list(value) if isinstance(value, (list, tuple)) else []
 
 
 def finite_data(value: Any) -> Any:
-    """Replace numbers that JSON has no text for.
-
-    Parameters
-    ----------
-    value : object
-        Plain data.
-
-    Returns
-    -------
-    object
-        The same with None for NaN and infinity.
-    """
+    """Replace numbers that JSON has no text for."""
     if isinstance(value, dict):
         return {key: finite_data(v) for key, v in value.items()}
     if isinstance(value, (list, tuple)):

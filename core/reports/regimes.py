@@ -31,21 +31,7 @@ _MOST_NAMED = 6
 
 
 def block_facts(model: UncertainLTI) -> list[dict[str, Any]]:
-    """What each block of a scheduled model rests on, and how fast it is.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    list of dict
-        Empty without a schedule. Of each block: `regime` in words; `at`, the value of each scheduling signal, recorded
-        units; `transitions` (None where the file does not say) and `tied_to`, the number of the block whose elements it
-        shares; `known`, whether a recording visited it; `mean_width` and `max_width` when fitted, recorded units, or
-        None; `eigenvalues` of A, 1/s, as pairs; `time_constants`, -1 / real part, s, None for each that does not decay.
-    """
+    """What each block of a scheduled model rests on, and how fast it is."""
     if model.schedule is None:
         return []
     point = model.operating_point
@@ -73,18 +59,7 @@ def block_facts(model: UncertainLTI) -> list[dict[str, Any]]:
 
 
 def blocks_in_words(model: UncertainLTI) -> list[str]:
-    """What a reader should know of the blocks of a scheduled model.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-
-    Returns
-    -------
-    list of str
-        Sentences; empty without a schedule, and where every block has data of its own.
-    """
+    """What a reader should know of the blocks of a scheduled model."""
     if model.schedule is None:
         return []
     found = []
@@ -115,21 +90,7 @@ def _tied(model: UncertainLTI, r: int) -> int:
 
 
 def check_regimes(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
-    """What became of the verdicts in each regime; a verdict belongs to the block of the largest weight.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model checked with.
-    verdicts : Verdicts
-        Of `EnvelopeMonitor.check`.
-
-    Returns
-    -------
-    list of dict
-        Empty without a schedule. Of each block: `regime` in words, `verdicts`, `violated`, `inside` (a share, or None),
-        `unknown_regime`, and `states`: of each its `violations`, `inside` and `mean_width`, recorded units.
-    """
+    """What became of the verdicts in each regime; a verdict belongs to the block of the largest weight."""
     if model.schedule is None:
         return []
     block, judged = _blocks(model, verdicts), verdicts.judged
@@ -162,36 +123,13 @@ def check_regimes(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any
 def sample_blocks(model: UncertainLTI, verdicts: Verdicts) -> NDArray[np.intp]:
     """The block of the largest weight for the verdict on each sample.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model checked with.
-    verdicts : Verdicts
-        Of `EnvelopeMonitor.check`.
-
-    Returns
-    -------
-    array of int (N+1,)
-        Its number; -1 where there is no verdict.
+    Returns (N+1,): its number; -1 where there is no verdict.
     """
     return np.where(verdicts.judged, _blocks(model, verdicts), -1)
 
 
 def unknown_in_words(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
-    """Why regimes are unknown, and modes not in the model, each reason once with its count.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model checked with.
-    verdicts : Verdicts
-        Of `EnvelopeMonitor.check`.
-
-    Returns
-    -------
-    list of str
-        Clauses that name the scheduling signals, their values and the knots; empty where every regime is known.
-    """
+    """Why regimes are unknown, and modes not in the model, each reason once with its count."""
     if model.schedule is None or not (verdicts.unknown_regime.any() or verdicts.unlisted_mode.any()):
         return []
     z, point, found = _before(model, verdicts), model.operating_point, []

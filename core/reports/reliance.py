@@ -53,22 +53,7 @@ MOST_VIOLATED = 0.5
 def reasons(
     model: UncertainLTI, validation: Mapping[str, Any] | None, recordings: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, str]]:
-    """Every reason for and against relying on a model.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-    validation : mapping or None
-        What `findings` holds of its validation.
-    recordings : sequence of mapping
-        What `findings` holds of each recording that was checked.
-
-    Returns
-    -------
-    list of dict
-        `weight` (one of `WEIGHTS`), `about` and `text` of each.
-    """
+    """Every reason for and against relying on a model."""
     return [
         *_fit_reasons(model),
         *_stability_reasons(model),
@@ -80,18 +65,7 @@ def reasons(
 
 
 def answer(found: Sequence[Mapping[str, str]]) -> str:
-    """Whether the model may be relied on: the weightiest of its reasons.
-
-    Parameters
-    ----------
-    found : sequence of mapping
-        As `reasons` returns them.
-
-    Returns
-    -------
-    str
-        One of `WEIGHTS`; yes without a reason.
-    """
+    """Whether the model may be relied on: the weightiest of its reasons."""
     weights = {YES, *(reason["weight"] for reason in found)}
     return next(weight for weight in WEIGHTS if weight in weights)
 

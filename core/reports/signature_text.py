@@ -17,18 +17,7 @@ from uncertain_lti.validation.signatures import Learnt
 
 
 def signature_text(learnt: Learnt) -> str:
-    """Summary for a person.
-
-    Parameters
-    ----------
-    learnt : Learnt
-        Of `learn_signatures`.
-
-    Returns
-    -------
-    str
-        A table, and what cannot be told apart.
-    """
+    """Summary for a person."""
     rows = [[s.label, str(s.recordings), str(s.verdicts), ", ".join(map(str, s.steps))] for s in learnt.signatures]
     lines = [table(("signature", "recordings", "verdicts", "steps"), rows)]
     labels = [label for _, label, _ in learnt.named]

@@ -16,20 +16,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Columns aligned with spaces; the first to the left, the others to the right.
-
-    Parameters
-    ----------
-    header : sequence of str
-        Names of the columns.
-    rows : iterable of sequence of str
-        Cells of each row, as many as `header` has.
-
-    Returns
-    -------
-    str
-        Lines, each indented by two spaces.
-    """
+    """Columns aligned with spaces; the first to the left, the others to the right."""
     lines = [list(header), *(list(row) for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     return "\n".join(
@@ -43,34 +30,12 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def number(value: float | None) -> str:
-    """Four digits, or a dash for nothing.
-
-    Parameters
-    ----------
-    value : float or None
-        The number; None or NaN for nothing.
-
-    Returns
-    -------
-    str
-        Four significant digits, or a dash.
-    """
+    """Four digits, or a dash for nothing."""
     return "-" if value is None or math.isnan(value) else f"{value:.4g}"
 
 
 def beyond(utilisation: float) -> str:
-    """A violated utilisation with as many digits as show that it is beyond -1 or 1.
-
-    Parameters
-    ----------
-    utilisation : float
-        Utilisation of a violated verdict, over 1 in magnitude.
-
-    Returns
-    -------
-    str
-        Three to nine digits, or `just beyond 1`.
-    """
+    """A violated utilisation with as many digits as show that it is beyond -1 or 1."""
     for digits in range(3, 10):
         text = f"{utilisation:.{digits}g}"
         if abs(float(text)) > 1.0:
@@ -79,18 +44,5 @@ def beyond(utilisation: float) -> str:
 
 
 def shortened(name: str, longest: int = 40) -> str:
-    """A name for a sentence, with its middle left out where it is long.
-
-    Parameters
-    ----------
-    name : str
-        Any name.
-    longest : int, default 40
-        Its length at most, in characters.
-
-    Returns
-    -------
-    str
-        The name, with an ellipsis where its middle is left out.
-    """
+    """A name for a sentence, with its middle left out where it is long."""
     return name if len(name) <= longest else f"{name[: longest // 2]}…{name[len(name) - longest // 2 + 1 :]}"

@@ -21,15 +21,7 @@ NONE = 0.4
 
 
 def tune_figure(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
-    """Draw every way as a point, and the plain and the chosen one as lines over the false alarms allowed.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `Tuned.to_dict`.
-    path : path
-        Image file to write, of a kind that matplotlib knows.
-    """
+    """Draw every way as a point, and the plain and the chosen one as lines over the false alarms allowed."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -21,18 +21,7 @@ _NAMED = 3  # ways that the budget left out; the model file has all
 
 
 def tune_text(data: Mapping[str, Any]) -> str:
-    """Summary of `Tuned.to_dict()` for a person.
-
-    Parameters
-    ----------
-    data : mapping
-        Of `Tuned.to_dict`.
-
-    Returns
-    -------
-    str
-        A table with the way that detects most first, the choice, and what to record.
-    """
+    """Summary of `Tuned.to_dict()` for a person."""
     trials = data["trials"]
     judged = sorted(
         (t for t in trials if "refused" not in t), key=lambda t: t["size"] if t["size"] is not None else 1.0

@@ -23,18 +23,7 @@ MOST_PARTS = 20
 
 
 def validation_text(data: dict[str, Any]) -> str:
-    """Summary of `Validation.to_dict()`, with the calibration if there is one, for a person.
-
-    Parameters
-    ----------
-    data : dict
-        Of `Validation.to_dict`; with the key `calibration` if there is one.
-
-    Returns
-    -------
-    str
-        Tables, intervals and notes.
-    """
+    """Summary of `Validation.to_dict()`, with the calibration if there is one, for a person."""
     what = "recording" if data["kind"] == "transients" else "block"
     gap = f", {number(data['gap'])} s on both sides not fitted either" if data["kind"] == "blocks" else ""
     condition = data.get("condition_short")  # files written before it was stored have none
@@ -124,18 +113,7 @@ def _each(data: dict[str, Any], what: str) -> list[str]:
 
 
 def left_out_text(data: dict[str, Any]) -> str:
-    """Short form of `validation_text`, one line, for a fit, with the hint that recordings may come in groups.
-
-    Parameters
-    ----------
-    data : dict
-        Of `leave_out_with_fit`.
-
-    Returns
-    -------
-    str
-        One or two lines.
-    """
+    """Short form of `validation_text`, one line, for a fit, with the hint that recordings may come in groups."""
     if "not_done" in data:
         return f"not validated, so how it does on other recordings is unknown: {data['not_done']}"
     what = "recording" if data["kind"] == "transients" else "block"

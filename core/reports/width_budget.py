@@ -30,26 +30,8 @@ def width_budget(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[
     Columns are states, controls, and what the model has of drift and noise. The elements of a scheduled model are those
     of its blocks, blended as in the bounds; a sample of a mode that is not listed has no width.
 
-    Parameters
-    ----------
-    model : UncertainLTI
-        The model.
-    transients : sequence of Transient
-        In recorded units, with the model's signals.
-
-    Returns
-    -------
-    array (n, columns)
-        Share of each column; a row of zeros where the width is 0.
-    array (n,)
-        Mean width, recorded units.
-    list of str
-        Names of the columns.
-
-    Raises
-    ------
-    ModelError
-        No recording has a usable transition.
+    Returns (n, columns): share of each column; a row of zeros where the width is 0; Returns (n,): mean width, recorded
+    units.
     """
     additive = [(term, np.atleast_2d(half)) for term, _, half in model.additive()]
     blocks = len(model.blocks)

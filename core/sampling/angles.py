@@ -17,23 +17,5 @@ TURN = 2.0 * math.pi
 
 
 def nearest_branch(angle: float, previous: float) -> float:
-    """An angle plus the whole turns that bring it nearest to the one before.
-
-    Parameters
-    ----------
-    angle : float
-        rad, finite.
-    previous : float
-        rad, finite.
-
-    Returns
-    -------
-    float
-        At most half a turn from previous, but for rounding.
-
-    Raises
-    ------
-    OverflowError
-        The turns between them are more than a float can count.
-    """
+    """An angle plus the whole turns that bring it nearest to the one before."""
     return angle + TURN * round((previous - angle) / TURN)

@@ -21,20 +21,7 @@ and its least size; or its size alone. At most so many are told apart."""
 
 
 def too_small(low: float, high: float) -> bool:
-    """Whether no number of a range can stand for no value.
-
-    Parameters
-    ----------
-    low : float
-        Least of the values.
-    high : float
-        Greatest of them.
-
-    Returns
-    -------
-    bool
-        False as well if either is NaN.
-    """
+    """Whether no number of a range can stand for no value."""
     return -CODE_LEAST < low and high < CODE_LEAST
 
 
@@ -45,15 +32,7 @@ def codes(values: Array) -> dict[float, int]:
     and lies CODE_APART times as far from the others as these spread; or if it is beyond CODE_SIZE where the others stay
     below a thousandth.
 
-    Parameters
-    ----------
-    values : array (samples,)
-        In recorded units.
-
-    Returns
-    -------
-    dict of float to int
-        The number -> how often it occurs.
+    `values` (samples,): in recorded units.
     """
     if len(values) and too_small(float(values.min()), float(values.max())):
         return {}  # the usual case, in a fraction of the time

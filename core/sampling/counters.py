@@ -24,31 +24,10 @@ class Counters(Counter[str]):
     """
 
     def add(self, kind: str, name: str, count: int = 1) -> None:
-        """Count something of a topic or signal.
-
-        Parameters
-        ----------
-        kind : {"late", "stale", "missing", "invalid"}
-            What happened.
-        name : str
-            Topic or signal.
-        count : int, default 1
-            How often.
-        """
+        """Count something of a topic or signal."""
         self[f"{kind} {name}"] += count
 
     def of(self, kind: str) -> dict[str, int]:
-        """Counts of one kind.
-
-        Parameters
-        ----------
-        kind : {"late", "stale", "missing", "invalid"}
-            What happened.
-
-        Returns
-        -------
-        dict
-            By topic or signal, those that were counted.
-        """
+        """Counts of one kind."""
         start = f"{kind} "
         return {key[len(start) :]: count for key, count in self.items() if key.startswith(start) and count}

@@ -22,18 +22,7 @@ LONGEST_NS = 2**62
 
 
 def to_ns(seconds: float) -> int:
-    """Seconds to whole nanoseconds.
-
-    Parameters
-    ----------
-    seconds : float
-        A duration, s; infinite or NaN for one without end.
-
-    Returns
-    -------
-    int
-        Nanoseconds.
-    """
+    """Seconds to whole nanoseconds."""
     if abs(seconds) < LONGEST_NS * 1e-9:
         return round(seconds * 1e9)
     return -LONGEST_NS if math.isfinite(seconds) and seconds < 0 else LONGEST_NS
@@ -45,17 +34,7 @@ def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) 
     Equal stamps and steps back do not count; an instant less than min_step_ns after the one before is passed over,
     as the sampler does.
 
-    Parameters
-    ----------
-    instants : sequence of array (messages,) of int
-        Of each recording, ns.
-    min_step_ns : int, default 0
-        Shortest step that counts, ns.
-
-    Returns
-    -------
-    int or None
-        Nanoseconds, or None.
+    `instants` (messages,): of each recording, ns.
     """
     pooled = np.concatenate([np.empty(0, np.int64), *(_forward_steps(i, min_step_ns) for i in instants)])
     return int(np.median(pooled)) if pooled.size else None
@@ -83,17 +62,7 @@ def period_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> in
     The median of the time that 100 samples take (fewer of short recordings), divided by their number: a stamp that is
     late, or a sample that is lost, changes few of these.
 
-    Parameters
-    ----------
-    instants : sequence of array (messages,) of int
-        Of each recording, ns.
-    min_step_ns : int, default 0
-        Shortest step that counts, ns.
-
-    Returns
-    -------
-    int or None
-        Nanoseconds, or None without a forward step.
+    `instants` (messages,): of each recording, ns.
     """
     steps = [_forward_steps(i, min_step_ns) for i in instants]
     longest = max((len(s) for s in steps), default=0)

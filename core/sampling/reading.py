@@ -41,23 +41,6 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, str]:
     """Per topic `header` or `log`: what the map says, else header where most messages of all recordings carry a stamp.
-
-    Parameters
-    ----------
-    streams : sequence of Stream
-        All recordings.
-    signals : SignalMap
-        The map.
-
-    Returns
-    -------
-    mapping of str to str
-        Topic -> source.
-
-    Raises
-    ------
-    SignalError
-        The map says header and no message has a stamp.
     """
     sources: dict[str, str] = {}
     for position, name in enumerate(signals.topics):
@@ -68,27 +51,6 @@ def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, 
 
 def time_source(signals: SignalMap, topic: str, stamped: int, counted: int) -> str:
     """What counts as the time of a topic's messages: what the map says, else the stamp where most messages carry one.
-
-    Parameters
-    ----------
-    signals : SignalMap
-        The map.
-    topic : str
-        Name of the topic.
-    stamped : int
-        Messages with a stamp, over all recordings.
-    counted : int
-        All messages.
-
-    Returns
-    -------
-    str
-        `header` or `log`.
-
-    Raises
-    ------
-    SignalError
-        The map says header and no message has a stamp.
     """
     chosen = signals.time.get(topic)
     if chosen == "header" and not stamped:
@@ -102,25 +64,6 @@ def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None)
     """One recording through the rules of the `Sampler`; signals must be resolved.
 
     In columns (`sampler_arrays`), and message after message where that is not possible; the same to the last bit.
-
-    Parameters
-    ----------
-    stream : Stream
-        The recording.
-    signals : SignalMap
-        Resolved: clock, max_gap, time sources, steady states and scales.
-    progress : Progress, optional
-        As in `read_transients`.
-
-    Returns
-    -------
-    Transient
-        In recorded units.
-
-    Raises
-    ------
-    TransientError
-        Steps are about a nanosecond.
     """
     samples = sample_arrays(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
     if samples is None:
@@ -143,27 +86,7 @@ def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None)
 
 
 def sample_by_message(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Samples:
-    """The samples through the `Sampler` itself, message after message.
-
-    Parameters
-    ----------
-    stream : Stream
-        The recording.
-    signals : SignalMap
-        Resolved, as for `sample`.
-    progress : Progress, optional
-        As in `read_transients`.
-
-    Returns
-    -------
-    Samples
-        As `sample_arrays` gives them.
-
-    Raises
-    ------
-    SignalError
-        Something in the map is not resolved.
-    """
+    """The samples through the `Sampler` itself, message after message."""
     sampler = Sampler(signals)
     topics = signals.topics
     rows = [iter(v.tolist()) for v in stream.values]
@@ -280,30 +203,7 @@ def _streams(
 def read_as_fitted(
     recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> Transient:
-    """Read one recording with the signals and sampling that a model was fitted with.
-
-    Parameters
-    ----------
-    recording : Recording or path
-        File or folder.
-    signals : SignalMap
-        Of the model.
-    progress : Progress, optional
-        As in `read_transients`.
-
-    Returns
-    -------
-    Transient
-        In recorded units.
-
-    Raises
-    ------
-    BagError
-        The recording cannot be read, lacks a topic, or a topic has another type than in the fit.
-    SignalError
-        The model names no topics (it was fitted to arrays) or does not say how they are sampled, or uses stamps
-        that the recording lacks.
-    """
+    """Read one recording with the signals and sampling that a model was fitted with."""
     stream = _stream_for_model(recording, signals, progress)
     return sample(stream, signals, progress)
 
@@ -311,31 +211,7 @@ def read_as_fitted(
 def read_as_fitted_with_decisions(
     recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> tuple[Transient, Decisions]:
-    """`read_as_fitted`, and which message decided each clock message.
-
-    Parameters
-    ----------
-    recording : Recording or path
-        File or folder.
-    signals : SignalMap
-        Of the model.
-    progress : Progress, optional
-        As in `read_transients`.
-
-    Returns
-    -------
-    Transient
-        In recorded units.
-    Decisions
-        Of every clock message that was decided.
-
-    Raises
-    ------
-    BagError
-        As `read_as_fitted`.
-    SignalError
-        As `read_as_fitted`.
-    """
+    """`read_as_fitted`, and which message decided each clock message."""
     stream = _stream_for_model(recording, signals, progress)
     decisions = decided(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
     return sample(stream, signals, progress), decisions
@@ -346,32 +222,8 @@ def read_field(
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """A field of any topic, and after which samples of the same recording its values came.
 
-    Parameters
-    ----------
-    recording : Recording
-        The recording.
-    signals : SignalMap
-        Of the model.
-    decisions : Decisions
-        Of `read_as_fitted_with_decisions`.
-    topic : str
-        Topic of the field.
-    field : FieldPath
-        The field.
-
-    Returns
-    -------
-    array (K,) of int
-        Samples that were decided before each message came.
-    array (K,)
-        The values; NaN where a message has no such number.
-
-    Raises
-    ------
-    BagError
-        The recording lacks the topic, or it cannot be decoded.
-    SignalError
-        The field is not in the message type, or is not one number.
+    Returns (K,): samples that were decided before each message came; Returns (K,): the values; NaN where a message has
+    no such number.
     """
     if topic not in recording.topics:
         raise BagError(no_topic(recording, topic))
@@ -428,27 +280,7 @@ def _stream_for_model(
 
 
 def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.PathLike[str]]) -> SignalMap:
-    """A signals file; where it contradicts itself, its topics are first looked for in the recordings.
-
-    Parameters
-    ----------
-    path : path
-        The signals file.
-    recordings : sequence of path
-        Recordings and folders.
-
-    Returns
-    -------
-    SignalMap
-        As `SignalMap.load`.
-
-    Raises
-    ------
-    BagError
-        A recording cannot be read, or lacks a topic of a file that contradicts itself.
-    SignalError
-        As `SignalMap.load`.
-    """
+    """A signals file; where it contradicts itself, its topics are first looked for in the recordings."""
     try:
         return SignalMap.load(path)
     except UncarriedTopicError as error:
@@ -460,20 +292,7 @@ def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.Pat
 
 
 def no_topic(bag: Recording, topic: str) -> str:
-    """The sentence for a topic that a recording lacks, with the nearest names and all of them.
-
-    Parameters
-    ----------
-    bag : Recording
-        The recording.
-    topic : str
-        The name that it lacks.
-
-    Returns
-    -------
-    str
-        The sentence.
-    """
+    """The sentence for a topic that a recording lacks, with the nearest names and all of them."""
     there = shortlist(sorted(bag.topics), 50) or "none"
     return f"{bag.path}: there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
 
@@ -508,18 +327,7 @@ def _with_signals(transient: Transient, signals: SignalMap, note: str | None) ->
 
 
 def unused(transient: Transient) -> list[str]:
-    """In words, how many transitions of a recording are not used, and why.
-
-    Parameters
-    ----------
-    transient : Transient
-        The recording.
-
-    Returns
-    -------
-    list of str
-        One entry per reason.
-    """
+    """In words, how many transitions of a recording are not used, and why."""
     counts: dict[str, int] = {}
     for status in transient.statuses()[1:]:
         if status is not Status.OK:

@@ -34,16 +34,6 @@ def processes_for(bags: Sequence[Recording]) -> int:
     """How many processes to read these recordings with: 1 for small ones, and on few cores.
 
     One process keeps nearly two cores busy, as it reads ahead.
-
-    Parameters
-    ----------
-    bags : sequence of Recording
-        The recordings.
-
-    Returns
-    -------
-    int
-        At most one per recording, and one for every two cores.
     """
     size = sum(bag.size for bag in bags)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -53,33 +43,7 @@ def processes_for(bags: Sequence[Recording]) -> int:
 def read_streams(
     bags: Sequence[Recording], signals: SignalMap, progress: Progress | None, processes: int
 ) -> list[Stream]:
-    """`read_stream` of every recording, in processes; progress advances by whole recordings.
-
-    Parameters
-    ----------
-    bags : sequence of Recording
-        The recordings.
-    signals : SignalMap
-        The map.
-    progress : Progress or None
-        Wraps what goes through all messages, given their number.
-    processes : int
-        How many at most.
-
-    Returns
-    -------
-    list of Stream
-        One per recording, in their order.
-
-    Raises
-    ------
-    BagError, SignalError
-        As `read_stream`, of the first recording in order that cannot be read; or a process ended before its time.
-    BagError
-        As `read_stream`, of the first recording in order that cannot be read; or a process ended before its time.
-    SignalError
-        As `read_stream`.
-    """
+    """`read_stream` of every recording, in processes; progress advances by whole recordings."""
     counts = [sum(bag.topics[topic].count for topic in signals.topics) for bag in bags]
     with _pool(min(processes, len(bags))) as pool:
         futures = {pool.submit(_read, bag, signals): number for number, bag in enumerate(bags)}
@@ -121,11 +85,6 @@ def children_ignore_ctrl_c() -> Iterator[None]:
     """Processes that are started in the block leave Ctrl-C to this one, which takes it at the end of the block.
 
     They inherit that SIGINT is blocked. In another than the main thread it cannot be set.
-
-    Yields
-    ------
-    None
-        The block in which they are started.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

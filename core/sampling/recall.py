@@ -33,21 +33,9 @@ Mask = NDArray[np.bool_]
 def recall(values: Values, memory: Memory, dt: Values, opens: Mask) -> Values:
     """What each sample takes from the samples up to it, as the `Sampler` has it.
 
-    Parameters
-    ----------
-    values : array (N,)
-        Of the field itself.
-    memory : Memory
-        What is taken.
-    dt : array (N,)
-        Step that leads to each sample, s; that of the first of a segment does not count.
-    opens : array of bool (N,)
-        The first sample of each segment.
-
-    Returns
-    -------
-    array (N,)
-        NaN where the segment has too few samples before.
+    `values` (N,): of the field itself; `dt` (N,): step that leads to each sample, s; that of the first of a segment
+    does not count; `opens` (N,): the first sample of each segment; Returns (N,): naN where the segment has too few
+    samples before.
     """
     place = np.arange(len(values))
     begin = np.maximum.accumulate(np.where(opens, place, 0)) if len(values) else place
@@ -60,25 +48,7 @@ def recall(values: Values, memory: Memory, dt: Values, opens: Mask) -> Values:
 
 
 def with_memories(transient: Transient, memories: Mapping[str, tuple[str, Memory]]) -> Transient:
-    """The same run with further controls that follow from earlier samples of its states and controls.
-
-    Parameters
-    ----------
-    transient : Transient
-        The run; one that was read from topics gets signals with the field paths of the memories.
-    memories : mapping of str to (str, Memory)
-        Name of the new control -> state or control whose samples it takes, and how.
-
-    Returns
-    -------
-    Transient
-        A new transient.
-
-    Raises
-    ------
-    TransientError
-        There is no such state or control, or the name is taken.
-    """
+    """The same run with further controls that follow from earlier samples of its states and controls."""
     names = [*transient.state_names, *transient.control_names, *transient.scheduling_names]
     z = np.hstack([transient.x, transient.u])
     columns, added = [], []
@@ -104,25 +74,7 @@ def with_memories(transient: Transient, memories: Mapping[str, tuple[str, Memory
 
 
 def with_delays(transient: Transient, delays: Mapping[str, int]) -> Transient:
-    """The same run with some controls taken so many samples earlier, as `delay` in a signals file does.
-
-    Parameters
-    ----------
-    transient : Transient
-        The run; one that was read from topics gets signals with these delays, beside those they have.
-    delays : mapping of str to int
-        Name of a control that is no memory -> samples.
-
-    Returns
-    -------
-    Transient
-        A new transient.
-
-    Raises
-    ------
-    TransientError
-        There is no such control, or it is a memory.
-    """
+    """The same run with some controls taken so many samples earlier, as `delay` in a signals file does."""
     u, controls = transient.u.copy(), list(transient.signals.controls) if transient.signals is not None else []
     for name, samples in delays.items():
         if name not in transient.control_names:
@@ -149,18 +101,7 @@ def _with_rules(structure: Any, memories: Mapping[str, tuple[str, Memory]]) -> A
 
 
 def recalled(transient: Transient) -> Transient:
-    """The same run with its memories taken again from its states and controls, after these were changed.
-
-    Parameters
-    ----------
-    transient : Transient
-        With signals that name the fields; without them, the run itself is returned.
-
-    Returns
-    -------
-    Transient
-        A new transient.
-    """
+    """The same run with its memories taken again from its states and controls, after these were changed."""
     if transient.signals is None or not transient.signals.recalled:
         return transient
     z = np.hstack([transient.x, transient.u, transient.s])
@@ -171,27 +112,7 @@ def recalled(transient: Transient) -> Transient:
 
 
 def memory_of(signal: Signal, memory: Memory, name: str) -> Signal:
-    """A memory of a signal, as a control.
-
-    Parameters
-    ----------
-    signal : Signal
-        A state or control.
-    memory : Memory
-        What is taken of it.
-    name : str
-        Of the new control.
-
-    Returns
-    -------
-    Signal
-        With the scale, and of a lag the steady state, of the signal.
-
-    Raises
-    ------
-    TransientError
-        The signal is delayed, and no lag is taken of it.
-    """
+    """A memory of a signal, as a control."""
     unit = f"{signal.unit}/s" if signal.unit and memory.kind == "rate" else signal.unit
     steady = signal.steady if memory.kind == "lag" else 0.0
     if signal.delay:

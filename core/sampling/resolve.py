@@ -29,27 +29,7 @@ def resolve(
     instants: Mapping[str, Sequence[NDArray[np.int64]]],
     time: Mapping[str, str],
 ) -> SignalMap:
-    """Fill in clock, max_gap, a constant step and time sources by the stated rules.
-
-    Parameters
-    ----------
-    signals : SignalMap
-        The map as the file says it.
-    instants : mapping
-        Per topic the instants of its messages in each recording, (messages,) ns, by that topic's time source.
-    time : mapping
-        Per topic `header` or `log`.
-
-    Returns
-    -------
-    SignalMap
-        The map without anything open but steady states and scales.
-
-    Raises
-    ------
-    SignalError
-        The clock has fewer than two distinct instants, or max_skew is given and no state is on another topic.
-    """
+    """Fill in clock, max_gap, a constant step and time sources by the stated rules."""
     if signals.max_skew is not None and len({s.topic for s in signals.states}) == 1:
         raise SignalError(
             f"{signals.source}: max_skew limits the age of states from another topic than the clock, and all states "

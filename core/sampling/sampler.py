@@ -59,20 +59,8 @@ class Step:
     All values are in recorded units, with NaN for what is missing. Without a sample k (first, reset) x and u are all
     NaN and dt is NaN; for a dropped message x_next is NaN as well.
 
-    Parameters
-    ----------
-    status : Status
-        What became of the message.
-    t_ns : int
-        Instant t_{k+1}, ns.
-    arrival_ns : int
-        Arrival of the message, ns.
-    dt : float
-        Δt_k, s.
-    before : sequence of float (n + m + q,)
-        x, u and the further scheduling signals s of sample k.
-    after : sequence of float (n,)
-        x of sample k+1.
+    `status`: what became of the message; `t_ns`: instant t_{k+1}, ns; `arrival_ns`: arrival of the message, ns; `dt`:
+    Δt_k, s; `before`: x, u and the further scheduling signals s of sample k; `after`: x of sample k+1.
     """
 
     status: Status = cython.declare(object, visibility="readonly")
@@ -315,23 +303,10 @@ class Sampler:
     ties to the latest arrival. A step is decided when its second sample opens, or, where states come from more
     than one topic, when that sample closes. Nothing is resampled.
 
-    Parameters
-    ----------
-    signals : SignalMap
-        With clock, max_gap and a time source for every topic resolved (`reading.read_transients` and the model file do
-        that).
-
-    Attributes
-    ----------
-    counters : Counter
-        samples, gaps, resets and missing; dropped messages by status value; `late <topic>` for messages that came
-        after the sample they belonged to was closed; `missing <signal>` and `stale <signal>` per sample;
-        `invalid <signal>` per message whose value is outside `valid` or in `ignore`.
-
-    Raises
-    ------
-    SignalError
-        Something in the map is not resolved.
+    `signals`: with clock, max_gap and a time source for every topic resolved (`reading.read_transients` and the model
+    file do that); `counters`: samples, gaps, resets and missing; dropped messages by status value; `late <topic>` for
+    messages that came after the sample they belonged to was closed; `missing <signal>` and `stale <signal>` per sample;
+    `invalid <signal>` per message whose value is outside `valid` or in `ignore`.
     """
 
     signals = cython.declare(object, visibility="readonly")
@@ -387,29 +362,7 @@ class Sampler:
         self._history = {}
 
     def push(self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]) -> list[Step]:
-        """Take one message.
-
-        Parameters
-        ----------
-        topic : str
-            One of `signals.topics`.
-        arrival_ns : int
-            Log time, or live the node clock at receipt.
-        stamp_ns : int or None
-            Header stamp; None, zero or less where there is none. Ignored for topics that go by log time.
-        values : sequence of float
-            The topic's signals in the order of `signals.on(topic)`.
-
-        Returns
-        -------
-        list of Step
-            The clock messages that it decided: none, one, or seldom two.
-
-        Raises
-        ------
-        ValueError
-            The number of values is not that of the topic's signals.
-        """
+        """Take one message."""
         state: _Topic = self._topics[topic]
         stamp: cython.longlong = stamp_ns if state.header and stamp_ns is not None and stamp_ns > 0 else 0
         message = _Message(arrival_ns, stamp, list(values))
@@ -556,18 +509,7 @@ class Sampler:
             z[i] = value
 
     def kept(self, topic: str) -> list[tuple[int, int, list[float]]]:
-        """Messages of a topic that may still be chosen, oldest first.
-
-        Parameters
-        ----------
-        topic : str
-            One of `signals.topics`.
-
-        Returns
-        -------
-        list of (int, int, list of float)
-            Stamp (0 for none) and arrival, ns, and values: those too that do not count for the signals of this sampler.
-        """
+        """Messages of a topic that may still be chosen, oldest first."""
         state: _Topic = self._topics[topic]
         message: _Message
         found = []
@@ -579,31 +521,14 @@ class Sampler:
         return found
 
     def latest(self) -> tuple[int, list[float]] | None:
-        """The open sample with what is known so far.
-
-        Returns
-        -------
-        (int, list of float) or None
-            Its instant, ns, and [x; u; s] (n + m + q); None before the first sample.
-        """
+        """The open sample with what is known so far."""
         if self._open is None:
             return None
         return _instant(self._open), self._fix(self._open, False, False)
 
 
 def all_finite(values: Sequence[float]) -> bool:
-    """Whether all are finite.
-
-    Parameters
-    ----------
-    values : sequence of float
-        Any numbers.
-
-    Returns
-    -------
-    bool
-        True without a number.
-    """
+    """Whether all are finite."""
     return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum of finite numbers may overflow
 
 

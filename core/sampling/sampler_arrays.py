@@ -44,17 +44,9 @@ Mask = NDArray[np.bool_]
 class Samples:
     """Samples of one recording.
 
-    Parameters
-    ----------
-    t_ns : array (N,) of int
-        Instants, ns.
-    x : array (N, n)
-        States; NaN for what is missing.
-    held : array (N, m + q)
-        Controls, then further scheduling signals; those of sample k act from t[k] on, and are NaN where nothing
-        follows that they lead to.
-    counters : Counter
-        Those of the `Sampler`.
+    `t_ns` (N,): instants, ns; `x` (N, n): states; NaN for what is missing; `held` (N, m + q): controls, then further
+    scheduling signals; those of sample k act from t[k] on, and are NaN where nothing follows that they lead to;
+    `counters`: those of the `Sampler`.
     """
 
     t_ns: Integers
@@ -67,16 +59,9 @@ class Samples:
 class Decisions:
     """What became of each clock message of a recording, in the order in which it was decided.
 
-    Parameters
-    ----------
-    arrival : array (M,) of int
-        Arrival of the message that decided it, ns.
-    t_ns : array (M,) of int
-        Its own instant, ns.
-    dropped : array (M,) of bool
-        It made no sample. The others are the samples of `sample_arrays`, one after the other.
-    by : array (M,) of int
-        Which clock message decided it, counted in order of arrival.
+    `arrival` (M,): arrival of the message that decided it, ns; `t_ns` (M,): its own instant, ns; `dropped` (M,): it
+    made no sample. The others are the samples of `sample_arrays`, one after the other; `by` (M,): which clock message
+    decided it, counted in order of arrival.
     """
 
     arrival: Integers
@@ -94,23 +79,9 @@ def sample_arrays(
 ) -> Samples | None:
     """Samples as the `Sampler` gives them, to the last bit and count; None where it has to be asked.
 
-    Parameters
-    ----------
-    signals : SignalMap
-        Resolved as the Sampler wants it.
-    topic : array (messages,) of int
-        Position in `signals.topics` of each message, in order of arrival.
-    arrival : array (messages,) of int
-        Log time, ns.
-    stamp : array (messages,) of int
-        Header stamp, ns; zero or less where there is none.
-    values : sequence of array (messages of the topic, signals on it)
-        One array per topic.
-
-    Returns
-    -------
-    Samples or None
-        None where the messages have to be pushed one by one.
+    `topic` (messages,): position in `signals.topics` of each message, in order of arrival; `arrival` (messages,): log
+    time, ns; `stamp` (messages,): header stamp, ns; zero or less where there is none; `values` (messages of the topic,
+    signals on it): one array per topic.
     """
     if (arrival[1:] < arrival[:-1]).any():
         return None
@@ -128,23 +99,9 @@ def decided(
     A sample is decided by its own message, or, where states span several topics, by the next one that opens a sample;
     without a next one it is not decided. A message that is dropped is decided at once.
 
-    Parameters
-    ----------
-    signals : SignalMap
-        As for `sample_arrays`.
-    topic : array (messages,) of int
-        As for `sample_arrays`, in any order of time.
-    arrival : array (messages,) of int
-        As for `sample_arrays`.
-    stamp : array (messages,) of int
-        As for `sample_arrays`.
-    values : sequence of array (messages of the topic, signals on it)
-        As for `sample_arrays`.
-
-    Returns
-    -------
-    Decisions
-        In the order in which they were decided.
+    `topic` (messages,): as for `sample_arrays`, in any order of time; `arrival` (messages,): as for `sample_arrays`;
+    `stamp` (messages,): as for `sample_arrays`; `values` (messages of the topic, signals on it): as for
+    `sample_arrays`.
     """
     sampling = _Sampling(signals, topic, arrival, stamp, values)
     clock = sampling.topics[signals.clock or ""]

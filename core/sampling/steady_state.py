@@ -34,19 +34,7 @@ def still_stretches(values: Array, span: Array, band: float = STILL_BAND) -> lis
     Greedy from the left: a stretch grows while the difference between its greatest and least value is at most
     band x span in every column, and counts from STILL_SAMPLES samples on. A value that is not finite ends it.
 
-    Parameters
-    ----------
-    values : array (samples, signals)
-        Recorded units.
-    span : array (signals,)
-        Range of each signal over all recordings.
-    band : float, optional
-        Share of the range; default STILL_BAND.
-
-    Returns
-    -------
-    list of (int, int)
-        First sample, and first sample after the stretch.
+    `values` (samples, signals): recorded units; `span` (signals,): range of each signal over all recordings.
     """
     stretches = []
     start, stop, count = 0, 0, len(values)
@@ -77,15 +65,7 @@ def end_stops(recordings: Sequence[Array]) -> list[list[float]]:
     exactly for STILL_SAMPLES samples, and arrives at it at STOP_SPEED of its usual speed: what settles by itself slows
     down first, as the temperature of a machine that cools does. 0 is none; it is where machines rest.
 
-    Parameters
-    ----------
-    recordings : sequence of array (samples, signals)
-        In recorded units; NaN where there is none.
-
-    Returns
-    -------
-    list of list of float
-        At most two values per signal.
+    `recordings` (samples, signals): in recorded units; NaN where there is none.
     """
     found: list[list[float]] = []
     for j in range(recordings[0].shape[1] if recordings else 0):
@@ -131,21 +111,7 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
     medians over all still stretches of all recordings, measured in recorded units, or the range (largest less least
     value) where that is 0, or 1 where the range is 0 too.
 
-    Parameters
-    ----------
-    signals : sequence of Signal
-        States, then controls.
-    recordings : sequence of array (samples, signals)
-        In recorded units.
-
-    Returns
-    -------
-    list of float
-        Steady state of each signal.
-    list of float
-        Scale of each signal.
-    str
-        The rule applied, in words.
+    `recordings` (samples, signals): in recorded units.
     """
     finite = [np.where(np.isfinite(r), r, np.nan) for r in recordings]
     pooled = np.concatenate(finite)

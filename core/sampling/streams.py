@@ -32,18 +32,9 @@ from uncertain_lti.signals.signal_map import SignalMap
 class Stream:
     """The wanted field values of one recording in order of arrival.
 
-    Parameters
-    ----------
-    bag : Recording
-        The recording.
-    topic : array (messages,) of int
-        Positions in `signals.topics`.
-    arrival : array (messages,) of int
-        Log time, ns.
-    stamp : array (messages,) of int
-        Header stamp, ns; -1 for no stamp.
-    values : list of array (messages of the topic, signals on it)
-        One array per topic, in the order of `signals.on(topic)`.
+    `bag`: the recording; `topic` (messages,): positions in `signals.topics`; `arrival` (messages,): log time, ns;
+    `stamp` (messages,): header stamp, ns; -1 for no stamp; `values` (messages of the topic, signals on it): one array
+    per topic, in the order of `signals.on(topic)`.
     """
 
     bag: Recording
@@ -57,27 +48,6 @@ def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = 
     """Read the fields of a signals file from one recording.
 
     Messages are read in blocks (`bag_arrays`), with what `read_stream_by_message` gives to the last bit.
-
-    Parameters
-    ----------
-    bag : Recording
-        The recording.
-    signals : SignalMap
-        The map; it need not be resolved.
-    progress : Progress, optional
-        As in `read_transients`.
-
-    Returns
-    -------
-    Stream
-        In recorded units.
-
-    Raises
-    ------
-    BagError
-        A topic is not there or cannot be read.
-    SignalError
-        A field is not in the message type, is not one number, or looks up a name or an element that no message has.
     """
     paths = check_paths(bag, signals)
     try:
@@ -89,29 +59,7 @@ def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = 
 
 
 def read_stream_by_message(bag: Recording, signals: SignalMap, progress: Progress | None = None) -> Stream:
-    """What `read_stream` gives, message by message.
-
-    Parameters
-    ----------
-    bag : Recording
-        The recording.
-    signals : SignalMap
-        The map; it need not be resolved.
-    progress : Progress, optional
-        As in `read_transients`.
-
-    Returns
-    -------
-    Stream
-        In recorded units.
-
-    Raises
-    ------
-    BagError
-        As `read_stream`.
-    SignalError
-        As `read_stream`.
-    """
+    """What `read_stream` gives, message by message."""
     paths = check_paths(bag, signals)
     topics = signals.topics
     messages: Iterable[tuple[str, int, object]] = bag.messages(topics)
@@ -136,23 +84,6 @@ def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
     """Field paths per topic; every problem of the map is found before the long read.
 
     What the index of a file says is wrong is looked for in the file itself before it is reported: they may differ.
-
-    Parameters
-    ----------
-    bag : Recording
-        The recording.
-    signals : SignalMap
-        The map.
-
-    Returns
-    -------
-    list of list of FieldPath
-        Per topic, in the order of `signals.on(topic)`.
-
-    Raises
-    ------
-    SignalError
-        A path is not in the message type, or is not one number.
     """
     if bag.indexed:
         try:

@@ -37,20 +37,8 @@ from uncertain_lti.signals.signal_map import SignalMap
 class Transitions:
     """The usable transitions k -> k+1 of one transient, in recorded units; all numbers are finite.
 
-    Parameters
-    ----------
-    k : array (N,) of int
-        Position of sample k in the transient.
-    dt : array (N,)
-        Δt_k, s.
-    x : array (N, n)
-        States at t_k.
-    u : array (N, m)
-        Controls at t_k.
-    x_next : array (N, n)
-        States at t_{k+1}.
-    s : array (N, q)
-        Further scheduling signals at t_k.
+    `k` (N,): position of sample k in the transient; `dt` (N,): Δt_k, s; `x` (N, n): states at t_k; `u` (N, m): controls
+    at t_k; `x_next` (N, n): states at t_{k+1}; `s` (N, q): further scheduling signals at t_k.
     """
 
     k: NDArray[np.intp]
@@ -63,15 +51,7 @@ class Transitions:
     def take(self, which: NDArray[np.bool_] | slice) -> Transitions:
         """Some of them.
 
-        Parameters
-        ----------
-        which : array of bool (N,) or slice
-            Those that are wanted; a slice is no copy.
-
-        Returns
-        -------
-        Transitions
-            In the same order.
+        `which` (N,): those that are wanted; a slice is no copy.
         """
         return Transitions(
             self.k[which], self.dt[which], self.x[which], self.u[which], self.x_next[which], self.s[which]
@@ -483,23 +463,7 @@ class Transient:
 
 
 def listed_transients(given: Transient | Iterable[Transient]) -> list[Transient]:
-    """One run or several as a list.
-
-    Parameters
-    ----------
-    given : Transient or iterable of Transient
-        The runs.
-
-    Returns
-    -------
-    list of Transient
-        The runs.
-
-    Raises
-    ------
-    TransientError
-        It is something else, or something else is among them.
-    """
+    """One run or several as a list."""
     instead = "read recordings with read_transients first, or make one with Transient(t, x, u)"
     if isinstance(given, Transient):
         return [given]

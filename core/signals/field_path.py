@@ -38,24 +38,8 @@ class FieldPath:
     in rad, and, outermost, lag(field, k), diff(field) and rate(field) of earlier samples (the sampler does these two,
     as it knows where a stream restarts).
 
-    Parameters
-    ----------
-    text : str
-        The path as a signals file writes it.
-
-    Attributes
-    ----------
-    unwrap : bool
-        The sampler is to unwrap it.
-    memory : Memory or None
-        What the sampler is to take from earlier samples.
-    inner : str
-        The path without that: whose earlier samples they are.
-
-    Raises
-    ------
-    SignalError
-        The text is not a field path.
+    `text`: the path as a signals file writes it; `unwrap`: the sampler is to unwrap it; `memory`: what the sampler is
+    to take from earlier samples; `inner`: the path without that: whose earlier samples they are.
     """
 
     __slots__ = ("text", "unwrap", "memory", "inner", "function", "steps", "_name_index")
@@ -120,18 +104,7 @@ class FieldPath:
         return hash(self.text)
 
     def read(self, message: Any) -> float:
-        """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero.
-
-        Parameters
-        ----------
-        message : object
-            A decoded message of the type that the path was checked against.
-
-        Returns
-        -------
-        float
-            The number as recorded, in rad for an angle of a quaternion; not unwrapped.
-        """
+        """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero."""
         value, parent = message, message
         for kind, key in self.steps:
             if kind == "attribute":
@@ -158,18 +131,7 @@ class FieldPath:
         return -1
 
     def absent(self, message: Any) -> str:
-        """What this path looks up and the message has not, in words, with what is there; empty where it has.
-
-        Parameters
-        ----------
-        message : object
-            A decoded message of the type that the path was checked against.
-
-        Returns
-        -------
-        str
-            A sentence, or an empty text where the message has the value.
-        """
+        """What this path looks up and the message has not, in words, with what is there; empty where it has."""
         value, parent, name = message, message, ""
         for kind, key in self.steps:
             if kind == "attribute":
@@ -189,22 +151,7 @@ class FieldPath:
         return ""
 
     def check(self, topic: str, type_name: str, type_fields: TypeFields) -> None:
-        """Check the path against a message type.
-
-        Parameters
-        ----------
-        topic : str
-            Topic that carries the type, for the error.
-        type_name : str
-            Type of the message, as package/msg/Name.
-        type_fields : callable
-            Type name -> {field name: FieldType}.
-
-        Raises
-        ------
-        SignalError
-            The path is not in the type, or is not one number; the sentence names what is there.
-        """
+        """Check the path against a message type."""
         here = f"field '{self.text}' of {topic} ({type_name})"
         current: FieldType = FieldType("message", type_name)
         parent: Mapping[str, FieldType] = {}

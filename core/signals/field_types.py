@@ -20,14 +20,8 @@ from typing import Literal
 class FieldType:
     """Type of one message field.
 
-    Parameters
-    ----------
-    kind : {"number", "bool", "string", "message", "other"}
-        What one element is.
-    type_name : str
-        Type of one element, as the message definition writes it.
-    array : int or None, optional
-        None for a single value, 0 for a sequence of any length, n for n elements.
+    `kind`: what one element is; `type_name`: type of one element, as the message definition writes it; `array`: none
+    for a single value, 0 for a sequence of any length, n for n elements.
     """
 
     kind: Literal["number", "bool", "string", "message", "other"]

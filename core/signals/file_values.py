@@ -22,23 +22,7 @@ from uncertain_lti.base.files import kind_of
 
 
 def load_yaml(path: str | os.PathLike[str]) -> Any:
-    """Read the structure of a signals file.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-
-    Returns
-    -------
-    object
-        Mappings, lists, numbers and text.
-
-    Raises
-    ------
-    SignalError
-        The file is missing, is not YAML, repeats a key, or holds nothing.
-    """
+    """Read the structure of a signals file."""
     import yaml  # the live node reads signals from the model file and needs no YAML
 
     if (kind := kind_of(path)) and kind != "a signals file":
@@ -91,27 +75,7 @@ def _repeated_key(top: Any) -> Any:
 
 
 def checked_mapping(data: Any, where: str, known: set[str] | None) -> dict[str, Any]:
-    """Check that a value is a mapping with known keys.
-
-    Parameters
-    ----------
-    data : object
-        Value as YAML or JSON gives it.
-    where : str
-        File and key, for the error.
-    known : set of str or None
-        Keys that it may have; None for any.
-
-    Returns
-    -------
-    dict
-        The value itself.
-
-    Raises
-    ------
-    SignalError
-        It is no mapping, or a key is unknown.
-    """
+    """Check that a value is a mapping with known keys."""
     if not isinstance(data, dict):
         raise SignalError(f"{where}: a mapping is wanted here, not {kind_in_yaml(data)}; see config/signals/")
     for key in data:
@@ -123,18 +87,7 @@ def checked_mapping(data: Any, where: str, known: set[str] | None) -> dict[str, 
 
 
 def kind_in_yaml(data: object) -> str:
-    """Name what a value is in the words of YAML.
-
-    Parameters
-    ----------
-    data : object
-        Value as YAML or JSON gives it.
-
-    Returns
-    -------
-    str
-        Words such as "a list".
-    """
+    """Name what a value is in the words of YAML."""
     names = {dict: "a mapping", list: "a list", str: "a text", bool: "a truth value", type(None): "nothing"}
     return names.get(type(data), "a number" if isinstance(data, (int, float)) else type(data).__name__)
 
@@ -145,25 +98,7 @@ def _remedy(kind: str) -> str:
 
 
 def checked_number(value: Any, where: str) -> float | None:
-    """Check that a value is a number.
-
-    Parameters
-    ----------
-    value : object
-        Value as YAML or JSON gives it; YAML 1.1 reads 1e-3 as text, which counts as a number here.
-    where : str
-        File and key, for the error.
-
-    Returns
-    -------
-    float or None
-        The number; None for nothing.
-
-    Raises
-    ------
-    SignalError
-        It is no number.
-    """
+    """Check that a value is a number."""
     if value is None:
         return None
     if isinstance(value, str):

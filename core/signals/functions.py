@@ -19,16 +19,8 @@ from typing import Any, NamedTuple
 class ValueKind(NamedTuple):
     """What a function takes: a message with certain fields, or also an array of numbers.
 
-    Parameters
-    ----------
-    words : str
-        What it is, for errors.
-    required : str
-        Fields that a message must have, one letter each.
-    optional : str, default ""
-        Fields that count where the message has them.
-    array : bool, default False
-        Whether an array of numbers will do as well.
+    `words`: what it is, for errors; `required`: fields that a message must have, one letter each; `optional`: fields
+    that count where the message has them; `array`: whether an array of numbers will do as well.
     """
 
     words: str
@@ -37,18 +29,7 @@ class ValueKind(NamedTuple):
     array: bool = False
 
     def parts(self, fields: Container[str]) -> tuple[str, ...]:
-        """Fields of a message that the function takes, in its order.
-
-        Parameters
-        ----------
-        fields : container of str
-            Names of the message's fields.
-
-        Returns
-        -------
-        tuple of str
-            Names; empty if the message is not of this kind.
-        """
+        """Fields of a message that the function takes, in its order."""
         if any(name not in fields for name in self.required):
             return ()
         return tuple(name for name in self.required + self.optional if name in fields)
@@ -57,19 +38,11 @@ class ValueKind(NamedTuple):
 class FieldFunction(NamedTuple):
     """A number computed from the parts of a value, in two steps so that many messages share the first.
 
-    Parameters
-    ----------
-    takes : ValueKind
-        What it is a function of.
-    terms : callable
-        Takes the parts (x, y, z, w of a quaternion; floats, or arrays of them: the arithmetic is the same to the last
-        bit) to the arguments of `number`, and to what has to be positive for there to be one.
-    number : callable
-        Takes these arguments, floats alone, to the number: numpy's functions round otherwise than those of math.
-    unit : str, default ""
-        Unit of the number; "" if it is that of the parts.
-    wraps : bool, default False
-        Whether the number is an angle that jumps by a full turn.
+    `takes`: what it is a function of; `terms`: takes the parts (x, y, z, w of a quaternion; floats, or arrays of them:
+    the arithmetic is the same to the last bit) to the arguments of `number`, and to what has to be positive for there
+    to be one; `number`: takes these arguments, floats alone, to the number: numpy's functions round otherwise than
+    those of math; `unit`: unit of the number; "" if it is that of the parts; `wraps`: whether the number is an angle
+    that jumps by a full turn.
     """
 
     takes: ValueKind
@@ -79,53 +52,20 @@ class FieldFunction(NamedTuple):
     wraps: bool = False
 
     def of(self, value: Any) -> float:
-        """The number for one value of a message; NaN where there is none.
-
-        Parameters
-        ----------
-        value : object
-            A quaternion, a vector or an array in a decoded message.
-
-        Returns
-        -------
-        float
-            Angle in rad, or norm; NaN where there is none.
-        """
+        """The number for one value of a message; NaN where there is none."""
         names = self.takes.required + self.takes.optional
         if self.takes.array and not hasattr(value, names[0]):
             return self.of_parts(*(as_number(v) for v in value))
         return self.of_parts(*(getattr(value, name) for name in names if hasattr(value, name)))
 
     def of_parts(self, *parts: Any) -> float:
-        """The same from the parts of the value.
-
-        Parameters
-        ----------
-        *parts : float
-            x, y, z, w of a quaternion, or the elements of a vector.
-
-        Returns
-        -------
-        float
-            Angle in rad, or norm; NaN where there is none.
-        """
+        """The same from the parts of the value."""
         arguments, size = self.terms(*parts)
         return self.number(*arguments) if size > 0.0 else math.nan
 
 
 def as_number(value: Any) -> float:
-    """A number of a decoded message.
-
-    Parameters
-    ----------
-    value : object
-        As the decoder has it; rclpy has a `byte` as bytes.
-
-    Returns
-    -------
-    float
-        The number.
-    """
+    """A number of a decoded message."""
     return float(value[0] if isinstance(value, bytes) else value)
 
 

@@ -27,21 +27,8 @@ _KEYS = ("longest", "steps", "seconds")
 class HorizonRule:
     """What a fit is asked for; without a length the longest horizon is chosen as well.
 
-    Parameters
-    ----------
-    longest : float or None, optional
-        Longest horizon, s: a geometric set of horizons up to it, of which those stay that hold on left-out data.
-    steps : tuple of int, optional
-        Numbers of steps, each at least 2; all stay.
-    seconds : tuple of float, optional
-        The same in s.
-    widths : {"auto", "growing", "constant"}
-        Half-widths.
-
-    Raises
-    ------
-    SignalError
-        More than one of the lengths is given, or they are no such numbers.
+    `longest`: longest horizon, s: a geometric set of horizons up to it, of which those stay that hold on left-out data;
+    `steps`: numbers of steps, each at least 2; all stay; `seconds`: the same in s; `widths`: half-widths.
     """
 
     longest: float | None = None
@@ -71,25 +58,7 @@ class HorizonRule:
 
     @classmethod
     def of(cls, data: Any, where: str = "horizons") -> HorizonRule:
-        """From what a signals file, or an argument of `fit`, has.
-
-        Parameters
-        ----------
-        data : Any
-            "auto", a list of numbers of steps, or an object with one of longest, steps and seconds, and widths.
-        where : str, default "horizons"
-            What errors call it.
-
-        Returns
-        -------
-        HorizonRule
-            The rule.
-
-        Raises
-        ------
-        SignalError
-            It is none; names the key.
-        """
+        """From what a signals file, or an argument of `fit`, has."""
         if isinstance(data, cls):
             return data
         if isinstance(data, str) and data == "auto":

@@ -34,54 +34,20 @@ class Memory:
     Sample k takes y_{k - samples} (lag), y_k - y_{k-1} (diff) or (y_k - y_{k-1}) / Δt_{k-1} (rate); there is none until
     the segment has the samples that it needs.
 
-    Parameters
-    ----------
-    kind : {"lag", "diff", "rate"}
-        The function.
-    samples : int, default 1
-        Samples by which a lag is earlier.
+    `kind`: the function; `samples`: samples by which a lag is earlier.
     """
 
     kind: Literal["lag", "diff", "rate"]
     samples: int = 1
 
     def of(self, field: str) -> str:
-        """The field path of this memory of a field.
-
-        Parameters
-        ----------
-        field : str
-            Path of the field itself.
-
-        Returns
-        -------
-        str
-            For example `lag(position[j0], 2)`.
-        """
+        """The field path of this memory of a field."""
         return f"lag({field}, {self.samples})" if self.kind == "lag" else f"{self.kind}({field})"
 
 
 @lru_cache(maxsize=4096)
 def parse_memory(text: str) -> tuple[Memory | None, str]:
-    """Take the function of earlier samples off a field path.
-
-    Parameters
-    ----------
-    text : str
-        As a signals file has it.
-
-    Returns
-    -------
-    Memory or None
-        None if the path has no such function.
-    str
-        The path of the field itself.
-
-    Raises
-    ------
-    SignalError
-        The number of samples is out of range, or such functions are nested.
-    """
+    """Take the function of earlier samples off a field path."""
     match = re.fullmatch(rf"\s*({'|'.join(KINDS)})\s*\((.*)\)\s*", text, re.DOTALL)
     if not match:
         return None, text.strip()

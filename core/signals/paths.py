@@ -23,22 +23,7 @@ _MOST_NAMES = 100
 
 
 def numeric_paths(type_name: str, type_fields: TypeFields, depth: int = 6) -> Iterator[str]:
-    """Field paths of a type that can be signals; arrays end in `[]` (sequence) or `[n]` (fixed length).
-
-    Parameters
-    ----------
-    type_name : str
-        Type of the message, as package/msg/Name.
-    type_fields : callable
-        Type name -> {field name: FieldType}.
-    depth : int, default 6
-        Levels of nested messages that are opened.
-
-    Yields
-    ------
-    str
-        A path that leads to numbers or booleans.
-    """
+    """Field paths of a type that can be signals; arrays end in `[]` (sequence) or `[n]` (fixed length)."""
     for name, kind in type_fields(type_name).items():
         suffix = "" if kind.array is None else "[]" if kind.array == 0 else f"[{kind.array}]"
         if kind.kind in ("number", "bool"):
@@ -55,24 +40,6 @@ def signal_paths(
 
     The entries of an array stand as one path, `data[0..99]` for `data[0]` to `data[99]`, or as
     `position[fan]` each where the message names them; a quaternion is also offered as roll(...) and the like.
-
-    Parameters
-    ----------
-    type_fields : callable
-        Type name -> {field name: FieldType}.
-    type_name : str
-        Type of the message, as package/msg/Name.
-    message : object
-        A decoded message of that type.
-    before : str, default ""
-        Path that leads to this message from the outermost one, with its dot.
-    depth : int, optional
-        Levels of nested messages that are opened.
-
-    Yields
-    ------
-    str
-        A field path; an array as one path with the range of its indices.
     """
     fields = type_fields(type_name)
     for name, field in fields.items():

@@ -46,30 +46,13 @@ STEP_CHOICES = "recorded, constant, or the period in seconds"
 class Signal:
     """One state or control: where it is read, and the operating point it is measured from.
 
-    Parameters
-    ----------
-    name : str
-        Name of the signal; each in a map has its own.
-    topic : str
-        Topic that carries it.
-    field : str
-        Path of the number in the message, as `FieldPath` reads it.
-    steady : float or "auto", default 0.0
-        Steady state in recorded units; `auto` asks for the rule in `operating_point`.
-    scale : float or "auto", default 1.0
-        Positive scale in recorded units; `auto` likewise.
-    unit : str, default ""
-        Unit as it is shown.
-    type : str, default ""
-        Message type of the topic; empty while it is unknown.
-    max_hold : float or None, optional
-        Greatest age, s, at which a held control still counts; None for no limit. For controls only.
-    delay : int, default 0
-        Samples by which a control is shifted: sample k takes u(t_{k - delay}). For controls only.
-    valid : (float, float) or None, optional
-        Least and greatest value of the field; beyond them it counts as missing. None for no limit.
-    ignore : tuple of float, default ()
-        Values of the field that stand for none; each also as single precision rounds it.
+    `name`: name of the signal; each in a map has its own; `topic`: topic that carries it; `field`: path of the number
+    in the message, as `FieldPath` reads it; `steady`: steady state in recorded units; `auto` asks for the rule in
+    `operating_point`; `scale`: positive scale in recorded units; `auto` likewise; `unit`: unit as it is shown; `type`:
+    message type of the topic; empty while it is unknown; `max_hold`: greatest age, s, at which a held control still
+    counts; None for no limit. For controls only; `delay`: samples by which a control is shifted: sample k takes u(t_{k
+    - delay}). For controls only; `valid`: least and greatest value of the field; beyond them it counts as missing. None
+    for no limit; `ignore`: values of the field that stand for none; each also as single precision rounds it.
     """
 
     name: str
@@ -95,18 +78,7 @@ class Signal:
         return parse_memory(self.field)[1]
 
     def admits(self, value: float) -> bool:
-        """Whether a value of the field counts.
-
-        Parameters
-        ----------
-        value : float
-            Recorded units; NaN counts, as it says itself that there is none.
-
-        Returns
-        -------
-        bool
-            False outside `valid`, and for a value of `ignore`.
-        """
+        """Whether a value of the field counts."""
         low, high = self.valid or (-math.inf, math.inf)
         return not (value < low or value > high or value in self.ignored)
 
@@ -129,14 +101,8 @@ def _single(value: float) -> float:
 class Recalled:
     """A signal that follows from another one's samples.
 
-    Parameters
-    ----------
-    position : int
-        Of the signal in [x; u; s].
-    of : int
-        Of the state or control whose samples they are.
-    memory : Memory
-        How it follows.
+    `position`: of the signal in [x; u; s]; `of`: of the state or control whose samples they are; `memory`: how it
+    follows.
     """
 
     position: int
@@ -148,14 +114,8 @@ class Recalled:
 class ScheduleRule:
     """What a signals file says of one scheduling signal.
 
-    Parameters
-    ----------
-    signal : str
-        A state, a control or a further scheduling signal.
-    knots : "auto", int, tuple of float or None, optional
-        Chosen by what is left out, a number of knots, or knots in recorded units; None for modes.
-    modes : tuple of float, optional
-        Values of a discrete signal, in recorded units.
+    `signal`: A state, a control or a further scheduling signal; `knots`: chosen by what is left out, a number of knots,
+    or knots in recorded units; None for modes; `modes`: values of a discrete signal, in recorded units.
     """
 
     signal: str
@@ -166,12 +126,7 @@ class ScheduleRule:
 class UncarriedTopicError(SignalError):
     """A signals file names a topic that carries no signal.
 
-    Parameters
-    ----------
-    text : str
-        The sentence for a person.
-    topics : tuple of str
-        The topics that do carry a signal, any of which may be misspelt.
+    `text`: the sentence for a person; `topics`: the topics that do carry a signal, any of which may be misspelt.
     """
 
     def __init__(self, text: str, topics: tuple[str, ...]) -> None:

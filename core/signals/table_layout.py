@@ -29,14 +29,9 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 class TableLayout:
     """Which columns of a table (CSV, Parquet, .mat, .npz) say when and in which run a row was recorded.
 
-    Parameters
-    ----------
-    time : str or None, optional
-        Column of the time; None to look for one.
-    unit : {"s", "ms", "us", "ns"} or None, optional
-        Unit of a time column of numbers; None to take it from the column's name and size.
-    runs : str or None, optional
-        Column whose values tell the recordings in one file apart; None where a file is one recording.
+    `time`: column of the time; None to look for one; `unit`: unit of a time column of numbers; None to take it from the
+    column's name and size; `runs`: column whose values tell the recordings in one file apart; None where a file is one
+    recording.
     """
 
     time: str | None = None
@@ -45,25 +40,7 @@ class TableLayout:
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> TableLayout:
-        """Build from the structure of a signals file or a model file.
-
-        Parameters
-        ----------
-        data : object
-            Mapping with any of the parameters.
-        where : str
-            File and key, for the error.
-
-        Returns
-        -------
-        TableLayout
-            The layout.
-
-        Raises
-        ------
-        SignalError
-            A key is unknown, or a value is wrong.
-        """
+        """Build from the structure of a signals file or a model file."""
         given = checked_mapping(data, where, {"time", "unit", "runs"})
         for key in ("time", "runs"):
             value = given.get(key)
@@ -78,11 +55,5 @@ class TableLayout:
         return cls(names["time"], unit, names["runs"])
 
     def to_dict(self) -> dict[str, str]:
-        """Return what `from_dict` takes, without what is left open.
-
-        Returns
-        -------
-        dict of str to str
-            Plain data.
-        """
+        """Return what `from_dict` takes, without what is left open."""
         return {key: value for key, value in asdict(self).items() if value is not None}

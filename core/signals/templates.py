@@ -35,23 +35,6 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
     An entry of `states`, `controls`, `scheduling` or `structure` with the key `for` stands for one entry per member,
     which has the member in the place of each `{}`. `structure: own`, alone or as the first of the rules, fixes to 0
     what a state of one member takes from the signals of another.
-
-    Parameters
-    ----------
-    top : mapping
-        The structure of a signals file.
-    source : str
-        What errors call it.
-
-    Returns
-    -------
-    dict
-        The same without `for` and `own`.
-
-    Raises
-    ------
-    SignalError
-        A list of members cannot be read, an entry has no place for them, or there is nothing that `own` can tell apart.
     """
     found = dict(top)
     member: dict[str, str] = {}
@@ -88,25 +71,7 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def members_of(value: Any, where: str) -> list[str]:
-    """Members of a `for` list; `...` between two that are counted stands for those between.
-
-    Parameters
-    ----------
-    value : object
-        As YAML gives it.
-    where : str
-        What errors call it.
-
-    Returns
-    -------
-    list of str
-        The members.
-
-    Raises
-    ------
-    SignalError
-        It is no list of names and numbers, or what `...` stands for cannot be told.
-    """
+    """Members of a `for` list; `...` between two that are counted stands for those between."""
     if not isinstance(value, list) or not value:
         raise SignalError(f"{where} is {reprlib.repr(value)}; write a list, such as [j0, ..., j11]")
     if any(isinstance(v, bool) or not isinstance(v, (str, int)) or v == "" for v in value):

@@ -49,23 +49,7 @@ _TINY, _HUGE = 1e-12, LARGEST
 
 
 def kinds_of(statistics: Sequence[str] | str) -> tuple[str, ...]:
-    """Names of statistics.
-
-    Parameters
-    ----------
-    statistics : sequence of str, or str
-        Names, or one text with commas between them; `all` for every kind.
-
-    Returns
-    -------
-    tuple of str
-        In the order of `KINDS`, each once.
-
-    Raises
-    ------
-    FitError
-        One is no statistic, or there is none.
-    """
+    """Names of statistics."""
     names = statistics.split(",") if isinstance(statistics, str) else list(statistics)
     names = [name.strip() for name in names if name.strip()]
     for name in names:
@@ -80,16 +64,8 @@ def kinds_of(statistics: Sequence[str] | str) -> tuple[str, ...]:
 class Family:
     """Alarm rules that differ in one factor on their thresholds and margins alone.
 
-    Parameters
-    ----------
-    kinds : tuple of str, default ()
-        Statistics; none for containment alone.
-    window : int, default 1
-        In verdicts of containment, in median steps of statistics.
-    violations : int, default 1
-        m of m of n; 1 beside statistics.
-    dt : float, default 0.0
-        Median step, s; 0 if there is none.
+    `kinds`: statistics; none for containment alone; `window`: in verdicts of containment, in median steps of
+    statistics; `violations`: m of m of n; 1 beside statistics; `dt`: median step, s; 0 if there is none.
     """
 
     kinds: tuple[str, ...] = ()
@@ -110,19 +86,7 @@ class Family:
         return f"{', '.join(self.kinds)} over {self.window_s:.3g} s"
 
     def rules(self, model: UncertainLTI) -> tuple[Rule, ...]:
-        """The rules for one model, with thresholds and margins of 1.
-
-        Parameters
-        ----------
-        model : UncertainLTI
-            Its horizons are watched, too.
-
-        Returns
-        -------
-        tuple of Rule
-            Containment of one step and of each horizon, and every kind at one step and at the longest horizon; there
-            chi2 of one verdict, too.
-        """
+        """The rules for one model, with thresholds and margins of 1."""
         steps = [horizon.steps for horizon in model.horizons]
         if not self.kinds:
             return tuple(AlarmRule(self.violations, self.window, 1.0, h) for h in (1, *steps))
@@ -137,42 +101,14 @@ class Family:
 
 
 def longest_window(parts: Sequence[Part], dt: float) -> int:
-    """The longest window that the recordings support, in median steps.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    dt : float
-        Median step, s.
-
-    Returns
-    -------
-    int
-        SUPPORT of them are as long as the median recording or group, and two as the median part of it.
-    """
+    """The longest window that the recordings support, in median steps."""
     lengths = np.array([float(p.dt.sum()) for p in parts])
     typical = min(float(np.median(by_unit(parts, lengths))) / SUPPORT, float(np.median(lengths)) / 2.0)
     return int(typical / dt * (1.0 + 1e-9)) if dt else 0
 
 
 def families(parts: Sequence[Part], dt: float, kinds: Sequence[Sequence[str]] = ()) -> list[Family]:
-    """What may be armed, as far as the recordings support its window; the plainest first.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    dt : float
-        Median step, s.
-    kinds : sequence of sequence of str, optional
-        Sets of statistics that are armed together.
-
-    Returns
-    -------
-    list of Family
-        1 of 1, m of n, then each set of statistics over each window.
-    """
+    """What may be armed, as far as the recordings support its window; the plainest first."""
     longest = longest_window(parts, dt)
     found = [Family(dt=dt)]
     found += [Family((), n, m, dt) for m, n in COUNTED if n <= max(10, longest)]
@@ -184,19 +120,8 @@ def families(parts: Sequence[Part], dt: float, kinds: Sequence[Sequence[str]] = 
 def values_of(rules: Sequence[Rule], part: Part, table: Array | None = None) -> list[Array]:
     """What each rule compares with its threshold or margin, on one part.
 
-    Parameters
-    ----------
-    rules : sequence of Rule
-        Of `Family.rules`.
-    part : Part
-        The part.
-    table : array (K, rows, n), optional
-        Default that of the part.
-
-    Returns
-    -------
-    list of array (K, c)
-        Of each rule, of each state or of all together (c = 1).
+    `table` (K, rows, n): default that of the part; Returns (K, c): of each rule, of each state or of all together (c =
+    1).
     """
     model = part.judged_by
     assert model is not None
@@ -229,19 +154,8 @@ def _scale(peaks: Array) -> Array:
 class Armed:
     """One set of rules on a common scale; a single rule of containment on its own, that of margins.
 
-    Parameters
-    ----------
-    rules : sequence of Rule
-        Of `Family.rules`.
-    parts : sequence of Part
-        Left-out parts.
-
-    Attributes
-    ----------
-    rules : tuple of Rule
-        As given.
-    levels : list of array (K,)
-        Of each part the factor below which some rule raises the alarm; 0 where a margin of 1 does not.
+    `rules`: of `Family.rules`; `parts`: left-out parts; `rules`: as given; `levels` (K,): of each part the factor below
+    which some rule raises the alarm; 0 where a margin of 1 does not.
     """
 
     def __init__(self, rules: Sequence[Rule], parts: Sequence[Part]) -> None:
@@ -274,15 +188,7 @@ class Armed:
     def counts(self, factor: float) -> NDArray[np.intp]:
         """Alarms that are raised on each part.
 
-        Parameters
-        ----------
-        factor : float
-            On the scales.
-
-        Returns
-        -------
-        array (parts,) of int
-            Rising edges.
+        Returns (parts,): rising edges.
         """
         each = zip(self.levels, self._parts, strict=True)
         return np.array([rising(level > factor, part.starts) for level, part in each], dtype=np.intp)
@@ -292,17 +198,7 @@ class Armed:
     ) -> tuple[float, NDArray[np.intp]] | None:
         """The last factor before one does not keep to what is asked for.
 
-        Parameters
-        ----------
-        factors : iterable of float
-            From the largest down.
-        keeps : callable
-            Whether a factor, with the alarms of each part, keeps to it.
-
-        Returns
-        -------
-        (float, array (parts,) of int), or None
-            The factor and its alarms; None if the first does not keep to it.
+        Returns (parts,): the factor and its alarms; None if the first does not keep to it.
         """
         chosen = None
         for factor in factors:
@@ -313,18 +209,7 @@ class Armed:
         return chosen
 
     def at(self, factor: float) -> tuple[Rule, ...]:
-        """The rules with the thresholds and margins of one factor.
-
-        Parameters
-        ----------
-        factor : float
-            On the scales.
-
-        Returns
-        -------
-        tuple of Rule
-            Margins are at least 1, below which samples like those that were fitted would count as violations.
-        """
+        """The rules with the thresholds and margins of one factor."""
         found: list[Rule] = []
         for rule, scale in zip(self.rules, self._scales, strict=True):
             if isinstance(rule, AlarmRule):
@@ -340,28 +225,7 @@ def quiet(
 ) -> tuple[tuple[Rule, ...], NDArray[np.intp]]:
     """The rules of a family with the smallest factor that raises at most so many alarms on what was left out.
 
-    Parameters
-    ----------
-    family : Family
-        What is armed.
-    model : UncertainLTI
-        The full model.
-    parts : sequence of Part
-        What was left out.
-    allowed : int
-        Alarms.
-
-    Returns
-    -------
-    tuple of Rule
-        The alarm.
-    array (parts,) of int
-        Alarms of each part.
-
-    Raises
-    ------
-    FitError
-        No threshold is quiet: bounds without width are left.
+    Returns (parts,): alarms of each part.
     """
     armed = Armed(family.rules(model), parts)
     top = armed.top
@@ -382,30 +246,7 @@ def steady(
     Of few recordings left out one at a time and of many ways, the one with the lowest thresholds owes them to chance:
     fresh recordings then raise its alarm several times as often. What half of the recordings bound badly shows it.
 
-    Parameters
-    ----------
-    family : Family
-        What is armed.
-    model : UncertainLTI
-        The full model.
-    parts : sequence of Part
-        What was left out.
-    halves : sequence of sequence of Part
-        The same recordings, judged by models of half of them, for several ways to halve them: the median counts.
-    allowed : int
-        Alarms, on `parts` and on each of `halves`.
-
-    Returns
-    -------
-    tuple of Rule
-        The alarm.
-    array (parts,) of int
-        Alarms of each of `parts`.
-
-    Raises
-    ------
-    FitError
-        No threshold is quiet on `parts`: bounds without width are left.
+    Returns (parts,): alarms of each of `parts`.
     """
     rules, counts = quiet(family, model, parts, allowed)
     others = []

@@ -26,45 +26,12 @@ BLOCKS = 10
 
 
 def cut(transient: Transient, start: int, stop: int) -> Transient:
-    """Samples start..stop-1 as a transient of their own.
-
-    Parameters
-    ----------
-    transient : Transient
-        The whole.
-    start : int
-        First sample.
-    stop : int
-        First sample after it.
-
-    Returns
-    -------
-    Transient
-        Without counters and notes.
-    """
+    """Samples start..stop-1 as a transient of their own."""
     return transient.replace(slice(start, stop))
 
 
 def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
-    """Contiguous blocks with equal numbers of usable transitions; neighbours share one sample.
-
-    Parameters
-    ----------
-    transient : Transient
-        The whole recording.
-    blocks : int
-        How many.
-
-    Returns
-    -------
-    list of (int, int)
-        First sample, and first sample after it, of each block.
-
-    Raises
-    ------
-    FitError
-        There are fewer than two usable transitions per block.
-    """
+    """Contiguous blocks with equal numbers of usable transitions; neighbours share one sample."""
     usable = np.flatnonzero(transient.usable)
     if len(usable) < 2 * blocks:
         raise FitError(
@@ -77,44 +44,14 @@ def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
 
 
 def guard_interval(model: UncertainLTI, cuts: Sequence[tuple[Transient, int, int]]) -> float:
-    """Three of the slowest stable time constants of the model, at most half of the shortest block.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The fit to all recordings.
-    cuts : sequence of (Transient, int, int)
-        Each block: its recording, first sample, and first sample after it.
-
-    Returns
-    -------
-    float
-        Time on each side of a block that is not fitted, s.
-    """
+    """Three of the slowest stable time constants of the model, at most half of the shortest block."""
     stable = [-v.real for v in model.eigenvalues().ravel() if v.real < 0]
     shortest = min(float(t.t[stop - 1] - t.t[start]) for t, start, stop in cuts)
     return min(3.0 / min(stable) if stable else math.inf, 0.5 * shortest)
 
 
 def remaining_spans(transient: Transient, start: int, stop: int, gap: float) -> list[tuple[int, int]]:
-    """What is left of a transient without a block and the guard intervals on both sides of it.
-
-    Parameters
-    ----------
-    transient : Transient
-        The whole recording.
-    start : int
-        First sample of the block.
-    stop : int
-        First sample after the block.
-    gap : float
-        Guard interval, s.
-
-    Returns
-    -------
-    list of (int, int)
-        First sample, and first sample after it, of what is left before and after; empty if the block is the whole.
-    """
+    """What is left of a transient without a block and the guard intervals on both sides of it."""
     if (start, stop) == (0, len(transient)):
         return []
     t = transient.t

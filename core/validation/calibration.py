@@ -51,20 +51,10 @@ WORTH = 0.02
 class Candidate:
     """One alarm rule, or several armed together, at the smallest factor that keeps to the target.
 
-    Parameters
-    ----------
-    family : Family
-        What is armed, but for its thresholds.
-    margin : float or None
-        Of one-step bounds, the smallest; None if none keeps to the target.
-    alarms : int
-        False alarms on the left-out parts.
-    upper : float
-        One-sided upper confidence limit of the false alarms per hour.
-    rules : tuple of AlarmRule or StatisticRule
-        All that are armed; empty if none keeps to the target.
-    faults : Detectable or None
-        The smallest faults that are detected; None if none keeps to the target.
+    `family`: what is armed, but for its thresholds; `margin`: of one-step bounds, the smallest; None if none keeps to
+    the target; `alarms`: false alarms on the left-out parts; `upper`: one-sided upper confidence limit of the false
+    alarms per hour; `rules`: all that are armed; empty if none keeps to the target; `faults`: the smallest faults that
+    are detected; None if none keeps to the target.
     """
 
     family: Family
@@ -105,28 +95,13 @@ def _relative(faults: Detectable | None) -> NDArray[np.float64]:
 class Calibration:
     """The alarm rule that `calibrate` chose, and all it tried.
 
-    Parameters
-    ----------
-    alarm_rule : AlarmRule or None
-        For one-step containment; None if no rule can be shown to keep to the target.
-    target : float
-        Target rate: false alarms per hour at most.
-    confidence : float
-        That the true rate is below the target.
-    hours : float
-        Time under verdict in the left-out parts, h.
-    needed_hours : float
-        Time without a false alarm that would show the target, h.
-    within : float
-        Time within which the faults are seen by which rules were compared, s.
-    candidates : tuple of Candidate
-        One per rule tried.
-    words : str
-        The outcome as a sentence.
-    warning : str, default ""
-        What the chosen rule does not detect; empty if it sees biases or drifts of BLIND of the range of every state.
-    rules : tuple of AlarmRule or StatisticRule
-        All that were chosen to be armed together, for `UncertainLTI.alarm`; empty without a choice.
+    `alarm_rule`: for one-step containment; None if no rule can be shown to keep to the target; `target`: target rate:
+    false alarms per hour at most; `confidence`: that the true rate is below the target; `hours`: time under verdict in
+    the left-out parts, h; `needed_hours`: time without a false alarm that would show the target, h; `within`: time
+    within which the faults are seen by which rules were compared, s; `candidates`: one per rule tried; `words`: the
+    outcome as a sentence; `warning`: what the chosen rule does not detect; empty if it sees biases or drifts of BLIND
+    of the range of every state; `rules`: all that were chosen to be armed together, for `UncertainLTI.alarm`; empty
+    without a choice.
     """
 
     alarm_rule: AlarmRule | None
@@ -141,13 +116,7 @@ class Calibration:
     rules: tuple[Rule, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for the model file.
-
-        Returns
-        -------
-        dict
-            Plain data for JSON; null for what is infinite.
-        """
+        """Plain data for the model file."""
         return {
             "target_per_hour": self.target,
             "confidence": self.confidence,

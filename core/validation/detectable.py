@@ -69,30 +69,12 @@ GROWS = 10.0
 class Seen:
     """The smallest detectable fault of one kind on one signal.
 
-    Parameters
-    ----------
-    kind : str
-        One of `KINDS`.
-    signal : str
-        Name of the state or control.
-    unit : str
-        Of the size.
-    thresholds : array (cases,)
-        Smallest size that was seen in each case; inf where even the largest was not.
-    largest : float
-        The largest size tried.
-    size : float
-        Seen in SHARE of the cases; inf if the largest is not.
-    size_interval : tuple of (float, float)
-        Its confidence interval.
-    share : float
-        Share of the cases in which that size was seen; of the largest size if `size` is inf.
-    share_interval : tuple of (float, float)
-        Confidence interval of the share of all such cases, of which these are some.
-    delay : float
-        Median time from the onset to the alarm at that size, s; NaN if none was seen.
-    refused : str
-        Why nothing is known; "" otherwise.
+    `kind`: one of `KINDS`; `signal`: name of the state or control; `unit`: of the size; `thresholds` (cases,): smallest
+    size that was seen in each case; inf where even the largest was not; `largest`: the largest size tried; `size`: seen
+    in SHARE of the cases; inf if the largest is not; `size_interval`: its confidence interval; `share`: share of the
+    cases in which that size was seen; of the largest size if `size` is inf; `share_interval`: confidence interval of
+    the share of all such cases, of which these are some; `delay`: median time from the onset to the alarm at that size,
+    s; NaN if none was seen; `refused`: why nothing is known; "" otherwise.
     """
 
     kind: str
@@ -108,13 +90,7 @@ class Seen:
     refused: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for the model file.
-
-        Returns
-        -------
-        dict
-            null for what is infinite or unknown.
-        """
+        """Plain data for the model file."""
         return {
             "kind": self.kind,
             "of": KINDS[self.kind].of,
@@ -135,22 +111,9 @@ class Seen:
 class Detectable:
     """The smallest detectable faults of a model with its alarm rule.
 
-    Parameters
-    ----------
-    within : float
-        Time within which a fault is seen, s.
-    confidence : float
-        Of the intervals.
-    cases : int
-        Onsets of each fault.
-    left_out : int
-        Cases that were left out because the alarm was raised without a fault.
-    faults : tuple of Seen
-        By kind and signal.
-    refused : str
-        Why there is none; "" otherwise.
-    units : array (cases,) of int
-        Number of what each case was left out with.
+    `within`: time within which a fault is seen, s; `confidence`: of the intervals; `cases`: onsets of each fault;
+    `left_out`: cases that were left out because the alarm was raised without a fault; `faults`: by kind and signal;
+    `refused`: why there is none; "" otherwise; `units` (cases,): number of what each case was left out with.
     """
 
     within: float
@@ -162,13 +125,7 @@ class Detectable:
     units: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for the model file.
-
-        Returns
-        -------
-        dict
-            Sizes in recorded units.
-        """
+        """Plain data for the model file."""
         return {
             "within": self.within,
             "share": SHARE,
@@ -180,20 +137,7 @@ class Detectable:
         }
 
     def find(self, kind: str, signal: str) -> Seen | None:
-        """One of the faults.
-
-        Parameters
-        ----------
-        kind : str
-            One of `KINDS`.
-        signal : str
-            Name of the state or control.
-
-        Returns
-        -------
-        Seen or None
-            None if it was not looked for.
-        """
+        """One of the faults."""
         return next((f for f in self.faults if (f.kind, f.signal) == (kind, signal)), None)
 
 
@@ -271,17 +215,8 @@ class _Cases:
 def log_sizes(faults: Iterable[tuple[ArrayLike, float]], kept: NDArray[np.bool_] | None = None) -> Array:
     """Logarithms of the smallest detectable sizes of some faults, to be compared.
 
-    Parameters
-    ----------
-    faults : iterable of (array (cases,), float)
-        Of each the `Seen.thresholds`, and the largest size tried.
-    kept : array (cases,) of bool, optional
-        Cases that count; default all.
-
-    Returns
-    -------
-    array (faults,)
-        What is never seen counts as MOST_SEEN times the largest tried; NaN without a case.
+    `faults` (cases,): of each the `Seen.thresholds`, and the largest size tried; `kept` (cases,): cases that count;
+    default all; Returns (faults,): what is never seen counts as MOST_SEEN times the largest tried; NaN without a case.
     """
     found = []
     for thresholds, largest in faults:
@@ -296,35 +231,13 @@ def log_sizes(faults: Iterable[tuple[ArrayLike, float]], kept: NDArray[np.bool_]
 
 
 def check_within(within: float | None) -> None:
-    """Refuse a time in which nothing can be seen.
-
-    Parameters
-    ----------
-    within : float or None
-        s; None for the default.
-
-    Raises
-    ------
-    FitError
-        It is not a positive number.
-    """
+    """Refuse a time in which nothing can be seen."""
     if within is not None and not (math.isfinite(within) and within > 0):
         raise FitError(f"within is {within}; give a positive number of seconds")
 
 
 def typical_within(parts: Sequence[Part]) -> float:
-    """Time within which a fault shall be seen, where nobody says.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-
-    Returns
-    -------
-    float
-        s.
-    """
+    """Time within which a fault shall be seen, where nobody says."""
     steps = np.concatenate([p.dt for p in parts])
     spans = [float(p.dt.sum()) for p in parts if p.judged]
     if not spans:
@@ -350,35 +263,6 @@ def detectable(
     is raised within the time; cases in which it is raised without the fault are left out. In each case the smallest
     size that is seen is found by bisection, and the one that SHARE of the cases see is reported, with the interval that
     `quantile_share_interval` gives for cases that come in recordings or groups.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The full model: its alarm rule is tried, and its nominal model gives the response to faults of actuators.
-    parts : sequence of Part
-        What was left out, of `validate`.
-    within : float, optional
-        Time within which a fault is seen, s; default `typical_within`.
-    kinds : sequence of str, optional
-        Kinds of faults, of `KINDS`.
-    cases : int, default CASES
-        Onsets of each fault; fewer where all of them together would take more than LIMIT samples.
-    confidence : float, default 0.9
-        Of the intervals.
-    seed : int, default 0
-        Of the onsets, signs and noise; one seed, one result.
-    progress : callable, optional
-        Called with one line of text per fault.
-
-    Returns
-    -------
-    Detectable
-        The sizes; refused if no part is long enough.
-
-    Raises
-    ------
-    FitError
-        The time is not positive, there is no such kind, or the parts do not hold their models.
     """
     for kind in kinds:
         if kind not in KINDS:

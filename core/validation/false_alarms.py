@@ -26,22 +26,7 @@ _ROUNDING = 1e-9
 
 
 def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> dict[str, Any]:
-    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to as many parts.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    rule : AlarmRule
-        The alarm rule.
-    confidence : float
-        Of the interval, two-sided.
-
-    Returns
-    -------
-    dict
-        The rule, counts, `raised_share` of the time, `per_hour` and its `interval`; None without a verdict.
-    """
+    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to as many parts."""
     counts = [p.alarms(rule) for p in parts]
     hours = sum(p.hours for p in parts)
     raised = sum(float(p.dt[p.level(rule.violations, rule.window) > rule.margin].sum()) for p in parts) / 3600.0
@@ -59,20 +44,7 @@ def false_alarms(parts: Sequence[Part], rule: AlarmRule, confidence: float) -> d
 
 
 def allowed_alarms(rate: float, hours: float) -> int:
-    """False alarms that a rate allows in so many hours.
-
-    Parameters
-    ----------
-    rate : float
-        Per hour, at most.
-    hours : float
-        Time under verdict, a sum of steps: short of a whole number by rounding, it counts as that number.
-
-    Returns
-    -------
-    int
-        Whole alarms.
-    """
+    """False alarms that a rate allows in so many hours."""
     return math.floor(rate * hours * (1.0 + _ROUNDING))
 
 
@@ -81,18 +53,6 @@ def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
 
     The margin is that at which three parts or groups alarm, but not below NEARBY times the rule's: far below, alarms
     are of another kind.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    rule : AlarmRule
-        The alarm rule.
-
-    Returns
-    -------
-    float
-        As `cluster_size`.
     """
     levels = [p.level(rule.violations, rule.window) for p in parts]
     margin = borrowed_margin(peaks(parts, levels), rule.margin)
@@ -103,17 +63,7 @@ def typical_cluster(parts: Sequence[Part], rule: AlarmRule) -> float:
 def peaks(parts: Sequence[Part], levels: Sequence[Array]) -> list[float]:
     """Largest level of each part that was left out alone, and of each group.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    levels : sequence of array (K,)
-        `Part.level` of each.
-
-    Returns
-    -------
-    list of float
-        One per part or group.
+    `levels` (K,): `Part.level` of each.
     """
     found: dict[int, float] = {}
     for unit, level in zip(unit_numbers(parts).tolist(), levels, strict=True):
@@ -122,20 +72,7 @@ def peaks(parts: Sequence[Part], levels: Sequence[Array]) -> list[float]:
 
 
 def borrowed_margin(largest: Sequence[float], margin: float) -> float:
-    """The margin at which clusters of alarms are counted.
-
-    Parameters
-    ----------
-    largest : sequence of float
-        Of `peaks`.
-    margin : float
-        The rule's.
-
-    Returns
-    -------
-    float
-        At most the rule's, at least NEARBY times it.
-    """
+    """The margin at which clusters of alarms are counted."""
     third = sorted(largest, reverse=True)[min(2, len(largest) - 1)]
     # a little below the third peak: an alarm that only just starts is always alone
     return min(margin, max(0.95 * third, NEARBY * margin))

@@ -89,34 +89,6 @@ def validate_model(
 
     The key by which its file says that the recordings are grouped, `fit --group`, applies unless groups or blocks are
     given.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Of `fit`, with its summary.
-    transients : sequence of Transient
-        The recordings it was fitted to.
-    blocks : int, optional
-        As in `left_out.validate`.
-    gap : float, optional
-        As in `left_out.validate`.
-    groups : sequence or str, optional
-        As in `left_out.validate`; "none" leaves out single recordings nevertheless.
-    confidence : float, default 0.9
-        As in `left_out.validate`.
-    progress : callable, optional
-        As in `left_out.validate`.
-
-    Returns
-    -------
-    Validation
-        As of `left_out.validate`.
-
-    Raises
-    ------
-    FitError
-        As of `left_out.validate`; or the model does not state how it was fitted, or a fit to the recordings gives
-        another model.
     """
     if isinstance(groups, str) and groups == "none":
         groups = None
@@ -155,29 +127,6 @@ def leave_out_with_fit(
 
     Whether it is done depends on the recordings and the model alone, never on how long anything took: it is done
     if the elements of all left-out problems together (fits, transitions, states, signals) are at most `limit`.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    model : UncertainLTI
-        Fitted to them.
-    groups : sequence or str, optional
-        As in `left_out.validate`.
-    progress : callable, optional
-        Called with one line of text per fit.
-    limit : float, default LIMIT
-        Elements of all left-out problems together.
-
-    Returns
-    -------
-    dict
-        As `summary`, or with the key `not_done` alone.
-
-    Raises
-    ------
-    FitError
-        The groups do not fit the recordings.
     """
     names, _ = resolve_groups(transients, groups)
     fits = len(set(names)) if names else len(transients) if len(transients) > 1 else BLOCKS

@@ -79,27 +79,7 @@ def group_names(transients: Sequence[Transient], key: str) -> list[str]:
 
 
 def resolve_groups(transients: Sequence[Transient], groups: Sequence[Any] | str | None) -> tuple[list[str], str]:
-    """The group of each recording, and in words what the groups are; ([], "") without any.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        The recordings.
-    groups : sequence, or str, optional
-        One name per recording, or a key of `group_names`.
-
-    Returns
-    -------
-    names : list of str
-        One per recording.
-    grouping : str
-        What the groups are.
-
-    Raises
-    ------
-    FitError
-        As `group_names`; or there are not two groups, or not one name per recording.
-    """
+    """The group of each recording, and in words what the groups are; ([], "") without any."""
     if groups is None:
         return [], ""
     if isinstance(groups, str):
@@ -190,16 +170,6 @@ def likely_groups(transients: Sequence[Transient]) -> str:
     """A sentence if recordings seem to come in groups, by the folders and the hours they are from; else "".
 
     Recordings that overlap in time (simulated ones, mostly) cannot be distinguished by their hours.
-
-    Parameters
-    ----------
-    transients : sequence of Transient
-        As read from recordings.
-
-    Returns
-    -------
-    str
-        What was found, and what to do.
     """
     count = len(transients)
     if count < 3:

@@ -38,16 +38,9 @@ from uncertain_lti.signals.signal_map import Recalled
 class Kind:
     """A kind of fault.
 
-    Parameters
-    ----------
-    of : str
-        What fails: `sensor` (of a state), `actuator` (a control) or `dynamics` (of a state).
-    unit : str
-        Of its size: `recorded` (that of the signal), `rate` (that per s), `share`, or `s`.
-    words : str
-        What happens.
-    both : bool, default False
-        Whether it may be of either sign.
+    `of`: what fails: `sensor` (of a state), `actuator` (a control) or `dynamics` (of a state); `unit`: of its size:
+    `recorded` (that of the signal), `rate` (that per s), `share`, or `s`; `words`: what happens; `both`: whether it may
+    be of either sign.
     """
 
     of: str
@@ -79,23 +72,9 @@ KINDS: Mapping[str, Kind] = {
 class Fault:
     """One fault.
 
-    Parameters
-    ----------
-    kind : str
-        One of `KINDS`.
-    signal : str
-        Name of the state, or of an actuator's control.
-    size : float
-        In the unit of its kind; negative for the other direction, where there is one.
-    at : float
-        Onset, s after the first sample; it begins with the first sample at or after.
-    seed : int, default 0
-        Of noise.
-
-    Raises
-    ------
-    FitError
-        There is no such kind, or the size does not fit it.
+    `kind`: one of `KINDS`; `signal`: name of the state, or of an actuator's control; `size`: in the unit of its kind;
+    negative for the other direction, where there is one; `at`: onset, s after the first sample; it begins with the
+    first sample at or after; `seed`: of noise.
     """
 
     kind: str
@@ -115,18 +94,8 @@ class Fault:
 class Windows:
     """Stretches of recordings of equal length, side by side, all with the onset of a fault at the same sample.
 
-    Parameters
-    ----------
-    t : array (W, L)
-        Instants, s.
-    x : array (W, L, n)
-        States, recorded units; NaN where there is none.
-    u : array (W, L, m)
-        Controls, recorded units.
-    s : array (W, L, q)
-        Further scheduling signals, recorded units.
-    onset : int
-        The first sample of the fault.
+    `t` (W, L): instants, s; `x` (W, L, n): states, recorded units; NaN where there is none; `u` (W, L, m): controls,
+    recorded units; `s` (W, L, q): further scheduling signals, recorded units; `onset`: the first sample of the fault.
     """
 
     t: Array
@@ -138,43 +107,13 @@ class Windows:
     def take(self, which: NDArray[np.bool_]) -> Windows:
         """Some of them.
 
-        Parameters
-        ----------
-        which : array (W,) of bool
-            Those that are wanted.
-
-        Returns
-        -------
-        Windows
-            In the same order.
+        `which` (W,): those that are wanted.
         """
         return replace(self, t=self.t[which], x=self.x[which], u=self.u[which], s=self.s[which])
 
 
 def position(kind: str, signal: str, states: Sequence[str], controls: Sequence[str]) -> int:
-    """Column of the signal that a fault is of.
-
-    Parameters
-    ----------
-    kind : str
-        One of `KINDS`.
-    signal : str
-        Its name.
-    states : sequence of str
-        Names of the states.
-    controls : sequence of str
-        Names of the controls.
-
-    Returns
-    -------
-    int
-        Column in x, or in u for an actuator.
-
-    Raises
-    ------
-    FitError
-        There is no such signal.
-    """
+    """Column of the signal that a fault is of."""
     names = controls if KINDS[kind].of == "actuator" else states
     what = "control" if KINDS[kind].of == "actuator" else "state"
     if signal not in names:
@@ -183,27 +122,7 @@ def position(kind: str, signal: str, states: Sequence[str], controls: Sequence[s
 
 
 def inject(transient: Transient, fault: Fault, model: UncertainLTI | None = None) -> Transient:
-    """A recording as it would have been with a fault.
-
-    Parameters
-    ----------
-    transient : Transient
-        Of a healthy machine.
-    fault : Fault
-        The fault.
-    model : UncertainLTI, optional
-        Its nominal model gives the response to faults of actuators and of the dynamics; sensors need none.
-
-    Returns
-    -------
-    Transient
-        With changed states, and the recorded controls.
-
-    Raises
-    ------
-    FitError
-        There is no such signal; or the fault needs a model and there is none.
-    """
+    """A recording as it would have been with a fault."""
     i = position(fault.kind, fault.signal, transient.state_names, transient.control_names)
     onset = int(np.searchsorted(transient.t, fault.at - 1e-12))
     windows = Windows(transient.t[None], transient.x[None], transient.u[None], transient.s[None], onset)
@@ -226,36 +145,9 @@ def faulty(
 ) -> tuple[Array, Array]:
     """States and controls of many recordings at once, each with a fault of its own size.
 
-    Parameters
-    ----------
-    windows : Windows
-        Without a fault.
-    kind : str
-        One of `KINDS`.
-    i : int
-        Column of the signal, of `position`.
-    size : array (W,)
-        Size of the fault in each.
-    noise : array (W, L)
-        Standard normal numbers.
-    recalled : sequence of Recalled, optional
-        Controls that are memories of states or controls: those of a state follow its readings.
-    model : UncertainLTI, optional
-        As in `inject`.
-    segment : array (W, L) of int, optional
-        Segments of the samples, over which no response goes on; default one.
-
-    Returns
-    -------
-    array (W, L, n)
-        States, recorded units.
-    array (W, L, m)
-        Controls, recorded units: those of `windows`, but for the memories of states.
-
-    Raises
-    ------
-    FitError
-        The fault needs a model and there is none.
+    `size` (W,): size of the fault in each; `noise` (W, L): standard normal numbers; `segment` (W, L): segments of the
+    samples, over which no response goes on; default one; Returns (W, L, n): states, recorded units; Returns (W, L, m):
+    controls, recorded units: those of `windows`, but for the memories of states.
     """
     if KINDS[kind].of == "sensor":
         x = windows.x.copy()

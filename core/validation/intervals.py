@@ -22,15 +22,7 @@ from uncertain_lti.base.arrays import Array
 def cluster_size(counts: ArrayLike) -> float:
     """Σc² / Σc of the events c_g counted on transient g: how many come at once, weighted by events; 1 without any.
 
-    Parameters
-    ----------
-    counts : array (G,)
-        Events on each transient.
-
-    Returns
-    -------
-    float
-        At least 1 for whole counts.
+    `counts` (G,): events on each transient.
     """
     c = np.asarray(counts, dtype=np.float64)
     return float(np.sum(c**2) / np.sum(c)) if c.any() else 1.0
@@ -46,25 +38,7 @@ def rate_interval(
     limits hold. As `size` is estimated from G transients, the tails are those of Student's t with G - 1 degrees of
     freedom in place of the normal's.
 
-    Parameters
-    ----------
-    counts : array (G,)
-        Events on each transient.
-    exposure : float
-        Total over all transients, in the unit wanted (h, verdicts).
-    confidence : float
-        Of the interval; with `one_sided`, of its upper limit alone.
-    size : float, optional
-        Cluster size; at least that of `counts` is used. Counts that are all 0 have none: give one estimated elsewhere.
-    one_sided : bool, default False
-        Whether the upper limit alone is wanted; the lower one is then 0.
-
-    Returns
-    -------
-    float
-        Lower limit; 0 for fewer than two transients or no exposure.
-    float
-        Upper limit; inf on the same condition.
+    `counts` (G,): events on each transient.
     """
     from scipy.special import gammainccinv, gammaincinv, ndtr, stdtrit
 
@@ -80,24 +54,7 @@ def rate_interval(
 
 
 def share_interval(hits: int, trials: int, confidence: float) -> tuple[float, float]:
-    """Exact binomial (Clopper-Pearson) interval for the share of whole transients.
-
-    Parameters
-    ----------
-    hits : int
-        Transients with the property.
-    trials : int
-        All transients.
-    confidence : float
-        Of the interval, two-sided.
-
-    Returns
-    -------
-    float
-        Lower limit.
-    float
-        Upper limit.
-    """
+    """Exact binomial (Clopper-Pearson) interval for the share of whole transients."""
     from scipy.stats import beta
 
     tail = (1.0 - confidence) / 2.0
@@ -115,23 +72,7 @@ def quantile_share_interval(
     the design effect, the variance of the clusters' totals over that of independent cases (at least 1). As it is
     estimated from G clusters, the tails are those of Student's t with G - 1 degrees of freedom.
 
-    Parameters
-    ----------
-    units : array (N,) of int
-        Cluster of each case.
-    hits : array (N,) of bool
-        Whether it has the property.
-    confidence : float
-        Of the interval, two-sided.
-    share : float, optional
-        In place of the share of the cases, as the middle of the interval.
-
-    Returns
-    -------
-    float
-        Share of the cases.
-    tuple of (float, float)
-        Its limits; (0, 1) for fewer than two clusters.
+    `units` (N,): cluster of each case; `hits` (N,): whether it has the property.
     """
     from scipy.special import ndtr, stdtrit
     from scipy.stats import beta
@@ -165,22 +106,6 @@ def scenario_interval(support: int, transients: int, confidence: float) -> tuple
         C(N,k) t^(N-k) - β/2N Σ_{i=k}^{N-1} C(i,k) t^(i-k) - β/6N Σ_{i=N+1}^{4N} C(i,k) t^(i-k) = 0,
 
     k = support, β = 1 - confidence.
-
-    Parameters
-    ----------
-    support : int
-        Transients that would change the solution if left out, k.
-    transients : int
-        All transients, N.
-    confidence : float
-        1 - β.
-
-    Returns
-    -------
-    float
-        Lower limit, 1 - t_2.
-    float
-        Upper limit, 1 - t_1.
     """
     from scipy.optimize import brentq
     from scipy.special import gammaln, logsumexp
@@ -223,22 +148,6 @@ def discarding_bound(variables: int, discarded: int, transients: int, confidence
     C(k+d-1, k) P[Binomial(N, ε) <= k+d-1] = 1 - confidence, with d decision variables and k discarded of N
     independent transients, whichever rule discards them. 1 where there are too few. discarded = 0 is the plain
     bound before looking at the solution.
-
-    Parameters
-    ----------
-    variables : int
-        Decision variables, d.
-    discarded : int
-        Transients discarded, k.
-    transients : int
-        All transients, N.
-    confidence : float
-        Of the bound.
-
-    Returns
-    -------
-    float
-        ε, 0 to 1.
     """
     from scipy.optimize import brentq
     from scipy.special import gammaln

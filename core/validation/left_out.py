@@ -46,47 +46,7 @@ def validate(
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Validation:
-    """Leave out one recording or group at a time, fit to the others, and judge what was left out.
-
-    Parameters
-    ----------
-    transients : Transient or sequence of Transient
-        The recordings.
-    operating_point : OperatingPoint, optional
-        As in `fit`.
-    weights : array or sequence of array, optional
-        As in `fit`; weights per sample go with their samples.
-    alarm_rule : AlarmRule, optional
-        As in `fit`.
-    blocks : int, optional
-        Cut every recording into this many contiguous blocks and leave out one block at a time. Default: whole
-        recordings if there are two or more, else BLOCKS blocks.
-    gap : float, optional
-        Time on both sides of a left-out block that is not fitted either, s, because it resembles the block. Default:
-        three times the slowest time constant of the nominal model, at most half a block.
-    groups : sequence or str, optional
-        What the recordings have in common: one name (of a machine, a day, an operator) per recording, or a key of
-        `groups.group_names`. A whole group is left out at a time, and the intervals count groups. Without it they
-        treat every recording as independent of the others.
-    confidence : float, default 0.9
-        Of every interval, 0.5 to below 1.
-    full : UncertainLTI, optional
-        The fit to all recordings, if it is done already.
-    progress : callable, optional
-        Called with one line of text per fit.
-    **options : object
-        Further arguments of `fit`. Every fit has the schedule and the horizons of the fit to all recordings.
-
-    Returns
-    -------
-    Validation
-        The parts, each judged by the model that was fitted without it.
-
-    Raises
-    ------
-    FitError
-        There is too little to leave out, an option is out of range, or a left-out fit fails (names the part).
-    """
+    """Leave out one recording or group at a time, fit to the others, and judge what was left out."""
     transients = listed_transients(transients)
     if not 0.5 <= confidence < 1.0:
         raise FitError(f"confidence is {confidence:g}; it must be at least 0.5 and below 1")

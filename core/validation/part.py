@@ -30,48 +30,19 @@ from uncertain_lti.sampling.transient import Transient, Transitions
 class Part:
     """A recording, or a block of one, judged by the model that was fitted without it.
 
-    Parameters
-    ----------
-    name : str
-        What was left out.
-    dt : array (K,)
-        Step of each judged transition, s.
-    utilisation : array (K, n)
-        (x_next - centre) / half of every judged transition.
-    starts : tuple of int
-        Positions at which the alarm restarts: 0, and after every step back in time.
-    violations : array (n,) of int
-        Violated verdicts of each state at margin 1.
-    violated : int
-        Verdicts violated on any state at margin 1.
-    outside_domain : int
-        Verdicts from outside the domain fitted without this part.
-    unseen : int
-        Violated verdicts from inside that domain.
-    mean_width : array (n,)
-        Of the left-out model's bounds on this part, recorded units.
-    max_width : array (n,)
-        The largest such width.
-    relative_width : array (n,)
-        The mean over that of the full model on the same samples.
-    group : str
-        What was left out together with it; "" if it was left out alone.
-    block : array (K,) of int, optional
-        Block of the full model that has the largest weight at each judged transition; 0 without a schedule.
-    model : UncertainLTI, optional
-        Fitted without it.
-    transient : Transient, optional
-        What was left out.
-    longer : array (K, H, n), optional
-        Utilisation by each horizon of the full model; NaN where a window is broken, or the left-out model has none.
-    longer_width : array (H, n), optional
-        Mean width of the left-out model's envelopes over each horizon on this part, recorded units; NaN likewise.
-    residual : array (K, n), optional
-        x_next - centre of every judged transition, normalised.
-    longer_residual : array (K, H, n), optional
-        The same of each horizon; NaN as in `longer`.
-    judged_by : UncertainLTI, optional
-        The full model with the residuals of the left-out one: what a statistic on this part takes.
+    `name`: what was left out; `dt` (K,): step of each judged transition, s; `utilisation` (K, n): (x_next - centre) /
+    half of every judged transition; `starts`: positions at which the alarm restarts: 0, and after every step back in
+    time; `violations` (n,): violated verdicts of each state at margin 1; `violated`: verdicts violated on any state at
+    margin 1; `outside_domain`: verdicts from outside the domain fitted without this part; `unseen`: violated verdicts
+    from inside that domain; `mean_width` (n,): of the left-out model's bounds on this part, recorded units; `max_width`
+    (n,): the largest such width; `relative_width` (n,): the mean over that of the full model on the same samples;
+    `group`: what was left out together with it; "" if it was left out alone; `block` (K,): block of the full model that
+    has the largest weight at each judged transition; 0 without a schedule; `model`: fitted without it; `transient`:
+    what was left out; `longer` (K, H, n): utilisation by each horizon of the full model; NaN where a window is broken,
+    or the left-out model has none; `longer_width` (H, n): mean width of the left-out model's envelopes over each
+    horizon on this part, recorded units; NaN likewise; `residual` (K, n): x_next - centre of every judged transition,
+    normalised; `longer_residual` (K, H, n): the same of each horizon; NaN as in `longer`; `judged_by`: the full model
+    with the residuals of the left-out one: what a statistic on this part takes.
     """
 
     name: str
@@ -116,19 +87,7 @@ class Part:
     def level(self, violations: int, window: int, severity: Array | None = None) -> Array:
         """The margin below which the alarm is raised: the m-th largest severity of the last n verdicts.
 
-        Parameters
-        ----------
-        violations : int
-            m.
-        window : int
-            n, in verdicts.
-        severity : array (K,), optional
-            Default that of the part.
-
-        Returns
-        -------
-        array (K,)
-            -inf until there are m verdicts.
+        `severity` (K,): default that of the part; Returns (K,): -inf until there are m verdicts.
         """
         severity = self.severity if severity is None else severity
         level = np.empty(len(severity))
@@ -153,18 +112,7 @@ class Part:
         return np.concatenate([row for row in rows if row.size or not self.judged], axis=1)
 
     def alarms(self, rule: AlarmRule) -> int:
-        """How often the alarm is raised (rising edges).
-
-        Parameters
-        ----------
-        rule : AlarmRule
-            The alarm rule, with its margin.
-
-        Returns
-        -------
-        int
-            Rising edges.
-        """
+        """How often the alarm is raised (rising edges)."""
         return rising(self.level(rule.violations, rule.window) > rule.margin, self.starts)
 
 
@@ -172,26 +120,7 @@ _NUMBERS = 2**22  # of one piece of `Part.level`
 
 
 def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str, group: str = "") -> Part:
-    """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Fitted without the transient.
-    full : UncertainLTI
-        Gives the widths that the left-out ones are compared with.
-    transient : Transient
-        What was left out.
-    name : str
-        Its name.
-    group : str, default ""
-        What was left out together with it.
-
-    Returns
-    -------
-    Part
-        The verdicts.
-    """
+    """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1."""
     verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
     judged = verdicts.judged
     steps = transient.transitions()
@@ -260,15 +189,7 @@ def _residual(model: UncertainLTI, steps: Transitions) -> Array:
 def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
     """Number of what each part was left out with: its group, or a number of its own.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-
-    Returns
-    -------
-    array (parts,) of int
-        From 0, in order of first appearance.
+    Returns (parts,): from 0, in order of first appearance.
     """
     numbers: dict[str, int] = {}
     found = [
@@ -278,20 +199,7 @@ def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
 
 
 def by_unit(parts: Sequence[Part], values: ArrayLike) -> Array:
-    """Sums over what was left out together.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-        Left-out parts.
-    values : array (..., parts)
-        One value per part.
-
-    Returns
-    -------
-    array (..., units)
-        Sums over each group, or the values themselves if every part was left out alone.
-    """
+    """Sums over what was left out together."""
     values = np.asarray(values, dtype=np.float64)
     numbers = unit_numbers(parts)
     member = numbers[:, None] == np.arange(int(numbers.max(initial=-1)) + 1)
@@ -301,17 +209,7 @@ def by_unit(parts: Sequence[Part], values: ArrayLike) -> Array:
 def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:
     """Rising edges of an alarm that restarts, cleared, at each of `starts`.
 
-    Parameters
-    ----------
-    raised : array (K,) of bool
-        Whether the alarm is raised.
-    starts : sequence of int
-        Positions at which it restarts.
-
-    Returns
-    -------
-    int
-        Rising edges.
+    `raised` (K,): whether the alarm is raised.
     """
     before = np.concatenate([[False], raised[:-1]])
     before[[s for s in starts if s < len(raised)]] = False

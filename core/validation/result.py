@@ -117,18 +117,7 @@ class Validation:
 
 
 def summary(validation: Validation) -> dict[str, Any]:
-    """Everything `validate` found as plain data; the fields are described in docs/validation.md.
-
-    Parameters
-    ----------
-    validation : Validation
-        Of `validate`.
-
-    Returns
-    -------
-    dict
-        Plain data for JSON; widths in recorded units.
-    """
+    """Everything `validate` found as plain data; the fields are described in docs/validation.md."""
     v, model, parts = validation, validation.model, validation.parts
     judged = sum(p.judged for p in parts)
     hours = sum(p.hours for p in parts)
@@ -208,34 +197,12 @@ def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
 
 
 def short_condition(validation: Validation) -> str:
-    """What must be true for the intervals to hold, in a few words.
-
-    Parameters
-    ----------
-    validation : Validation
-        Of `validate`.
-
-    Returns
-    -------
-    str
-        A clause that follows an interval.
-    """
+    """What must be true for the intervals to hold, in a few words."""
     return f"if the {validation.what}s are independent and show all that happens"
 
 
 def condition(validation: Validation) -> str:
-    """What must be true for the intervals to hold.
-
-    Parameters
-    ----------
-    validation : Validation
-        Of `validate`.
-
-    Returns
-    -------
-    str
-        A sentence.
-    """
+    """What must be true for the intervals to hold."""
     v = validation
     if v.kind == "blocks":
         return (
@@ -263,20 +230,7 @@ def _whole_interval(validation: Validation) -> list[float]:
 
 
 def full_widths(model: UncertainLTI) -> tuple[list[float], list[float]]:
-    """Widths of the full fit on its own samples.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        Of `fit`.
-
-    Returns
-    -------
-    list of float
-        Mean width of each state, recorded units.
-    list of float
-        Largest width of each state, recorded units.
-    """
+    """Widths of the full fit on its own samples."""
     return (
         [float(w) for w in model.fit_summary["mean_width_recorded"]],
         [float(w) for w in model.fit_summary["max_width_recorded"]],

@@ -26,24 +26,7 @@ VOID = 0.9
 
 
 def scenario(model: UncertainLTI, parts: Sequence[Part], what: str, confidence: float) -> dict[str, Any]:
-    """The scenario bound on leaving the envelope anywhere in a whole fresh transient or group, or why there is none.
-
-    Parameters
-    ----------
-    model : UncertainLTI
-        The fit to all recordings.
-    parts : sequence of Part
-        Left-out parts.
-    what : str
-        What was left out at a time: `recording`, `group` or `block`.
-    confidence : float
-        Of the bound.
-
-    Returns
-    -------
-    dict
-        `words`, and if there is a bound its `interval` and what was counted.
-    """
+    """The scenario bound on leaving the envelope anywhere in a whole fresh transient or group, or why there is none."""
     G = int(unit_numbers(parts).max(initial=-1)) + 1
     discarded = _discarded(model)
     condition = (

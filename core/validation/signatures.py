@@ -28,15 +28,9 @@ from uncertain_lti.monitor.verdicts import Verdicts
 class Learnt:
     """What labelled recordings gave.
 
-    Parameters
-    ----------
-    signatures : tuple of Signature
-        Those of the model, with the new ones.
-    named : tuple of (str, str, str)
-        Of each recording its name, its label, and the label that the signatures of the other recordings give it; empty
-        for unknown, or where there is no other recording of its label.
-    alike : tuple of (str, str, float)
-        Pairs of labels that cannot be told apart, with their match.
+    `signatures`: those of the model, with the new ones; `named`: of each recording its name, its label, and the label
+    that the signatures of the other recordings give it; empty for unknown, or where there is no other recording of its
+    label; `alike`: pairs of labels that cannot be told apart, with their match.
     """
 
     signatures: tuple[Signature, ...]
