@@ -24,8 +24,12 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_tr
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model import repeats
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
+from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.repeats import Repeats, repeats_of
 from uncertain_lti.model.schedule import Axis, Schedule
+from uncertain_lti.monitor.frozen import needs
+from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.session import ERROR, WARN
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
@@ -97,6 +101,9 @@ def same_as_live(model: UncertainLTI, transient: Transient, **rule: Any) -> None
         assert verdict.alarm == live.alarm == whole.alarm[k]
         assert [m.state for m in verdict.frozen] == np.flatnonzero(whole.frozen[k]).tolist()
         assert [m.state for m in verdict.repeating] == np.flatnonzero(whole.repeating[k]).tolist()
+        assert list(verdict.withheld) == np.flatnonzero(whole.withheld[k]).tolist()
+        if verdict.judged:
+            assert np.array(verdict.statistics).tobytes() == whole.statistics[k].tobytes()
         for name in ("flags", "lower", "upper", "utilisation"):
             assert np.array(verdict.numbers(name)).tobytes() == getattr(whole, name)[k].tobytes()
         if verdict.judged:
@@ -161,10 +168,61 @@ def test_a_held_state_is_reported_while_the_machine_moves(model: UncertainLTI, s
         first, end = told[0], begin + 150
         of = {(0, 1)[state]} if isinstance(state, int) else set(np.flatnonzero(verdicts.frozen.any(axis=0)).tolist())
         assert set(np.flatnonzero(verdicts.frozen.any(axis=0)).tolist()) == of
-        assert verdicts.alarm[first:end].all() and not verdicts.judged[first:end].any()
-        assert not verdicts.judged[end] and verdicts.thawed[end], "its bounds would begin at a stale value"
-        assert verdicts.judged[end + 1]
+        assert verdicts.alarm[first:end].all() and not verdicts.withheld[end + 1 :].any() and verdicts.judged[end + 1]
+        frozen = verdicts.frozen | np.roll(verdicts.frozen, 1, axis=0)  # after it the bounds begin at a stale value
+        without = (frozen[:, None, :] & needs(model)).any(axis=2)
+        assert np.array_equal(np.isnan(verdicts.flags)[first : end + 2], without[first : end + 2])
     assert max(late) <= 1.0
+
+
+def three() -> UncertainLTI:
+    """Three levels: the second needs the first, by 0.01 * 10 * 2 = 0.2 against 0.1; the third does not, by 0.02."""
+    A = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    domain = Domain(*([side] * size for side, size in ((-1.0, 3), (1.0, 3), (-1.0, 1), (1.0, 1))))
+    rules = [AlarmRule(1, 1), StatisticRule("energy", 0.05, 20.0), StatisticRule("mean", 0.1, 20.0)]
+    return UncertainLTI(
+        A, [[1.0], [0.0], [0.0]], 0 * A, np.zeros((3, 1)), v=[0.1] * 3, domain=domain,
+        sampling=Sampling(dt_median=0.01), repeats=Repeats([0.0] * 3, [0.0] * 3, [0.0] * 3), alarm=rules,
+    )  # fmt: skip
+
+
+def test_a_row_needs_a_state_that_moves_it_by_more_than_its_half_width() -> None:
+    model = three()
+    assert needs(model).tolist() == [[True, False, False], [True, True, False], [False, False, True]]
+    for element, needed in ((4.999, False), (5.001, True)):  # 0.01 * 5 * 2 is the half-width
+        A = model.A.copy()
+        A[2, 1] = element
+        assert needs(model.replace(A=A))[2, 1] == needed
+        dA = np.zeros((3, 3))
+        dA[2, 1] = element  # half of which the half-width has already
+        assert needs(model.replace(dA=dA, v=[0.1, 0.1, 0.1 - 0.01 * element]))[2, 1] == needed
+    everywhere = model.replace(domain=None)
+    assert needs(everywhere).tolist() == [[True, False, False], [True, True, False], [True, False, True]]
+
+
+@pytest.mark.parametrize("masked", [(), ("x3",)])
+def test_what_does_not_need_a_frozen_state_is_judged_on(masked: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(0)
+    u = np.full((200, 1), 8.0)
+    x = rng.uniform(-0.02, 0.02, (200, 3)) + 0.5
+    x[50:100, 0] = x[50, 0]
+    x[80, 2] += 5.0
+    model, transient = three(), Transient(DT * np.arange(200), x, u)
+    verdicts = EnvelopeMonitor(model, masked=masked).check(transient)
+    told = np.flatnonzero(verdicts.frozen[:, 0])
+    assert told.tolist() == list(range(told[0], 100)) and told[0] <= 53 and not verdicts.frozen[:, 1:].any()
+    lost = np.isnan(verdicts.flags)
+    assert lost[told[0] : 101, 0].all() and lost[told[0] : 101, 1].all() and not lost[101:].any()
+    assert verdicts.alarm[told].all()
+    statuses = verdicts.statuses()
+    if masked:
+        assert lost[told[0] : 101].all() and statuses[told[0]] is Status.FROZEN
+    else:
+        assert not lost[1:, 2].any() and verdicts.flags[80, 2] == 1.0 and statuses[80] is Status.OK
+        assert {r.state for r in verdicts.raised(80)} == {"x3"}
+        (line,) = [s for k, s in over_recording(verdicts, model) if k == 80]
+        assert line.startswith("alarm: frozen: x1; ") and line.endswith("x3; no verdict on x1, x2")
+    same_as_live(model, transient, masked=masked)
 
 
 def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
@@ -434,7 +492,7 @@ def test_a_session_names_what_is_frozen() -> None:
     assert line.startswith("alarm, frozen: b repeats exactly for ") and "half-widths" in line
     monitor, a, b = rig.session.report(rig.now, 10.0)
     assert monitor.level == b.level == ERROR and "alarm: frozen: b repeats exactly for 0." in monitor.message
-    assert "a state is frozen" in monitor.message and b.message.startswith("frozen: repeats exactly")
+    assert "every state needs one that is frozen" in monitor.message and b.message.startswith("frozen: repeats exactly")
     assert a.level != ERROR and int(monitor.values["frozen"]) > 30 and monitor.values["alarm"] == "1"
     monitor, *_ = rig.session.report(rig.now + 20.0, 10.0)
     assert "frozen" not in monitor.message.split(";")[0], "nothing arrives, so nothing is known to be frozen"

@@ -121,9 +121,9 @@ def test_several_take_their_parts_of_one_table_and_refuse_one_that_is_too_short(
 def test_one_number_beyond_a_limit_is_enough_and_none_at_all_is_no_verdict(source: Any) -> None:
     places, nan, beyond = array("q", [1, 3]), float("nan"), source.some_beyond
     assert beyond(array("d", [9.0, -1.0, 9.0, 1.0]), places, 1.0) == 0
-    assert (
-        beyond(array("d", [0.0, 0.0, 0.0, -1.5]), places, 1.0) == beyond(array("d", [0, nan, 0, 0]), places, 1.0) == 1
-    )
+    assert beyond(array("d", [0.0, 0.0, 0.0, -1.5]), places, 1.0) == 1
+    assert beyond(array("d", [0.0, nan, 0.0, 1.0]), places, 1.0) == 0
+    assert beyond(array("d", [0.0, nan, 0.0, 1.5]), places, 1.0) == 1
     assert beyond(array("d", [0.0, nan, 0.0, nan]), places, 1.0) == -1
     with pytest.raises(ValueError, match="do not fit"):
         beyond(array("d", [0.0, 0.0, 0.0]), places, 1.0)
@@ -168,6 +168,26 @@ def test_what_is_missing_changes_nothing(kind: str) -> None:
     alarm, broken = statistic(kind, 0.2).push_all(np.full(203, 0.01), without)
     assert np.delete(broken, [50, 51, 122], axis=0).tobytes() == plain.tobytes()
     assert broken[51].tobytes() == broken[49].tobytes() and alarm[51] == alarm[49]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_one_state_misses_changes_nothing_of_it_nor_of_the_others(kind: str) -> None:
+    """Its window holds what it has; states that are seen together have no verdict."""
+    rng = np.random.default_rng(4)
+    rows, dt = rng.normal(size=(400, 3)), rng.choice([0.01, 0.0125, 0.03], 400)
+    lost = np.zeros(400, dtype=bool)
+    lost[100:180] = lost[[250, 300, 301]] = True
+    some = rows.copy()
+    some[lost, 1] = np.nan
+    alarm, found = statistic(kind, 0.2).push_all(dt, some)
+    _, plain = statistic(kind, 0.2).push_all(dt, rows)
+    _, kept = statistic(kind, 0.2).push_all(dt[~lost], rows[~lost])
+    own = [0] if kind in JOINT else [1]
+    assert found[:, [0, 2]].tobytes() == plain[:, [0, 2]].tobytes() if kind not in JOINT else True
+    assert found[~lost][:, own].tobytes() == kept[:, own].tobytes()
+    last = np.maximum.accumulate(np.where(lost, 0, np.arange(400)))
+    assert found[:, own].tobytes() == found[last][:, own].tobytes()
+    assert np.array_equal(alarm, (np.abs(found) > 1).any(axis=1))
 
 
 def test_until_there_is_a_window_what_is_missing_counts_as_0() -> None:

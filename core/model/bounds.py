@@ -123,14 +123,20 @@ def utilisation_of(difference: cython.double, half: cython.double) -> cython.dou
 @cython.inline
 @cython.exceptval(check=False)
 def settled(utilisation: cython.double, inside: cython.bint) -> cython.double:
-    """Utilisation whose size is at most 1 exactly where the sample is contained: on the edge rounding decides."""
+    """Utilisation whose size is at most 1 exactly where the sample is contained: on the edge rounding decides.
+
+    Of a run that left all numbers it is infinite: NaN is no verdict.
+    """
     above = 1.0000000000000002  # the next number after 1
     if cython.compiled:
         if inside:
             return 1.0 if utilisation > 1.0 else -1.0 if utilisation < -1.0 else utilisation
+        if utilisation != utilisation:
+            return float("inf")
         return above if 0.0 <= utilisation <= 1.0 else -above if -1.0 <= utilisation < 0.0 else utilisation
     edge = np.where(utilisation < 0.0, -above, above)
-    return np.where(inside, np.clip(utilisation, -1.0, 1.0), np.where(np.abs(utilisation) <= 1.0, edge, utilisation))
+    left = np.where(np.isnan(utilisation), np.inf, np.where(np.abs(utilisation) <= 1.0, edge, utilisation))
+    return np.where(inside, np.clip(utilisation, -1.0, 1.0), left)
 
 
 @cython.cfunc

@@ -145,7 +145,7 @@ class AlarmWindow:
         if self._places:
             sizes = np.abs(table.reshape(len(table), table.shape[1] * table.shape[2])[:, self._places])
             given = np.asarray(~np.isnan(sizes).all(axis=1))
-            violated = np.asarray(~(sizes <= self._margin).all(axis=1))
+            violated = np.asarray((sizes > self._margin).any(axis=1))
         after = np.concatenate([[False], raised(violated[given], self.rule)])
         return after[np.cumsum(given)], np.zeros((len(violated), 0))
 

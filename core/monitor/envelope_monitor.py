@@ -46,7 +46,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, residual_row
 from uncertain_lti.monitor.arming import Armed
 from uncertain_lti.monitor.foreseen import Foreseen
-from uncertain_lti.monitor.frozen import Bounds, FrozenWatch
+from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Partly, needs
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.sampling.sampler import Step, all_finite
@@ -88,8 +88,8 @@ class EnvelopeMonitor:
     A sample is contained when lower <= x_next <= upper in the normalised quantities, nothing else (Leibov (2006),
     eqs. (8)(9)). Every rule of the alarm (m of n violations, a statistic over a window) looks at the last verdicts
     (messages without a verdict do not count) and starts over when time jumps back. A step shorter than half of, or
-    longer than twice, those that the model was fitted to has no verdict. Nor has one at whose end a state is frozen
-    (`frozen`), which raises the alarm.
+    longer than twice, those that the model was fitted to has no verdict. Nor has a state whose row needs one that is
+    frozen (`frozen`), which raises the alarm; the others are judged.
 
     Parameters
     ----------
@@ -126,6 +126,7 @@ class EnvelopeMonitor:
     masked: tuple[str, ...] = cython.declare(object, visibility="readonly")
     frozen_watch: FrozenWatch | None = cython.declare(object, visibility="readonly")
     _counted: Any
+    _every: Any
     _judge: Any
     _runs: Any
     _nothing: Any
@@ -163,6 +164,7 @@ class EnvelopeMonitor:
         if len(self.masked) == len(names):
             raise ModelError("every state of the model is masked; leave at least one that can raise the alarm")
         self._counted = np.array([name not in masked for name in names])
+        self._every = np.arange(model.n)
         self._judge = model.judge_of(self.rule.margin, self._counted)
         self.alarms = Alarm(every, model, self._counted)
         self._runs = model.runs_of(self._judge)
@@ -198,7 +200,7 @@ class EnvelopeMonitor:
         """What tells frozen states; None if the model knows no repeats."""
         if self.model.repeats is None:
             return None
-        return FrozenWatch(self.model.repeats, self.rule.margin, self._counted.tolist())
+        return FrozenWatch(self.model.repeats, self.rule.margin, self._counted.tolist(), needs(self.model))
 
     @cython.cfunc
     def _forget_repeats(self) -> None:
@@ -315,6 +317,7 @@ class EnvelopeMonitor:
         if step.status is _RESET or not armed:
             alarms.reset()
             self._frozen_alarm = False
+        withheld: tuple[int, ...] = ()
         judgement, status, looked = None, step.status, None
         if status is _OK:
             if not contained(self._shortest, step.dt, self._longest):
@@ -326,13 +329,16 @@ class EnvelopeMonitor:
         if judgement is not None and watch is not None:
             looked = watch.look(step.t_ns, step.dt, step.before, step.after, partial(self._bounds_of, step, judgement))
             self._frozen_alarm = armed and bool(looked.frozen)
-            if looked.no_verdict:
-                judgement, status = None, Status.FROZEN
+            if withheld := looked.withheld:
+                if self._counted[np.delete(self._every, withheld)].any():
+                    judgement = Partly(judgement, withheld, self._counted)
+                else:
+                    judgement, status = None, Status.FROZEN
         elif judgement is None and not status.dropped:
             self._forget_repeats()
         longer = self._nothing
         if self._runs is not None:
-            if judgement is not None:
+            if judgement is not None and not withheld:
                 longer = self._runs.push(step.before, step.after, step.dt)
             elif not status.dropped:  # what was dropped is no sample, and the next follows the one before
                 self._runs.reset()
@@ -341,7 +347,7 @@ class EnvelopeMonitor:
         return Verdict(step, alarms.alarm or self._frozen_alarm, judgement, status, alarms, longer, looked)
 
     @cython.cfunc
-    def _table(self, judgement: Judgement, longer: Any) -> array[float]:
+    def _table(self, judgement: Any, longer: Any) -> array[float]:
         """Utilisation for one step and for each horizon, then the residuals likewise where they are needed."""
         table = array("d", judgement.numbers(UTILISATION))
         if self._runs is not None:
@@ -349,7 +355,7 @@ class EnvelopeMonitor:
         if self.alarms.needs_residual:
             table += array("d", judgement.numbers(RESIDUAL))
             if self._runs is not None:
-                table += array("d", self._runs.residuals)
+                table += array("d", longer if longer is self._nothing else self._runs.residuals)
         return table
 
     def check(self, transient: Transient, armed: Armed | None = None) -> Verdicts:
@@ -412,15 +418,22 @@ class EnvelopeMonitor:
             z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
             flags[arrival], low, high, utilisation[arrival], residual = self._judge_all(z, steps.dt, x_next)
             lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
-        frozen, thawed, repeating = self._look_all(transient, steps, z, lower, upper)
-        if (without := frozen.any(axis=1) | thawed).any():
+        frozen, withheld, repeating = self._look_all(transient, steps, z, lower, upper)
+        longer, longer_residual = np.full((2, count, len(model.horizons), n), np.nan)
+        whole: Any = slice(None)
+        if withheld.any():
+            without = np.asarray(withheld[:, self._counted].all(axis=1))
             for numbers in (flags, lower, upper, utilisation):
-                numbers[without] = np.nan
+                numbers[withheld | without[:, None]] = np.nan
+            residual[withheld[arrival]] = np.nan
             kept = ~without[arrival]
             steps, arrival, z, x_next = steps.take(kept), arrival[kept], z[:, kept], x_next[kept]
             residual, unknown = residual[kept], unknown[kept]
-        longer = np.full((count, len(model.horizons), n), np.nan)
-        longer[arrival], longer_residual = model.over_horizons(steps.k, z, steps.dt, x_next)
+            whole = ~withheld[arrival].any(axis=1)  # the run of a horizon needs every state
+        at = arrival[whole]
+        longer[at], longer_residual[at] = model.over_horizons(
+            steps.k[whole], z[:, whole], steps.dt[whole], x_next[whole]
+        )
         judged[arrival] = True
         unknown_regime = np.zeros(count, dtype=bool)
         unknown_regime[arrival] = unknown
@@ -434,7 +447,7 @@ class EnvelopeMonitor:
         table = np.empty((count, 2 * half, n))
         if half:
             table[:, 0], table[:, 1:half] = utilisation, longer
-            table[arrival, half], table[arrival, half + 1 :] = residual, longer_residual
+            table[arrival, half], table[:, half + 1 :] = residual, longer_residual
         for start, stop in _alarm_spans(transient.t_ns, armed):
             part = slice(start, stop)
             on = np.flatnonzero(judged[part]) + start
@@ -445,19 +458,17 @@ class EnvelopeMonitor:
         alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
         return Verdicts(
             transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
-            unknown_regime, frozen, thawed, repeating, statistics, each, alarms, longer,
+            unknown_regime, frozen, withheld, repeating, statistics, each, alarms, longer,
         )  # fmt: skip
 
     def _look_all(
         self, transient: Transient, steps: Transitions, z: Array, lower: Array, upper: Array
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-        """`frozen`, `thawed` and `repeating` of `Verdicts`, by the watch of `judge`, where some state repeats."""
-        count, n = lower.shape
-        frozen, repeating = np.zeros((count, n), dtype=bool), np.zeros((count, n), dtype=bool)
-        thawed = np.zeros(count, dtype=bool)
+        """`frozen`, `withheld` and `repeating` of `Verdicts`, by the watch of `judge`, where some state repeats."""
+        frozen, withheld, repeating = (np.zeros(lower.shape, dtype=bool) for _ in range(3))
         watch = self._watch()
         if watch is None:
-            return frozen, thawed, repeating
+            return frozen, withheld, repeating
         repeats = np.asarray((steps.x == steps.x_next).any(axis=1))
         after = np.concatenate([[False], repeats[:-1] & (np.diff(steps.k) == 1)]) if len(repeats) else repeats
         rows = np.flatnonzero(repeats | after)  # what follows a repeat may thaw
@@ -477,12 +488,12 @@ class EnvelopeMonitor:
                 watch.forget()
             last, given = k, three
             looked = watch.look(t_ns, dt, x, x_next, bounds)
-            thawed[k] = looked.thawed
+            withheld[k, list(looked.withheld)] = True
             for moved in looked.frozen:
                 frozen[k, moved.state] = True
             for moved in looked.repeating:
                 repeating[k, moved.state] = True
-        return frozen, thawed, repeating
+        return frozen, withheld, repeating
 
     def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array, Array]:
         """flags, lower, upper, utilisation, residual of transitions [x; u; s] (n + m + q, K), (K,), (K, n)."""

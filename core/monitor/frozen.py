@@ -21,13 +21,18 @@ the longest of the fit, as a coarse sensor repeats by chance.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Sequence
 from operator import eq
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.model.bounds import FLAGS, UTILISATION
 from uncertain_lti.model.repeats import Moved, Repeating, Repeats
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 FARTHER = 2.0
 """How much farther than over any repeat of the fit the model must move a state whose repeat is no longer than those,
@@ -53,18 +58,13 @@ Bounds = tuple[Sequence[float], Sequence[float], Sequence[float]]
 class Looked(NamedTuple):
     """What one transition says of repeats.
 
-    `frozen`: states that are frozen at its end; empty for none; `thawed`: A state was frozen at its begin and is not
-    any more: its bounds begin at no measurement; `repeating`: other states that repeat for longer than ever in the fit.
+    `frozen`: states that are frozen at its end; empty for none; `withheld`: rows without a verdict, as they need one
+    that is frozen at either end; `repeating`: other states that repeat for longer than ever in the fit.
     """
 
     frozen: tuple[Moved, ...] = ()
-    thawed: bool = False
+    withheld: tuple[int, ...] = ()
     repeating: tuple[Moved, ...] = ()
-
-    @property
-    def no_verdict(self) -> bool:
-        """The value of a state at one of the ends is no measurement of that instant."""
-        return self.thawed or bool(self.frozen)
 
 
 _NOTHING = Looked()
@@ -74,7 +74,7 @@ class FrozenWatch:
     """Tells frozen states, one transition after another.
 
     `repeats`: those of the fit; `margin`: of the bounds that it will be given; `counted`: states to look at: one that
-    is masked is never frozen.
+    is masked is never frozen; `needs` (n, n): which rows need which states.
     """
 
     __slots__ = (
@@ -83,6 +83,7 @@ class FrozenWatch:
         "_frozen",
         "_longest",
         "_margin",
+        "_needed_by",
         "_on",
         "_run",
         "_run_within",
@@ -92,7 +93,7 @@ class FrozenWatch:
         "_usual",
     )
 
-    def __init__(self, repeats: Repeats, margin: float, counted: Sequence[bool]) -> None:
+    def __init__(self, repeats: Repeats, margin: float, counted: Sequence[bool], needs: NDArray[np.bool_]) -> None:
         self._longest: list[float] = repeats.longest_repeat_s.tolist()
         run, total = repeats.largest_run, repeats.largest_sum
         # how far the model must move a state, by its run in a repeat that is no longer than those of the fit, and in a
@@ -104,6 +105,7 @@ class FrozenWatch:
         self._active: list[float] = repeats.active_beyond.tolist()
         self._noisy: list[float] = np.where(repeats.longest_repeat_s == 0.0, repeats.noisy_steps, 0.0).tolist()
         self._counted, self._margin = list(counted), margin
+        self._needed_by = [np.flatnonzero(column).tolist() for column in needs.T]
         self._follow = Repeating(len(self._longest), margin)
         self.forget()
 
@@ -120,9 +122,9 @@ class FrozenWatch:
         if not any(map(eq, before, after)):
             if not self._on:
                 return _NOTHING
-            thawed = bool(self._frozen)
+            withheld = self._rows(self._frozen)
             self.forget()
-            return Looked(thawed=thawed)
+            return Looked(withheld=withheld)
         self._on = True
         lower, upper, own = bounds()
         still = len(after) > 1 and all(map(eq, before, after))  # as a parked machine is
@@ -136,8 +138,11 @@ class FrozenWatch:
             elif moved.seconds > self._longest[i]:
                 repeating.append(moved)
         now = frozenset(moved.state for moved in frozen)
-        thawed, self._frozen = not self._frozen <= now, now
-        return Looked(tuple(frozen), thawed, tuple(repeating))
+        withheld, self._frozen = self._rows(self._frozen | now), now
+        return Looked(tuple(frozen), withheld, tuple(repeating))
+
+    def _rows(self, states: frozenset[int]) -> tuple[int, ...]:
+        return tuple(sorted({i for j in states for i in self._needed_by[j]}))
 
     def _is_frozen(
         self, moved: Moved, after: Sequence[float], lower: Sequence[float], upper: Sequence[float], still: bool
@@ -159,6 +164,47 @@ class FrozenWatch:
             abs(value - start) > 0.5 * (high - low) / self._margin
             for value, start, low, high in zip(after, moved.start, lower, upper, strict=True)
         )
+
+
+def needs(model: UncertainLTI) -> NDArray[np.bool_]:
+    """Which rows need which states [i, j]: the own one, and any that over its fitted range moves them by a half-width.
+
+    The half-width is that of a median step at the mean size of the fitted values.
+    """
+    domain, n = model.domain, model.n
+    dt = model.sampling.dt_median or np.inf
+    span, size = domain.greatest - domain.least, 0.5 * (abs(domain.least) + abs(domain.greatest))
+    found = np.eye(n, dtype=bool)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for block in model.blocks:
+            half = dt * (block.dA @ size[:n] + block.dB @ size[n:] + block.dc) + block.v
+            element = np.abs(block.A) + block.dA
+            found |= (element > 0.0) & ~(dt * element * span[:n] <= np.minimum(half, LARGEST)[:, None])
+    return found
+
+
+class Partly:
+    """A judgement without the verdicts on some rows, whose numbers are NaN.
+
+    `judgement`: of all rows; `withheld`: those without a verdict; `counted` (n,): states whose violations count.
+    """
+
+    __slots__ = ("_values", "contained", "outside_domain", "unknown_regime", "violation")
+
+    def __init__(self, judgement: Any, withheld: Sequence[int], counted: NDArray[np.bool_]) -> None:
+        self._values = np.array([judgement.numbers(kind) for kind in range(UTILISATION + 1)], dtype=np.float64)
+        self._values[:, list(withheld)] = np.nan
+        left = self._values[FLAGS] == 1.0
+        self.contained, self.violation = not left.any(), bool((left & counted).any())
+        self.outside_domain, self.unknown_regime = judgement.outside_domain, judgement.unknown_regime
+
+    def numbers(self, which: int) -> Any:
+        """As of `Judgement`."""
+        return array("d", self._values[which].tobytes())
+
+    def packed(self) -> bytes:
+        """As of `Judgement`."""
+        return self._values.tobytes()
 
 
 def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:

@@ -110,9 +110,11 @@ class Pattern:
     def add(self, table: Array, half: Array) -> None:
         """Take one verdict.
 
-        `table` (H, n): utilisation; a row with NaN is left out; `half` (n,): half-widths of one step, normalised; a
-        common factor does not matter.
+        `table` (H, n): utilisation; a row with NaN is left out, and the verdict if it is that of one step; `half` (n,):
+        half-widths of one step, normalised; a common factor does not matter.
         """
+        if np.isnan(table[0]).any():
+            return
         self.verdicts += 1
         self._half += half
         for total, row in zip(self._sum, np.clip(table, -_LIMIT, _LIMIT), strict=True):

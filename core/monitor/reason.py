@@ -32,7 +32,7 @@ WHY = {
     Status.MISSING: "a signal is missing, stale or not finite",
     Status.MODE: "the scheduling signal has a value that the model does not list",
     Status.STEP: "the step is shorter or longer than those that the model was fitted to",
-    Status.FROZEN: "a state is frozen",
+    Status.FROZEN: "every state needs one that is frozen",
     Status.UNASKED: "outside the time asked for",
 }
 """Why a sample has no verdict."""
@@ -44,9 +44,10 @@ class Facts(NamedTuple):
     """What the words on one sample are made of.
 
     `alarm`: the alarm after it; `status`: OK with a verdict; `unknown_regime`: the verdict is on a regime that was not
-    fitted; `raised`: which rules raise the alarm; empty without a verdict; `frozen`: states that are frozen; `lacking`:
-    signals without a value at either end of the transition; looked at if the status is MISSING; `unlisted`: which mode
-    the model does not list, in words; looked at if the status is MODE; `jumps`: states that left their bounds by a jump
+    fitted; `raised`: which rules raise the alarm; empty without a verdict; `frozen`: states that are frozen;
+    `withheld`: states without a verdict, as their rows need a frozen one, where others have one; `lacking`: signals
+    without a value at either end of the transition; looked at if the status is MISSING; `unlisted`: which mode the
+    model does not list, in words; looked at if the status is MODE; `jumps`: states that left their bounds by a jump
     larger than any of the fit, in words.
     """
 
@@ -55,6 +56,7 @@ class Facts(NamedTuple):
     unknown_regime: bool
     raised: Sequence[Raised] = ()
     frozen: Sequence[str] = ()
+    withheld: Sequence[str] = ()
     lacking: Sequence[str] = ()
     unlisted: str = ""
     jumps: Sequence[str] = ()
@@ -90,7 +92,7 @@ class Reasons:
         """`push` of a verdict of the monitor."""
         if verdict.status.dropped:
             return self.text
-        if verdict.judged and not alarm:
+        if verdict.judged and not (alarm or verdict.withheld):
             return self.push(Facts(False, Status.OK, verdict.unknown_regime))
         names = self._model.state_names
         lacking: Sequence[str] = ()
@@ -98,12 +100,12 @@ class Reasons:
             lacking = self._lacking([*verdict.before, *verdict.numbers("state")])
         unlisted = self._model.why_unlisted(verdict.before) if verdict.status is Status.MODE else ""
         frozen = [names[moved.state] for moved in verdict.frozen]
+        withheld = [names[i] for i in verdict.withheld]
         jumps: Sequence[str] = ()
         if verdict.violated:
             jumps = jumps_in_words(self._model, verdict.before, verdict.numbers("state"), verdict.numbers("flags"))
-        return self.push(
-            Facts(alarm, verdict.status, verdict.unknown_regime, verdict.raised, frozen, lacking, unlisted, jumps)
-        )
+        facts = alarm, verdict.status, verdict.unknown_regime, verdict.raised
+        return self.push(Facts(*facts, frozen, withheld, lacking, unlisted, jumps))
 
     def _lacking(self, values: Sequence[float]) -> list[str]:
         """Names of signals of which some value, of [x; u; s] before and x after, is no number."""
@@ -116,10 +118,10 @@ class Reasons:
         judged = facts.status is Status.OK
         if not facts.alarm:
             self._blamed, self._jumps, self._held = {}, [], ""
-        elif facts.frozen:
-            self._held = f"frozen: {', '.join(facts.frozen)}"
-        elif judged and facts.raised:
-            self._held = self._rules_that(facts.raised, facts.jumps)
+        elif facts.frozen or (judged and facts.raised):
+            by = [f"frozen: {', '.join(facts.frozen)}"] if facts.frozen else []
+            by += [self._rules_that(facts.raised, facts.jumps)] if judged and facts.raised else []
+            self._held = "; ".join(by)
         elif judged and not self._held.startswith("latched"):
             self._held = "latched until ~/reset" + (f", raised by {self._held}" if self._held else "")
         self.by = self._held or self.by
@@ -128,6 +130,8 @@ class Reasons:
             said.append(f"no verdict: {self._why(facts)}")
         elif not facts.alarm:
             said.append(QUIET)
+        if judged and facts.withheld:
+            said.append(f"no verdict on {', '.join(facts.withheld)}")
         if judged and facts.unknown_regime:
             said.append("a regime that was not fitted")
         self.text = "; ".join(said)
@@ -165,6 +169,7 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
         status, alarm = statuses[k], bool(verdicts.alarm[k])
         raised = verdicts.raised(k) if alarm else ()
         frozen = [names[i] for i in np.flatnonzero(verdicts.frozen[k])]
+        withheld = [names[i] for i in np.flatnonzero(verdicts.withheld[k])]
         lacking: Sequence[str] = ()
         unlisted = ""
         if status in (Status.MISSING, Status.MODE):
@@ -178,7 +183,7 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
             flags = verdicts.flags[k].tolist()
             jumps = jumps_in_words(model, transient.x[k - 1].tolist(), transient.x[k].tolist(), flags)
         unknown = bool(verdicts.unknown_regime[k])
-        text = reasons.push(Facts(alarm, status, unknown, raised, frozen, lacking, unlisted, jumps))
+        text = reasons.push(Facts(alarm, status, unknown, raised, frozen, withheld, lacking, unlisted, jumps))
         if text != said:
             yield k, text
             said = text
@@ -186,7 +191,8 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
 
 def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Status]) -> NDArray[np.bool_]:
     """Samples of which something else may be said than of the one before."""
-    rows: list[NDArray[Any]] = [verdicts.alarm, verdicts.unknown_regime, verdicts.rule_alarms, verdicts.frozen]
+    rows: list[NDArray[Any]] = [verdicts.alarm, verdicts.unknown_regime, verdicts.rule_alarms]
+    rows += [verdicts.frozen, verdicts.withheld]
     if verdicts.alarm.any():
         rows += [verdicts.flags == 1.0, np.abs(verdicts.statistics) > 1.0]
         before = np.concatenate([np.full((1, model.n), np.nan), verdicts.transient.x[:-1]])

@@ -175,6 +175,8 @@ class Session(Stream):
             level, message = ERROR, f"frozen: {self.frozen_text(period.frozen[i]).removeprefix(name).lstrip()}"
         elif without > timeout:
             level, message = STALE, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet"
+        elif (lost := period.withheld[i]) and lost >= period.verdicts:
+            level, message = WARN, "no verdict: it needs a state that is frozen"
         elif violated:
             level = OK if masked else ERROR if period.alarm else WARN
             message = f"outside its bounds in {violated} of {period.verdicts} verdicts"

@@ -47,7 +47,7 @@ class Statistic:
     `kind`: one of the kinds above; `n`: number of states; `window_s`: T, s; `thresholds`: what raises the alarm if it
     is exceeded; `counted`: states that raise it; `allowance`: of cusum; `mean` (n,): of what chi2 and mewma take; see
     `model.residuals`; `whitening` (n, n): of the same; `alarm`: the statistic of some state that counts is over its
-    threshold.
+    threshold. Each state has its own window, so a verdict that leaves one state out changes nothing of that state.
     """
 
     alarm = cython.declare(cython.bint, visibility="readonly")
@@ -65,15 +65,15 @@ class Statistic:
     _values: cython.double[::1]  # the statistic over its threshold
     _up: cython.double[::1]  # sum of the newer half; moving average; sum upwards
     _down: cython.double[::1]  # the same downwards; of chi2 and mewma this verdict less the mean
+    _given: cython.uchar[::1]  # whether this verdict has a number of it
     _spread: cython.double  # variance of the moving average of mewma, that of a verdict being 1; 0 before the first
-    _queue: cython.double[::1]  # terms of the newer half, sums of the older one
-    _steps: cython.longlong[::1]  # ns
-    _begin: cython.Py_ssize_t  # of the window in the queue
-    _middle: cython.Py_ssize_t  # of its newer half
-    _end: cython.Py_ssize_t
+    _queue: cython.double[::1]  # of one state after another: terms of the newer half, sums of the older one
+    _steps: cython.longlong[::1]  # likewise, ns
+    _begin: cython.longlong[::1]  # of the window of each state in its part of the queue
+    _middle: cython.longlong[::1]  # of its newer half
+    _end: cython.longlong[::1]
+    _total: cython.longlong[::1]  # ns
     _capacity: cython.Py_ssize_t
-    _total: cython.longlong  # ns
-    _pushed: cython.bint
 
     def __init__(
         self,
@@ -101,8 +101,11 @@ class Statistic:
         self._whitening = _doubles(np.zeros(1) if whitening is None else np.reshape(whitening, -1))
         self._terms, self._values = array("d", bytes(8 * n)), array("d", bytes(8 * size))
         self._up, self._down = array("d", bytes(8 * n)), array("d", bytes(8 * n))
+        self._given = bytearray(size)
+        self._begin, self._middle = array("q", bytes(8 * size)), array("q", bytes(8 * size))
+        self._end, self._total = array("q", bytes(8 * size)), array("q", bytes(8 * size))
         self._capacity = 64
-        self._queue, self._steps = array("d", bytes(8 * size * 64)), array("q", bytes(8 * 64))
+        self._queue, self._steps = array("d", bytes(8 * size * 64)), array("q", bytes(8 * size * 64))
         self.reset()
 
     def reset(self) -> None:
@@ -111,28 +114,24 @@ class Statistic:
         for i in range(self._n):
             self._up[i] = self._down[i] = 0.0
         for i in range(self._size):
-            self._values[i] = 0.0
+            self._values[i] = float("nan")
+            self._begin[i] = self._middle[i] = self._end[i] = self._total[i] = 0
         self._spread = 0.0
-        self._begin = self._middle = self._end = 0
-        self._total = 0
-        self._pushed = False
         self.alarm = False
 
     def values(self) -> Any:
-        """The statistic over its threshold: 1 and -1 are the threshold; NaN before the first verdict.
+        """The statistic over its threshold: 1 and -1 are the threshold; NaN before the first verdict on a state.
 
         Returns (n,): A copy; of mean, ewma and cusum with the sign of the utilisation.
         """
-        if not self._pushed:
-            return array("d", [float("nan")] * self._size)
         return array("d", self._values)
 
     def push_all(self, dt: Any, rows: Any) -> tuple[Any, Any]:
         """Take many verdicts.
 
-        `dt` (K,): steps, s; `rows` (K, n): the utilisation of each state, or the residual, a row for each verdict. If
-        all are NaN there is no verdict, and nothing changes; Returns (K,): the alarm after each; Returns (K, n):
-        `values` after each.
+        `dt` (K,): steps, s; `rows` (K, n): the utilisation of each state, or the residual, a row for each verdict. NaN
+        is no verdict on that state, and changes nothing of it, nor of any state if all are seen together; Returns (K,):
+        the alarm after each; Returns (K, n): `values` after each.
         """
         count: cython.Py_ssize_t = len(dt)
         i: cython.Py_ssize_t
@@ -152,7 +151,7 @@ class Statistic:
             self._push(times[k], table, k * self._n)
             alarm[k] = self.alarm
             for i in range(self._size):
-                values[k * self._size + i] = self._values[i] if self._pushed else float("nan")
+                values[k * self._size + i] = self._values[i]
         return np.frombuffer(raised, dtype=np.bool_), np.frombuffer(found).reshape(count, self._size)
 
     @cython.cfunc
@@ -168,16 +167,19 @@ class Statistic:
         over: cython.bint = False
         if not self._take(row, begin):
             return
-        self._pushed = True
         if self._kind == EWMA:
             weight = dt / (self._window + dt)
             for i in range(self._size):
+                if not self._given[i]:
+                    continue
                 self._up[i] += (self._terms[i] - self._up[i]) * weight
                 self._values[i] = self._up[i] / self._thresholds[i]
         elif self._kind == CUSUM:
             weight = dt / self._window
             kept = self._window / (self._window + dt)
             for i in range(self._size):
+                if not self._given[i]:
+                    continue
                 value = self._up[i] * kept + (self._terms[i] - self._allowance) * weight
                 down = self._down[i] * kept + (-self._terms[i] - self._allowance) * weight
                 self._up[i] = value = value if value > 0.0 else 0.0
@@ -196,12 +198,14 @@ class Statistic:
                 value += self._up[i] * self._up[i]
             self._values[0] = value / self._spread / self._thresholds[0]
         else:
-            self._move(dt)
-            weight = self._window if self._total <= self._window_ns else dt
             for i in range(self._size):
+                if not self._given[i]:
+                    continue
+                self._move(i, dt)
+                weight = self._window if self._total[i] <= self._window_ns else dt
                 value = self._up[i]
-                if self._begin < self._middle:
-                    value = self._queue[self._begin * self._size + i] + value
+                if self._begin[i] < self._middle[i]:
+                    value = self._queue[i * self._capacity + self._begin[i]] + value
                 self._values[i] = value / weight / self._thresholds[i]
         for i in range(self._size):
             value = self._values[i]
@@ -212,7 +216,7 @@ class Statistic:
     @cython.boundscheck(False)
     @cython.wraparound(False)
     def _take(self, row: cython.double[::1], begin: cython.Py_ssize_t) -> cython.bint:
-        """What the verdict adds, to `_terms`; false if there is none."""
+        """What the verdict adds, to `_terms`, for the states `_given`; false if there is none."""
         n: cython.Py_ssize_t = self._n
         i: cython.Py_ssize_t
         j: cython.Py_ssize_t
@@ -220,12 +224,12 @@ class Statistic:
         total: cython.double
         square: cython.double = 0.0
         limit: cython.double
-        nothing: cython.bint = True
+        some: cython.bint = False
         if self._kind == CHI2 or self._kind == MEWMA:
             for i in range(n):
                 value = row[begin + i]
-                if value == value:
-                    nothing = False
+                if value != value:
+                    return False
                 value = _MOST if value > _MOST else -_MOST if value < -_MOST else value  # infinite where half is 0
                 self._down[i] = value - self._mean[i]
                 total = 0.0
@@ -236,67 +240,70 @@ class Statistic:
                 square += total * total
             if self._kind == CHI2:
                 self._terms[0] = square if square <= _MOST else _MOST
-            return not nothing
+            self._given[0] = True
+            return True
         limit = LIMIT if self._kind == EWMA or self._kind == CUSUM else _MOST
         for i in range(n):
             value = row[begin + i]
-            if value == value:
-                nothing = False
-            else:
-                value = limit
+            self._given[i] = value == value
+            some = some or self._given[i]
             value = limit if value > limit else -limit if value < -limit else value
             self._terms[i] = value * value if self._kind == ENERGY else value
-        return not nothing
+        return some
 
     @cython.cfunc
     @cython.boundscheck(False)
     @cython.wraparound(False)
-    def _move(self, dt: cython.double) -> cython.void:
-        """Add `_terms` to the window, and drop what is older than it."""
-        i: cython.Py_ssize_t
+    def _move(self, i: cython.Py_ssize_t, dt: cython.double) -> cython.void:
+        """Add the term of a state to its window, and drop what is older than it."""
         k: cython.Py_ssize_t
-        size: cython.Py_ssize_t = self._size
+        at: cython.Py_ssize_t
         step: cython.longlong
         value: cython.double
-        if self._end == self._capacity:
-            self._make_room()
+        if self._end[i] == self._capacity:
+            self._make_room(i)
+        at = i * self._capacity
         step = int(dt * 1e9 + 0.5)
-        self._steps[self._end] = step
-        self._total += step
-        for i in range(size):
-            value = self._terms[i] * dt
-            self._queue[self._end * size + i] = value
-            self._up[i] += value
-        self._end += 1
-        while self._end - self._begin > 1 and (self._total > self._window_ns or self._end - self._begin > _LONGEST):
-            if self._begin == self._middle:  # the newer half becomes the older one
-                for k in range(self._end - 2, self._begin - 1, -1):
-                    for i in range(size):
-                        self._queue[k * size + i] += self._queue[(k + 1) * size + i]
-                self._middle = self._end
-                for i in range(size):
-                    self._up[i] = 0.0
-            self._total -= self._steps[self._begin]
-            self._begin += 1
+        value = self._terms[i] * dt
+        self._steps[at + self._end[i]] = step
+        self._queue[at + self._end[i]] = value
+        self._total[i] += step
+        self._up[i] += value
+        self._end[i] += 1
+        while self._end[i] - self._begin[i] > 1 and (
+            self._total[i] > self._window_ns or self._end[i] - self._begin[i] > _LONGEST
+        ):
+            if self._begin[i] == self._middle[i]:  # the newer half becomes the older one
+                for k in range(at + self._end[i] - 2, at + self._begin[i] - 1, -1):
+                    self._queue[k] += self._queue[k + 1]
+                self._middle[i] = self._end[i]
+                self._up[i] = 0.0
+            self._total[i] -= self._steps[at + self._begin[i]]
+            self._begin[i] += 1
 
     @cython.cfunc
-    def _make_room(self) -> cython.void:
-        """Move the window to the front of the queue, or double the queue if the window fills more than half of it."""
-        size: cython.Py_ssize_t = self._size
-        count: cython.Py_ssize_t = self._end - self._begin
+    def _make_room(self, i: cython.Py_ssize_t) -> cython.void:
+        """Move the window of a state to the front of its part of the queue; if it fills half, double all first."""
+        j: cython.Py_ssize_t
         k: cython.Py_ssize_t
+        begin: cython.Py_ssize_t = self._begin[i]
+        count: cython.Py_ssize_t = self._end[i] - begin
+        before: cython.Py_ssize_t = self._capacity
         queue: cython.double[::1] = self._queue
         steps: cython.longlong[::1] = self._steps
-        if 2 * count > self._capacity:
+        if 2 * count > before:
             self._capacity *= 2
-            self._queue = array("d", bytes(8 * size * self._capacity))
-            self._steps = array("q", bytes(8 * self._capacity))
-        for k in range(count * size):
-            self._queue[k] = queue[self._begin * size + k]
-        for k in range(count):
-            self._steps[k] = steps[self._begin + k]
-        self._middle -= self._begin
-        self._begin, self._end = 0, count
+            self._queue = array("d", bytes(8 * self._size * self._capacity))
+            self._steps = array("q", bytes(8 * self._size * self._capacity))
+            for j in range(self._size):
+                for k in range(before):
+                    self._queue[j * self._capacity + k] = queue[j * before + k]
+                    self._steps[j * self._capacity + k] = steps[j * before + k]
+        for k in range(i * self._capacity, i * self._capacity + count):
+            self._queue[k] = self._queue[k + begin]
+            self._steps[k] = self._steps[k + begin]
+        self._middle[i] -= begin
+        self._begin[i], self._end[i] = 0, count
 
 
 @cython.cclass
@@ -338,7 +345,7 @@ class Statistics:
 
 
 def some_beyond(table: Any, places: Any, limit: cython.double) -> int:
-    """Whether the size of one of some numbers is over a limit, or one of them is NaN."""
+    """Whether the size of one of some numbers is over a limit; -1 if all are NaN, and one alone is no verdict."""
     row: cython.double[::1] = table
     at: cython.longlong[::1] = places
     i: cython.Py_ssize_t
@@ -350,7 +357,7 @@ def some_beyond(table: Any, places: Any, limit: cython.double) -> int:
             raise ValueError("the numbers of the verdict do not fit the states")
         value = row[at[i]]
         nothing = nothing and value != value
-        beyond = beyond or not -limit <= value <= limit
+        beyond = beyond or value > limit or value < -limit
     return -1 if nothing else int(beyond)
 
 

@@ -63,7 +63,8 @@ class Period:
     `unknown`: those of a regime that was not fitted; `last_unknown`: the last of these; `last_unlisted`: the last in it
     on a mode that the model does not list; `alarm`: the alarm was raised at some time in it; `frozen, repeating`: by
     number of the state, the last repeat of those that were frozen, and of others that repeat for longer than ever in
-    the fit; `violations`: by number of the state; `jumps`: the first jumps larger than any of the fit, in words;
+    the fit; `withheld`: by number of the state, samples without a verdict on it as it needs a frozen one; `violations`:
+    by number of the state; `jumps`: the first jumps larger than any of the fit, in words;
     `statuses`: of the samples in it; `counters`: those of the sampler when it began; `late`: late messages when it
     began; `unreadable`: unreadable messages when it began; `future`: messages with a stamp in the future when it began.
     """
@@ -76,6 +77,7 @@ class Period:
     last_unlisted: Verdict | None = cython.declare(object, visibility="public")
     alarm: bool = cython.declare(cython.bint, visibility="public")
     frozen: dict[int, Moved] = cython.declare(object, visibility="readonly")
+    withheld: Counter[int] = cython.declare(object, visibility="readonly")
     repeating: dict[int, Moved] = cython.declare(object, visibility="readonly")
     violations: Counter[int] = cython.declare(object, visibility="readonly")
     jumps: list[str] = cython.declare(object, visibility="readonly")
@@ -88,7 +90,7 @@ class Period:
     def __init__(self, began: float) -> None:
         self.began, self.last_unknown, self.last_unlisted, self.alarm = began, None, None, False
         self.verdicts = self.outside = self.unknown = 0
-        self.frozen, self.repeating = {}, {}
+        self.frozen, self.withheld, self.repeating = {}, Counter(), {}
         self.violations, self.statuses, self.counters = Counter(), Counter(), Counter()
         self.jumps = []
         self.late = self.unreadable = self.future = 0
@@ -448,6 +450,9 @@ class Stream:
                 self.sampler.counters[verdict.status.value] += 1
             if verdict.status is Status.MODE:
                 period.last_unlisted = verdict
+        elif verdict.withheld:
+            self.sampler.counters[Status.FROZEN.value] += 1
+        period.withheld.update(verdict.withheld)
         period.frozen.update({moved.state: moved for moved in verdict.frozen})
         period.repeating.update({moved.state: moved for moved in verdict.repeating})
         alarm: cython.bint = verdict.alarm or self.latched

@@ -85,6 +85,8 @@ class Verdict:
     ----------
     frozen, repeating : tuple of Moved
         States that are frozen, and others that repeat for longer than ever in the fit.
+    withheld : tuple of int
+        States without a verdict, as their rows need one that is frozen.
     ordinary : bool
         There is a verdict, and it says that every state is contained, within the fitted domain, without an alarm and
         without a state that repeats for longer than ever.
@@ -99,6 +101,7 @@ class Verdict:
     ordinary = cython.declare(cython.bint, visibility="readonly")
     frozen = cython.declare(object, visibility="readonly")
     repeating = cython.declare(object, visibility="readonly")
+    withheld = cython.declare(object, visibility="readonly")
     _after = cython.declare(object)
     _before = cython.declare(object)
     _judgement = cython.declare(object)
@@ -117,13 +120,14 @@ class Verdict:
         longer: Any = None,
         looked: Looked | None = None,
     ) -> None:
-        self.frozen, self.repeating = (looked.frozen, looked.repeating) if looked is not None else ((), ())
+        self.frozen, self.withheld, self.repeating = ((), (), ()) if looked is None else looked
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, status or step.status
         self._after, self._before = step.after, step.before
         self.outside_domain = self.unknown_regime = self.ordinary = False
         if judgement is not None:
             self.outside_domain, self.unknown_regime = judgement.outside_domain, judgement.unknown_regime
-            self.ordinary = judgement.contained and not (self.outside_domain or alarm or self.frozen or self.repeating)
+            odd = self.outside_domain or alarm or self.withheld or self.repeating
+            self.ordinary = judgement.contained and not odd
         self.alarm = alarm
         self._judgement, self._longer = judgement, longer
         self._alarms = alarms

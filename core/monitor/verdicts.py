@@ -41,7 +41,7 @@ class Verdicts:
     utilisation : array (N+1, n)
         (x_next - centre) / half, with half before the margin.
     judged : array (N+1,) of bool
-        Whether there is a verdict.
+        Whether there is a verdict on some state that counts.
     outside_domain : array (N+1,) of bool
         z(t_{k-1}) lies outside the ranges seen in the fit.
     alarm : array (N+1,) of bool
@@ -54,9 +54,9 @@ class Verdicts:
         A scheduling signal lies beyond the end knots, or no recording visited the regime; then the sample counts as
         outside the domain, too.
     frozen : array (N+1, n) of bool
-        The state repeats exactly although the model moves it, so there is no verdict.
-    thawed : array (N+1,) of bool
-        A state was frozen one sample before and is not any more, so there is no verdict either.
+        The state repeats exactly although the model moves it.
+    withheld : array (N+1, n) of bool
+        There is no verdict on the state, as its row needs one that is frozen here or was one sample before.
     repeating : array (N+1, n) of bool
         The state repeats exactly for longer than ever in the fit, and is not frozen.
     statistics : array (N+1, S)
@@ -83,7 +83,7 @@ class Verdicts:
     unlisted_mode: NDArray[np.bool_]
     unknown_regime: NDArray[np.bool_]
     frozen: NDArray[np.bool_]
-    thawed: NDArray[np.bool_]
+    withheld: NDArray[np.bool_]
     repeating: NDArray[np.bool_]
     statistics: Array
     rule_alarms: NDArray[np.bool_]
@@ -101,11 +101,12 @@ class Verdicts:
     def _repr_html_(self) -> str:
         """Violations and widths of each state."""
         transient, judged = self.transient, self.judged
-        count, rows = int(judged.sum()), []
+        rows = []
         units = [s.unit for s in transient.signals.states] if transient.signals else [""] * self.flags.shape[1]
         for i, (name, unit) in enumerate(zip(transient.state_names, units, strict=True)):
             bad = np.flatnonzero(self.flags[:, i] == 1.0)
-            width = (self.upper - self.lower)[judged, i]
+            given = judged & ~np.isnan(self.flags[:, i])
+            count, width = int(given.sum()), (self.upper - self.lower)[given, i]
             rows.append(
                 [
                     name_with_unit(name, unit),
@@ -125,13 +126,14 @@ class Verdicts:
         -------
         list of Status
             N+1, as of `Transient.statuses`, with STEP where a step is out of the range of the fit, MODE where the
-            model lists no such mode, FROZEN where a state is frozen, and UNASKED where no verdict was asked for.
+            model lists no such mode, FROZEN where every state that counts needs a frozen one, and UNASKED where no
+            verdict was asked for.
         """
         kinds = self.transient.statuses()
         for k in np.flatnonzero(~self.judged):
             if kinds[k] is Status.OK:  # but for the two below, a value is beyond what the arithmetic carries
                 kinds[k] = Status.MISSING
-        frozen = self.frozen.any(axis=1) | self.thawed
+        frozen = self.withheld.any(axis=1) & ~self.judged
         for which, kind in (
             (self.unfitted_step, Status.STEP),
             (self.unlisted_mode, Status.MODE),

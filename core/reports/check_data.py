@@ -53,7 +53,8 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     t = transient.t_ns
     judged = int(verdicts.judged.sum())
     odd = [(int(verdicts.unfitted_step.sum()), Status.STEP), (int(verdicts.unlisted_mode.sum()), Status.MODE)]
-    odd.append((int((verdicts.frozen.any(axis=1) | verdicts.thawed).sum()), Status.FROZEN))
+    odd.append((int((verdicts.withheld.any(axis=1) & ~verdicts.judged).sum()), Status.FROZEN))
+    partly = int((verdicts.withheld.any(axis=1) & verdicts.judged).sum())
     if verdicts.asked is not None:
         odd.append((int((~verdicts.asked).sum()), Status.UNASKED))
     width = np.where(verdicts.judged[:, None], verdicts.upper - verdicts.lower, np.nan)
@@ -61,19 +62,19 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     before = np.concatenate([np.full((1, model.n), np.nan), transient.x[:-1]])
     change, largest = jumps(model, before, transient.x)
     for i, name in enumerate(model.state_names):
-        flags = verdicts.flags[:, i]
-        bad = flags == 1.0
+        bad, own = verdicts.flags[:, i] == 1.0, int((~np.isnan(verdicts.flags[:, i])).sum())
         runs = _runs(bad)
         longest = max(runs, key=lambda run: (run[1] - run[0], -run[0]), default=None)
         states[name] = {
             "violations": int(bad.sum()),
-            "inside": None if not judged else 1.0 - int(bad.sum()) / judged,
+            "verdicts": own,
+            "inside": None if not own else 1.0 - int(bad.sum()) / own,
             "first_violation": _instant(transient, runs[0][0]) if runs else None,
             "longest_violation": None
             if longest is None
             else {**_instant(transient, longest[0]), "samples": longest[1] - longest[0], **_length(t, longest)},
-            "mean_width": float(np.nanmean(width[:, i])) if judged else None,
-            "max_width": float(np.nanmax(width[:, i])) if judged else None,
+            "mean_width": float(np.nanmean(width[:, i])) if own else None,
+            "max_width": float(np.nanmax(width[:, i])) if own else None,
             "unit": model.signals.states[i].unit,
             "jump": _jump(model, verdicts, i, change[:, i], float(largest[i])),
         }
@@ -82,7 +83,11 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "recording": transient.name,
         "samples": len(transient),
         "verdicts": judged,
-        "no_verdict": [*unused(transient), *(f"{count} {kind.value}" for count, kind in odd if count)],
+        "no_verdict": [
+            *unused(transient),
+            *(f"{count} {kind.value}" for count, kind in odd if count),
+            *([f"{partly} frozen in part"] if partly else []),
+        ],
         "violated": int(verdicts.violated.sum()),
         "inside": None if not judged else 1.0 - int(verdicts.violated.sum()) / judged,
         "outside_domain": int(verdicts.outside_domain.sum()),

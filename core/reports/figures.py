@@ -432,7 +432,8 @@ def _outside(checked: Sequence[Verdicts], n: int) -> tuple[Array, Array, Integer
     outside, of_any = np.full((len(checked), n), np.nan), np.full(len(checked), np.nan)
     for row, (v, count) in enumerate(zip(checked, judged, strict=True)):
         if count:
-            outside[row] = (v.flags == 1.0).sum(axis=0) / count
+            own = (~np.isnan(v.flags)).sum(axis=0)
+            outside[row] = (v.flags == 1.0).sum(axis=0) / np.where(own, own, np.nan)
             of_any[row] = v.violated.sum() / count
     return outside, of_any, judged
 

@@ -346,7 +346,7 @@ def _tightness(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[
     rows = []
     for state in facts["model"]["states"]:
         here = [r["states"][state["name"]] for r in facts["recordings"]]
-        judged = [r["verdicts"] for r in facts["recordings"]]
+        judged = [s["verdicts"] for s in here]
         total = sum(judged)
         width = sum(s["mean_width"] * n for s, n in zip(here, judged, strict=True) if n) / total if total else None
         spans = [s["range"] for s in here if s["range"] is not None]
@@ -429,7 +429,7 @@ def _regimes(model: UncertainLTI, facts: Mapping[str, Any]) -> str:
 
 def _widths(regimes: Sequence[Mapping[str, Any]], name: str) -> list[tuple[float, int]]:
     """Mean width of a state and verdicts, of each recording with some in a regime."""
-    return [(r["states"][name]["mean_width"], r["verdicts"]) for r in regimes if r["verdicts"]]
+    return [(s["mean_width"], s["verdicts"]) for s in (r["states"][name] for r in regimes) if s["verdicts"]]
 
 
 def _trust(facts: Mapping[str, Any]) -> str:

@@ -99,19 +99,21 @@ def check_regimes(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any
     for r in range(model.schedule.blocks):
         rows = np.flatnonzero(judged & (block == r))
         bad = (verdicts.flags[rows] == 1.0).sum(axis=0)
-        count = len(rows)
+        own = (~np.isnan(verdicts.flags[rows])).sum(axis=0)  # without those withheld as a state is frozen
+        total = np.nansum(width[rows], axis=0)
         found.append(
             {
                 "regime": model.block_name(r),
-                "verdicts": count,
+                "verdicts": len(rows),
                 "violated": int(violated[rows].sum()),
-                "inside": _inside(int(violated[rows].sum()), count),
+                "inside": _inside(int(violated[rows].sum()), len(rows)),
                 "unknown_regime": int(verdicts.unknown_regime[rows].sum()),
                 "states": {
                     name: {
+                        "verdicts": int(own[i]),
                         "violations": int(bad[i]),
-                        "inside": _inside(int(bad[i]), count),
-                        "mean_width": float(width[rows, i].mean()) if count else None,
+                        "inside": _inside(int(bad[i]), int(own[i])),
+                        "mean_width": float(total[i] / own[i]) if own[i] else None,
                     }
                     for i, name in enumerate(model.state_names)
                 },

@@ -122,7 +122,7 @@ _NUMBERS = 2**22  # of one piece of `Part.level`
 def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str, group: str = "") -> Part:
     """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1."""
     verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
-    judged = verdicts.judged
+    judged = verdicts.judged & ~verdicts.withheld.any(axis=1)
     steps = transient.transitions()
     steps = steps.take(judged[steps.k + 1])
     longer, longer_width, longer_residual = _longer(model, full, steps, verdicts.horizon_utilisation[judged][:, 1:])
