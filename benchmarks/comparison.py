@@ -9,7 +9,7 @@
 
 """Our fits compared with their peers, on the same data in one run: widths, coverage of fresh recordings, time.
 
-    ./run python benchmarks/comparison.py [--quick] [--only WORDS] [--peers PYTHON] [--write docs/validation.md]
+    ./run python benchmarks/comparison.py [--quick] [--only WORDS] [--peers PYTHON] [--write FILE]
 
 PyIPM and MAPIE are asked from the interpreter --peers (default: .venv-peers/bin/python); make one with
 `python3 -m venv .venv-peers && .venv-peers/bin/pip install PyIPM mapie`. Without it they are left out, which is said.
@@ -42,7 +42,6 @@ from uncertain_lti.base.errors import FitError  # noqa: E402
 from uncertain_lti.validation.blocks import cut  # noqa: E402
 
 Array = np.ndarray
-MARK = "<!-- comparison -->"
 
 
 @dataclass(frozen=True)
@@ -394,7 +393,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one seed, fewer fresh transients")
     parser.add_argument("--only", metavar="WORDS", default="", help="only the plants whose title holds these words")
     parser.add_argument("--peers", default=str(ROOT / ".venv-peers" / "bin" / "python"), help="with PyIPM and mapie")
-    parser.add_argument("--write", metavar="FILE", help=f"replace what stands between two {MARK} lines of this file")
+    parser.add_argument("--write", metavar="FILE", help="write the tables to this file")
     options = parser.parse_args()
     methods: dict[str, Method] = {
         "(10), pure intervals": ours("qp", "none"),
@@ -448,9 +447,7 @@ def main() -> None:
         print(text, flush=True)
         texts.append(text)
     if options.write:
-        path = Path(options.write)
-        before, _, after = path.read_text().split(MARK)
-        path.write_text(f"{before}{MARK}\n" + "\n".join(texts) + f"{MARK}{after}")
+        Path(options.write).write_text("\n".join(texts))
     for sentence in said:
         print(sentence)
 
