@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Criteria (10) and (11) as written (docs/theory.md), in cvxpy: an independent second answer, and what tests compare with."""
+"""Criteria (10) and (11) as written (docs/theory.md), in cvxpy: an independent second answer, for tests and `fit`."""
 
 from __future__ import annotations
 
