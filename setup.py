@@ -102,7 +102,7 @@ extras = {
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="Linear models with bounded uncertainty, fitted to recordings and watched live in ROS 2",
     maintainer=PACKAGE.findtext("maintainer"),
     maintainer_email=PACKAGE.find("maintainer").get("email"),

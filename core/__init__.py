@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
     from uncertain_lti.validation.fitted_model import validate as validate
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "EnvelopeMonitor": "monitor.envelope_monitor",

@@ -294,7 +294,7 @@ def test_the_changelog_of_a_release_is_what_catkin_reads(package):
     text = (ROOT / "CHANGELOG.md").read_text()
     assert "\nForthcoming\n-----------\n* " in convert(text, package.findtext("name"))
     released = convert(text.replace("(unreleased)", "(2026-01-31)"), package.findtext("name"))
-    assert "\n0.1.0 (2026-01-31)\n------------------\n* " in released
+    assert "\n0.2.0 (2026-01-31)\n------------------\n* " in released
     core = pytest.importorskip("docutils.core", reason="docutils comes with the extra docs")
     tree = core.publish_doctree(released, settings_overrides={"report_level": 2, "halt_level": 2})
     (section,) = [*tree.findall(lambda node: node.tagname == "bullet_list" and node.parent.tagname != "list_item")]
