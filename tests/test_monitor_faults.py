@@ -483,57 +483,116 @@ def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Pat
     assert world.set(enable="") == (True, "") and world.status()["armed"] is True
 
 
-def test_a_subscriber_that_stands_still_costs_outputs_and_no_verdict(
-    ros: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each message takes 1 ms to send, as Fast DDS does to a stopped process; later it takes 5 µs again."""
-    clock = SimpleNamespace(now=100.0, sending=1e-3)
-    its_module = sys.modules[Sender.__module__]  # compiled or not
-    monkeypatch.setattr(its_module, "time", SimpleNamespace(monotonic=lambda: clock.now))
-    model = compiled_cases.saved(tmp_path / "m.json", 2, np.random.default_rng(5))
-    node = compiled_cases.Node(tmp_path / "m.json")
-    sent: Counter[str] = Counter()
-    alarms: list[bool] = []
+class Sends:
+    """A node whose publishers take processor time, and time besides, as a clock made by hand has it."""
 
-    def sends(name: str) -> Any:
+    def __init__(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now, self.used = 100.0, 0.0
+        self.sending = dict.fromkeys(("flags", "lower", "violation"), (5e-6, 5e-6))  # processor time and time, s
+        its_module = sys.modules[Sender.__module__]
+        clock = SimpleNamespace(monotonic=lambda: self.now, thread_time=lambda: self.used)
+        monkeypatch.setattr(its_module, "time", clock)
+        self.model = compiled_cases.saved(tmp_path / "m.json", 2, np.random.default_rng(5))
+        self.node = compiled_cases.Node(tmp_path / "m.json")
+        self.sender = self.node.outputs.sender
+        self.sent: Counter[str] = Counter()
+        self.alarms = [False]
+        for name, output in self.node.outputs.publishers.items():
+            output.send = self._sends(name)
+
+    def _sends(self, name: str) -> Any:
         def send(data: bytes) -> None:
-            clock.now += clock.sending
-            sent[name] += 1
+            used, took = self.sending.get(name, (5e-6, 5e-6))
+            self.used, self.now = self.used + used, self.now + took
+            self.sent[name] += 1
             if name == "violation":
-                alarms.append(data == TRUE)
+                self.alarms.append(data == TRUE)
 
         return send
 
-    for name, output in node.outputs.publishers.items():
-        output.send = sends(name)
-    stream = compiled_cases.stream(model, np.random.default_rng(6), 4000, 0.1)
-    heard = [False]
-    began, verdicts, samples = clock.now, 0, 0
-    for received, (arrival, topic, data) in enumerate(stream, 1):
-        clock.now += 5e-4
-        node.arrive(arrival, topic, data)
-        verdicts, samples = node.session.verdicts, node.session.sampler.counters["samples"]
-        if node.session.alarm != heard[-1]:
-            heard.append(node.session.alarm)
-            assert alarms[-1] == heard[-1], "each change of the alarm is published at once"
-        if samples == 2000 and clock.sending > 1e-4:
-            assert sent["flags"] < 400, "most verdicts are held back"
-            assert sent["flags"] + node.outputs.sender.held_back >= verdicts > 1000, "nothing else is"
-            assert clock.now - began < 1.4 * 5e-4 * received + 0.6, "what is left of the time is for the inputs"
-            assert node.outputs.sender.problems and "stands still" in node.outputs.sender.problems[0]
-            clock.sending, before = 5e-6, (verdicts, sent["flags"], node.outputs.sender.held_back)
-    sender = node.outputs.sender
-    assert len(heard) > 2 and not sender.problems
-    judged, published, held = verdicts - before[0], sent["flags"] - before[1], sender.held_back - before[2]
-    assert published >= judged - held > 0.9 * judged, "all of them again"
-    clock.sending = 1e-3
-    for _ in range(100):
-        sender.publish(node.session, [node.session.last], False, clock.now, True)
-    assert sender.problems
-    for output in node.outputs.publishers.values():
+    def run(self, messages: int, step: float = 5e-4) -> int:
+        """Verdicts on so many messages; each change of the alarm is published at once."""
+        for arrival, topic, data in compiled_cases.stream(self.model, np.random.default_rng(6), messages, 0.1):
+            self.now += step
+            self.node.arrive(arrival, topic, data)
+            assert self.alarms[-1] == self.node.session.alarm
+        return int(self.node.session.verdicts)
+
+
+def test_a_subscriber_that_stands_still_costs_outputs_and_no_verdict(
+    ros: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each message takes 1 ms of the processor, as with a stopped process; later it takes 5 µs again."""
+    sends = Sends(tmp_path, monkeypatch)
+    names = list(sends.node.outputs.publishers)
+    sends.sending, began = dict.fromkeys(names, (1e-3, 1e-3)), sends.now
+    verdicts = sends.run(4000)
+    assert sends.sent["lower"] < 0.1 * verdicts, "most messages are held back"
+    assert sends.used < 0.6 * (sends.now - began), "what is left of the time is for the inputs"
+    assert len(sends.sender.problems) == 1 and "~/lower" in sends.sender.problems[0]
+    sends.now += 1.1
+    assert not sends.sender.problems, "nothing is sent any more"
+    sends.sending, before, held = {}, sends.sent.copy(), sends.sender.held_back
+    again = sends.run(4000) - verdicts
+    assert sends.sent["lower"] - before["lower"] >= again > 1000 and sends.sender.held_back == held, "all of them again"
+    sends.sending = dict.fromkeys(names, (1e-3, 1e-3))
+    sends.run(1000)
+    assert sends.sender.problems
+    for output in sends.node.outputs.publishers.values():
         output.listeners = 0
-    assert not sender.problems, "nobody listens that could stand still"
-    compiled_cases.end([node])
+    assert not sends.sender.problems, "nobody listens that could stand still"
+    compiled_cases.end([sends.node])
+
+
+def test_a_stopped_reader_of_one_output_costs_the_readers_of_others_nothing(
+    ros: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sends = Sends(tmp_path, monkeypatch)
+    sends.sending["lower"] = (1e-3, 1e-3)
+    verdicts = sends.run(4000)
+    assert sends.sent["upper"] == verdicts > 1000 > sends.sent["lower"]
+    assert sends.sent["flags"] >= verdicts and "~/lower stands still" in sends.sender.problems[0]
+    compiled_cases.end([sends.node])
+
+
+def test_a_busy_processor_is_no_reader_that_stands_still(
+    ros: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sending takes 2 ms as others have the processor, and 20 µs of it."""
+    sends = Sends(tmp_path, monkeypatch)
+    sends.sending = dict.fromkeys(sends.node.outputs.publishers, (2e-5, 2e-3))
+    verdicts = sends.run(2000)
+    assert sends.sent["lower"] == verdicts > 500 and sends.sender.held_back == 0 and not sends.sender.problems
+    compiled_cases.end([sends.node])
+
+
+_LISTENS = """
+import rclpy
+from sensor_msgs.msg import JointState
+rclpy.init()
+node = rclpy.create_node("stalls")
+for name in ("lower", "upper", "state", "utilisation"):
+    node.create_subscription(JointState, f"/envelope_monitor/{name}", lambda message: None, 100)
+print("listens", flush=True)
+rclpy.spin(node)
+"""
+
+
+def test_every_flag_arrives_beside_a_process_that_is_stopped(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    world.monitor(saved(model, tmp_path))
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    stalls = world.start("stalls", "-c", _LISTENS)
+    stalls.says("listens")
+    until(lambda: world.status()["listeners"]["lower"] == 1, "the reader")
+    plant = Plant(world, model).subscribed()
+    plant.send(60)
+    flags.count(60)
+    stalls.signal(signal.SIGSTOP)
+    plant.send(400)
+    flags.count(460, patience=30.0)
+    stalls.kill()
+    assert world.status()["held_back"] >= 0
 
 
 def test_reload_reads_the_file_again_or_says_why_not(world: World, tmp_path: Path) -> None:

@@ -348,6 +348,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _unsubscribe(self) -> None:
         self.intake.waiting(all_of_them=True)
         self.active = False
+        self.outputs.sender.changed()
         for subscription in self.inputs.values():
             subscription.destroy()
         self.inputs.clear()

@@ -22,14 +22,15 @@ except ImportError:  # Cython is not needed to run
     from uncertain_lti.base import uncompiled as cython
 
 from uncertain_lti.base.compiled import use_twin
-from uncertain_lti.monitor.outputs import REASON, VIOLATION
+from uncertain_lti.monitor.outputs import FLAGS, REASON, VIOLATION
 from uncertain_lti.monitor.stream import Stream
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, Encoder, VerdictMessages, text_message
 
-_SLOW = 0.0001  # s to send one message; it takes 3 to 10 µs, unless Fast DDS makes the way to a reader anew each time
-_PATIENCE = 60  # samples that are sent so slowly, less those that are not; a busy machine delays one of many
-_REST = 4.0  # times what the last try took pass until the next
+_SLOW = 0.0001  # s of processor time for one message; 3 to 40 µs, unless Fast DDS makes the way to a reader anew
+_PATIENCE = 60  # messages of one topic that are sent so slowly, less those that are not
+_REST_OF_FLAGS, _REST = 1.5, 6.0  # times its processor time pass after a slow message; of others, for each slow topic
+_FORGET = 1.0  # s without a message of a topic, and how slow it was is found out again
 
 
 class Publisher(Protocol):
@@ -40,19 +41,42 @@ class Publisher(Protocol):
 
 
 @cython.cclass
-class _Heard:
-    """Publishers of vectors that somebody listens to, and what makes their messages of a verdict."""
+class _Way:
+    """The way to the readers of one topic, and how slow it is.
 
-    publishers: list[Any]
-    encoder: Encoder
+    `tried`: steady time of the last message, s; `until`: no further message before this steady time.
+    """
 
-    def __init__(self, publishers: Sequence[Publisher], encoder: Encoder) -> None:
-        self.publishers, self.encoder = list(publishers), encoder
+    name: str
+    send: Any
+    slow: cython.Py_ssize_t
+    tried: cython.double
+    until: cython.double
+
+    def __init__(self, name: str, publisher: Publisher) -> None:
+        self.name, self.send = name, publisher.send
+        self.slow, self.tried, self.until = 0, -math.inf, -math.inf
 
     @cython.cfunc
-    def lay_out(self, verdict: Any, publishers: list[Any], messages: list[bytes]) -> None:
-        """Add the messages of a verdict, or of what is predicted, and who sends each."""
-        publishers += self.publishers
+    def is_slow(self, now: cython.double) -> cython.bint:
+        """Whether sending has been slow lately."""
+        return self.slow >= _PATIENCE and now - self.tried < _FORGET
+
+
+@cython.cclass
+class _Heard:
+    """Ways to the readers of vectors that somebody listens to, and what makes their messages of a verdict."""
+
+    ways: list[Any]
+    encoder: Encoder
+
+    def __init__(self, ways: Sequence[Any], encoder: Encoder) -> None:
+        self.ways, self.encoder = list(ways), encoder
+
+    @cython.cfunc
+    def lay_out(self, verdict: Any, ways: list[Any], messages: list[bytes]) -> None:
+        """Add the messages of a verdict, or of what is predicted, and the way that each goes."""
+        ways += self.ways
         messages += self.encoder(verdict)
 
 
@@ -60,14 +84,13 @@ class _Heard:
 class Sender:
     """Sends what is published of verdicts.
 
-    `now`: steady time, s; `alarm_sent`: when ~/violation was last published, steady time in s; `held_back`: verdicts
-    that were not published, as sending took so long that inputs would have been lost.
+    `now`: steady time, s; `alarm_sent`: when ~/violation was last published, steady time in s; `held_back`: messages
+    that were not published, as sending on their topic took so long that inputs would have been lost.
     """
 
     alarm_sent: float = cython.declare(cython.double, visibility="readonly")
     held_back: int = cython.declare(cython.Py_ssize_t, visibility="readonly")
-    _slow: cython.Py_ssize_t
-    _until: cython.double
+    _ways: dict[str, Any]
     _publishers: Mapping[str, Publisher] = cython.declare(object)
     _messages: VerdictMessages = cython.declare(object)
     _reason_sent: str = cython.declare(object)
@@ -83,7 +106,7 @@ class Sender:
 
     def __init__(self, now: float) -> None:
         self.alarm_sent, self.held_back = now, 0
-        self._slow, self._until = 0, -math.inf
+        self._ways = {}
         self._known = self._alarm_heard = self._reason_heard = False
         self._reason_sent = ""
         self._given = self._judged = self._predicted = self._foreseen = None
@@ -99,16 +122,17 @@ class Sender:
         self._messages, self._known = messages, False
 
     def changed(self) -> None:
-        """There are more or fewer listeners of some publisher; whether sending to them is slow is seen anew."""
-        self._known, self._slow = False, 0
+        """There are more or fewer listeners, or nothing is sent for now; which ways are slow is found out again."""
+        self._known, self._ways = False, {}
 
     def _heard(self, *when: str) -> Any:
         outputs = self._messages.outputs
         names = [name for name in outputs if outputs[name].when in when and self._publishers[name].listeners]
-        return _Heard([self._publishers[name] for name in names], self._messages.encoder(names)) if names else None
+        return _Heard([self._ways[name] for name in names], self._messages.encoder(names)) if names else None
 
     def _listen(self) -> None:
         """Choose the vectors that somebody listens to, and lay out their messages."""
+        self._ways = {name: _Way(name, publisher) for name, publisher in self._publishers.items()}
         self._given, self._judged = self._heard("message"), self._heard("message", "judged")
         self._predicted, self._foreseen = self._heard("predicted"), self._heard("predicted over")
         self._alarm_heard, self._reason_heard = self._violation.listeners > 0, self._reason.listeners > 0
@@ -120,60 +144,92 @@ class Sender:
         First all messages are laid out, then all are sent together: threads of the middleware that are woken by
         one message then find the others too, and need not be woken again.
 
-        A subscriber that stands still can make sending a hundred times slower, so that inputs would be lost. Then
-        verdicts are held back, but for a try now and then; the alarm is published when it changes.
+        A subscriber that stands still can make sending on its topics a hundred times slower, so that inputs would be
+        lost. Then messages of these topics are held back as far as they would take too much of the processor.
         """
         heard: _Heard
         if not self._known:
             self._listen()
-        publishers: list[Any] = []
+        ways: list[Any] = []
         messages: list[bytes] = []
-        if self._slow >= _PATIENCE and time.monotonic() < self._until:
-            self.held_back += len(verdicts)
-            verdicts, opened = (), False
+        beats: cython.bint = False
         for verdict in verdicts:
             judged: cython.bint = verdict.judged
             heard = self._judged if judged else self._given
             if heard is not None:
-                heard.lay_out(verdict, publishers, messages)
-            if judged and self._alarm_heard:
-                turned = True
+                heard.lay_out(verdict, ways, messages)
+            beats = beats or judged
+        if beats and self._alarm_heard and not turned:
+            self.alarm_sent = now
+            ways.append(self._ways[VIOLATION.name])
+            messages.append(TRUE if session.alarm else FALSE)
         if opened and self._predicted is not None and (expected := session.predict()) is not None:
             heard = self._predicted
-            heard.lay_out(expected, publishers, messages)
+            heard.lay_out(expected, ways, messages)
         if opened and self._foreseen is not None and (foreseen := session.foresee()) is not None:
             heard = self._foreseen
-            heard.lay_out(foreseen, publishers, messages)
-        if turned:
-            self.alarm_sent = now
-            publishers.append(self._violation)
-            messages.append(TRUE if session.alarm else FALSE)
+            heard.lay_out(foreseen, ways, messages)
         if messages:
-            self._send(publishers, messages)
+            self._send(ways, messages)
+        if turned:
+            self.send_alarm(session.alarm, now)
         if self._reason_heard:
             self.send_reason(session.reasons.text)
 
     @cython.cfunc
-    def _send(self, publishers: list[Any], messages: list[bytes]) -> None:
+    def _send(self, ways: list[Any], messages: list[bytes]) -> None:
         i: cython.Py_ssize_t
-        began: cython.double = time.monotonic()
+        way: _Way
+        began: cython.double = time.thread_time()  # not by the steady clock: the processor may be busy with others
         for i in range(len(messages)):
-            publishers[i].send(messages[i])
-        ended: cython.double = time.monotonic()
-        slow: cython.bint = ended - began > _SLOW * len(messages)
-        if slow or self._slow > 0:
-            self._slow = min(self._slow + 1, 2 * _PATIENCE) if slow else self._slow - 1
-            self._until = ended + _REST * (ended - began)
+            way = ways[i]
+            if way.slow >= _PATIENCE and self._rests(way):
+                continue
+            way.send(messages[i])
+            ended: cython.double = time.thread_time()
+            if ended - began > _SLOW:
+                self._was_slow(way, ended - began)
+            elif way.slow > 0:
+                way.slow -= 1
+            began = ended
+
+    @cython.cfunc
+    def _rests(self, way: _Way) -> cython.bint:
+        """Whether a message is held back on a slow way."""
+        now: cython.double = time.monotonic()
+        if now - way.tried >= _FORGET:
+            way.slow = 0
+            return False
+        if now >= way.until:
+            return False
+        self.held_back += 1
+        return True
+
+    @cython.cfunc
+    def _was_slow(self, way: _Way, took: cython.double) -> None:
+        now: cython.double = time.monotonic()
+        if now - way.tried >= _FORGET:
+            way.slow = 0
+        way.slow, way.tried = min(way.slow + 1, 2 * _PATIENCE), now
+        rest: cython.double = _REST_OF_FLAGS if way.name == FLAGS.name else _REST * len(self.slow_topics())
+        way.until = now + rest * took
+
+    def slow_topics(self) -> list[str]:
+        """Outputs whose messages are held back in part, as sending them takes too long."""
+        now, found = time.monotonic(), []
+        for way in self._ways.values():
+            known: _Way = way
+            if known.is_slow(now):
+                found.append(known.name)
+        return found
 
     @property
     def problems(self) -> list[str]:
-        """Why verdicts are held back, one sentence; empty if they are not."""
-        if self._slow < _PATIENCE:
+        """On which outputs messages are held back, one sentence; none if there are none."""
+        if not (names := self.slow_topics()):
             return []
-        return [
-            "a subscriber of the outputs stands still: sending to it takes so long that most verdicts are not "
-            "published, the alarm is"
-        ]
+        topics = ", ".join(f"~/{name}" for name in names)
+        return [f"a subscriber of {topics} stands still: sending to it takes so long that messages are held back there"]
 
     def send_alarm(self, alarm: bool, now: float) -> None:
         """Publish ~/violation."""
