@@ -213,3 +213,32 @@ def test_a_looped_recording_starts_the_grace_over():
     armed = Arming(condition, 0).over(t_ns[:4], [1, 3, 3], [1.0, 0.0, 1.0])
     assert armed.counts.tolist() == [False, True, True, True]
     assert armed.cleared.tolist() == [True, False, False, True]  # it went off and on between two samples
+
+
+def test_of_a_name_that_is_there_twice_the_first_counts_live_and_offline(machine, tmp_path, capsys):
+    """With names that move from one message to the next, and a condition on another topic."""
+    model, folder = machine
+    rng = np.random.default_rng(1)
+    plant = transient(200, 2, start_ns=10**18)
+    n, messages = len(plant.state_names), []
+    for k, t in enumerate(plant.t_ns.tolist()):
+        order = rng.permutation([*range(n), *rng.integers(0, n, 2)])
+        names = [plant.state_names[i] for i in order]
+        x = plant.x[k][order] + 1e-4 * np.arange(n + 2)  # of places, not of names
+        hot = cdr("sensor_msgs/msg/Temperature", header=header(t), temperature=plant.x[k][-1], variance=0.0)
+        messages.append(Message("/engine/hot", t, hot, t))
+        messages.append(Message(STATE_TOPIC, t, joint_state(names, x, t), t))
+        messages.append(Message(CONTROL_TOPIC, t, joint_state(plant.control_names, plant.u[k], t), t))
+    kinds = dict.fromkeys((STATE_TOPIC, CONTROL_TOPIC), "sensor_msgs/msg/JointState")
+    kinds["/engine/hot"] = "sensor_msgs/msg/Temperature"
+    path = write([Topic(name, kind) for name, kind in kinds.items()], messages).save(tmp_path / "twice.mcap")
+    condition = f"{CONTROL_TOPIC} position[0] > -99"
+    assert main(["check", str(folder / "m.model.json"), str(path), "--json", "--enable", condition]) in (0, 1, 3)
+    found = json.loads(capsys.readouterr().out)["recordings"][0]["verdict_per_sample"]
+    assert [(v["t_ns"], v["alarm"]) for v in found] == live(model, Bag(path), Rule(enable=condition))
+    read = read_transients([path], folder / "signals.yaml")[0]
+    first = []
+    for message in Bag(path).raw_messages([STATE_TOPIC]):
+        value = JAZZY.deserialize_cdr(message.data, kinds[STATE_TOPIC])
+        first.append(dict(zip(reversed(value.name), reversed(value.position), strict=True))[FAN])
+    assert read.x[:, 0].tolist() == first[: len(read)]

@@ -17,6 +17,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -30,7 +31,9 @@ from bag_writer import Layout, Message, Topic, write
 from conftest import ROOT
 
 from uncertain_lti import UncertainLTI
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.monitor.live_rule import Rule
 from uncertain_lti.monitor.sender import Sender
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.monitor.verdict_messages import TRUE
@@ -828,3 +831,40 @@ def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) 
     album.take(scene(30_000), patience=300.0)
     assert outside.read_bytes() == b"of someone else" and (folder / written[0].name).is_symlink()
     assert not list(tmp_path.rglob("*.part"))
+
+
+# --- model files that are none ------------------------------------------------------------------------------
+
+
+def test_a_pipe_or_a_device_is_refused_as_a_model_and_the_node_lives_on(world: World, tmp_path: Path) -> None:
+    path = saved(by_hand(), tmp_path)
+    process = world.monitor(path)
+    os.mkfifo(tmp_path / "pipe")
+    for wrong in (tmp_path / "pipe", "/dev/zero"):
+        accepted, reason = world.set(model=str(wrong))
+        assert not accepted and f"{wrong}: is no regular file" in reason
+    assert world.status()["model"] == str(path) and world.status()["state"] == "active"
+    process.signal(signal.SIGTERM)
+    assert process.wait(20.0) == 0
+
+
+def test_a_file_that_cannot_be_read_in_time_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from uncertain_lti_ros import sessions
+
+    waiting = threading.Event()
+    monkeypatch.setattr(sessions.UncertainLTI, "load", lambda file: waiting.wait())
+    monkeypatch.setattr(sessions, "_PATIENCE", 0.05)
+    (tmp_path / "m.json").touch()
+    with pytest.raises(ModelError, match="cannot be read within 0.05 s"):
+        sessions.make_session(str(tmp_path / "m.json"), Rule(), None)  # type: ignore[arg-type]
+    waiting.set()
+
+
+def test_a_topic_without_its_time_is_refused_by_name(world: World, tmp_path: Path) -> None:
+    path = saved(by_hand(), tmp_path)
+    world.monitor(path)
+    content = json.loads(path.read_text())
+    del content["sampling"]["time"][CONTROL]
+    path.write_text(json.dumps(content))
+    assert trigger(world, "reload") == (False, f"{path}: sampling.time says nothing of {CONTROL}; write header or log")
+    assert world.status()["state"] == "active"

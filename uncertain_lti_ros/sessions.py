@@ -12,8 +12,10 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,28 @@ from uncertain_lti_ros.settings import Settings
 _type_fields = cache(live_fields)
 
 
+_PATIENCE = 10.0  # s that a file may take to be read, as on a network that is down
+
+
+def _load(file: Path) -> UncertainLTI:
+    """Read a model file in a thread of its own, so that a file that cannot be read does not hold up the node."""
+    loaded: Future[UncertainLTI] = Future()
+
+    def load() -> None:
+        try:
+            loaded.set_result(UncertainLTI.load(file))
+        except Exception as error:
+            loaded.set_exception(error)
+
+    threading.Thread(target=load, name="model file", daemon=True).start()
+    try:
+        return loaded.result(_PATIENCE)
+    except TimeoutError:
+        raise ModelError(
+            f"{file}: cannot be read within {_PATIENCE:g} s; copy it to a disk of this machine"
+        ) from None
+
+
 def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | None = None) -> Session:
     """Load a model file, and start a session with it."""
     if not path:
@@ -40,7 +64,7 @@ def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | Non
     file = Path(path).expanduser()  # no shell does that behind :=
     if not (file.is_absolute() or os.path.exists(file)):
         raise ModelError(f"{path}: there is no such model file in {Path.cwd()}; give the whole path")
-    model = UncertainLTI.load(file)
+    model = _load(file)
     types = topic_types(model, path, _type_fields)
     for names in (model.state_names, model.control_names):
         sendable(names)

@@ -111,6 +111,8 @@ def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> di
             )
     for topic, type_name in types.items():
         model.signals.check(topic, type_name, type_fields)
+        if topic not in model.signals.time:
+            raise ModelError(f"{source}: sampling.time says nothing of {topic}; write header or log")
     return types
 
 

@@ -24,7 +24,6 @@ from uncertain_lti.base.errors import SignalError
 from uncertain_lti.proposal.candidates import FEWEST, OF_QUATERNION, WRAPPING, Candidate, Source
 from uncertain_lti.proposal.effects import residual
 from uncertain_lti.proposal.roles import role_by_name, role_of_column
-from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.recording import Recording, TopicFacts
 from uncertain_lti.recordings.table import TYPE, Table
 from uncertain_lti.sampling.codes import codes
@@ -196,7 +195,7 @@ def _read(bag: Recording, sources: Sequence[Source], progress: Iterate | None) -
             stamps = columns.stamp[columns.stamp >= 0]
             if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(arrival) - 1):
                 source.halting = True
-        except (RepeatedNamesError, SignalError):
+        except SignalError:
             read = [(t, [path.read(message) for path in paths]) for _, t, message in bag.messages([source.topic])]
             arrival = np.array([t for t, _ in read], dtype=np.int64)
             values = np.array([row for _, row in read], dtype=np.float64).reshape(len(read), len(paths))

@@ -66,10 +66,6 @@ _SHORT_TEXT = 64  # bytes; longer texts that change are looked at one by one
 _MEANT = {*"xyzw", "header", "stamp", "sec", "nanosec"}  # what is read by a field's name
 
 
-class RepeatedNamesError(Exception):
-    """A name that a path looks up stands twice: which one counts depends on the messages before."""
-
-
 class Failure(NamedTuple):
     """A message that cannot be decoded.
 
@@ -498,8 +494,6 @@ class FieldReader:
 
     def _decode(self, data: bytes) -> tuple[list[float], int]:
         value = self.definition.decode(data)
-        for path in self.paths:
-            _look_for_repeated_names(path, value)
         return [path.read(value) for path in self.paths], header_stamp_ns(value) or NO_STAMP
 
     def _learn(self, data: bytes) -> _Layout | None:
@@ -511,8 +505,6 @@ class FieldReader:
             self.definition.decode_strictly(data)
             walk = Walk(data, self.fields)
             walk.message(self.definition.type_name, self.wanted)
-            if walk.repeated:
-                raise RepeatedNamesError
             shape = _Shape(walk, data)
             known = self.layouts.get(shape.key)
             if known is not None:
@@ -550,21 +542,3 @@ class FieldReader:
             return False
         decoded, stamp = self._decode(data)
         return values.tobytes() == np.array(decoded, dtype=np.float64).tobytes() and int(stamps[0]) == stamp
-
-
-def _look_for_repeated_names(path: FieldPath, message: Any) -> None:
-    value, parent = message, message
-    for kind, key in path.steps:
-        if kind == "attribute":
-            parent, value = value, getattr(value, str(key))
-        elif kind == "index":
-            if int(key) >= len(value):
-                return
-            value = value[int(key)]
-        else:
-            names = list(parent.name)
-            if names.count(str(key)) > 1:
-                raise RepeatedNamesError
-            if str(key) not in names or names.index(str(key)) >= len(value):
-                return
-            value = value[names.index(str(key))]

@@ -154,8 +154,7 @@ class Walk:
 
     `data`: serialised message; `fields`: type name -> {field name: FieldType}; `at`: where to begin; `pieces`: in
     order; `numbers`: the wanted ones that are there; `whole`: path that takes a whole array -> its length; `reserved`:
-    bytes that may stand behind the message, besides `PADDING`; `odd`: whether a string has not even a closing zero;
-    `repeated`: whether a name that a path looks up stands twice.
+    bytes that may stand behind the message, besides `PADDING`; `odd`: whether a string has not even a closing zero.
     """
 
     def __init__(self, data: bytes, fields: TypeFields, at: int = ENCAPSULATION) -> None:
@@ -168,7 +167,7 @@ class Walk:
         self.numbers: list[Number] = []
         self.whole: dict[int, int] = {}
         self.reserved = 0
-        self.odd = self.repeated = False
+        self.odd = False
 
     @property
     def excess(self) -> int:
@@ -230,7 +229,6 @@ class Walk:
         """Wanted elements of an array by position, those by name among them; what is not there is left out."""
         found = {i: each for i, each in here.elements.items() if i < count}
         for name, each in here.named.items():
-            self.repeated |= names.count(name) > 1
             if name in names[:count]:
                 i = names.index(name)
                 found[i] = _merged(found[i], each) if i in found else each

@@ -128,7 +128,7 @@ class MessageReader:
         return walk
 
     def _learn(self, walk: Walk, data: bytes, stamp: int | None, values: list[float]) -> None:
-        if walk.odd or walk.repeated:
+        if walk.odd:
             return
         layout = _Layout(walk, data, self._paths)
         found = layout.read(data)

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.recordings.bag_arrays import in_reach
-from uncertain_lti.recordings.cdr_arrays import RepeatedNamesError
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_path import FieldPath
@@ -50,10 +49,7 @@ def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = 
     Messages are read in blocks (`bag_arrays`), with what `read_stream_by_message` gives to the last bit.
     """
     paths = check_paths(bag, signals)
-    try:
-        columns = bag.columns(signals.topics, paths, progress)
-    except RepeatedNamesError:
-        return read_stream_by_message(bag, signals, progress)
+    columns = bag.columns(signals.topics, paths, progress)
     _refuse_absent(bag, signals, paths, columns.values)
     return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
 

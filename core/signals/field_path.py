@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -42,13 +42,12 @@ class FieldPath:
     to take from earlier samples; `inner`: the path without that: whose earlier samples they are.
     """
 
-    __slots__ = ("text", "unwrap", "memory", "inner", "function", "steps", "_name_index")
+    __slots__ = ("text", "unwrap", "memory", "inner", "function", "steps")
 
     def __init__(self, text: str) -> None:
         self.text = text
         self.unwrap = False
         self.function: FieldFunction | None = None
-        self._name_index = 0
         self.memory, self.inner = parse_memory(text)
         inner = self.inner
         functions: list[str] = []
@@ -114,21 +113,11 @@ class FieldPath:
                     return math.nan
                 value = value[key]
             else:
-                index = self._find_name(parent.name, key)  # type: ignore[arg-type]
-                if index < 0 or index >= len(value):
+                names = list(parent.name)
+                if key not in names or names.index(key) >= len(value):  # of a name that is there twice, the first
                     return math.nan
-                value = value[index]
+                value = value[names.index(key)]
         return self.function.of(value) if self.function else as_number(value)
-
-    def _find_name(self, names: Sequence[str], wanted: str) -> int:
-        index = self._name_index  # names seldom move between messages
-        if index < len(names) and names[index] == wanted:
-            return index
-        for index, name in enumerate(names):
-            if name == wanted:
-                self._name_index = index
-                return index
-        return -1
 
     def absent(self, message: Any) -> str:
         """What this path looks up and the message has not, in words, with what is there; empty where it has."""
