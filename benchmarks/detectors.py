@@ -7,267 +7,224 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Detectors that the benchmark of detection compares: a score per sample of many recordings, larger means less healthy.
+"""Detectors of process monitoring: each learns from healthy rows, and gives a score per row, larger is less healthy.
 
-All take recordings as arrays: x (R, T, n), u (R, T, m) and dt (R, T-1), R recordings of one length; a score is (R, T),
--inf where there is none. What a detector learns, it learns from the fitted recordings alone; its threshold is learnt
-elsewhere, for all in the same way.
+A recording is an array (T, p), a row per sample; a score is (T,), -inf while a window is not full. What a detector
+learns, it learns from the healthy recordings alone; its threshold is learnt elsewhere, for all in the same way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import lu_factor, lu_solve
 from scipy.signal import lfilter
+from scipy.stats import f as f_distribution
+from scipy.stats import norm
 
 Array = np.ndarray
+Score = Callable[[Array], Array]
+Learn = Callable[[Sequence[Array]], Score]
+
+COMPONENTS, ORDER = 9, 29
+"""Principal components (of 33 signals, as by parallel analysis), and states of canonical variates, at most."""
+WINDOWS = (10, 30)
+"""Rows over which each score is averaged, too: those of the panel."""
 
 
-@dataclass(frozen=True, eq=False)
-class Runs:
-    """Recordings of one length."""
-
-    x: Array
-    u: Array
-    dt: Array
-
-    @property
-    def z(self) -> Array:
-        """[x u], (R, T, n + m)."""
-        return np.concatenate([self.x, self.u], axis=2)
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    return "".join("| " + " | ".join(line) + " |\n" for line in (header, ["---"] * len(header), *rows))
 
 
-Residuals = Callable[[Runs], Array]
-"""(R, T-1, n): of the arrivals at samples 1..T-1."""
-Score = Callable[[Runs], Array]
+def lagged(rows: Array, lags: int) -> Array:
+    """Rows (T, p) as (T - lags, p (lags + 1)), the newest first."""
+    return sliding_window_view(rows, lags + 1, axis=0)[..., ::-1].transpose(0, 2, 1).reshape(len(rows) - lags, -1)
 
 
-# --- models: residuals ---
+def padded(score: Array, rows: int) -> Array:
+    """A score of the last rows as one of all."""
+    return np.concatenate([np.full(rows - len(score), -np.inf), score])
 
 
-@dataclass(frozen=True)
-class LeastSquares:
-    """x_next - x = Δt [x u 1] theta, one law for all regimes: what least squares gives."""
+def averaged(score: Score, window: int) -> Score:
+    """The mean over the last rows."""
 
-    theta: Array
+    def of(rows: Array) -> Array:
+        found = score(rows)
+        start = int(np.isneginf(found).sum())
+        if len(found) - start < window:
+            return np.full(len(found), -np.inf)
+        return padded(sliding_window_view(found[start:], window).mean(axis=1), len(rows))
 
-    @classmethod
-    def of(cls, fitted: Iterable[Runs]) -> LeastSquares:
-        """Fit one law."""
-        phi, target = [], []
-        for runs in fitted:
-            phi.append(cls._phi(runs.x[:, :-1], runs.u[:, :-1], runs.dt).reshape(-1, runs.z.shape[2] + 1))
-            target.append(np.diff(runs.x, axis=1).reshape(-1, runs.x.shape[2]))
-        return cls(np.linalg.lstsq(np.vstack(phi), np.vstack(target), rcond=None)[0])
-
-    @staticmethod
-    def _phi(x: Array, u: Array, dt: Array) -> Array:
-        return np.concatenate([x, u, np.ones((*x.shape[:-1], 1))], axis=-1) * dt[..., None]
-
-    def step(self, x: Array, u: Array, dt: Array) -> Array:
-        """The next state from x (..., n), u (..., m) after dt (...)."""
-        return x + self._phi(x, u, dt) @ self.theta
-
-    def __call__(self, runs: Runs) -> Array:
-        """One-step residuals."""
-        return runs.x[:, 1:] - self.step(runs.x[:, :-1], runs.u[:, :-1], runs.dt)
+    return of
 
 
-@dataclass(frozen=True)
-class Kalman:
-    """Innovations of the stationary Kalman filter of a least-squares model."""
-
-    law: LeastSquares
-    gain: Array
-
-    @classmethod
-    def of(cls, fitted: Sequence[Runs], law: LeastSquares, process: float, sensors: float) -> Kalman:
-        """Covariances of process and sensors are these shares of that of the residuals; of the sensors its diagonal."""
-        n = fitted[0].x.shape[2]
-        A = np.eye(n) + median_step(fitted) * law.theta[:n].T
-        spread = np.cov(np.concatenate([law(r).reshape(-1, n) for r in fitted]).T)
-        R = sensors * np.diag(np.diag(spread))
-        P = solve_discrete_are(A.T, np.eye(n), process * spread, R)
-        return cls(law, P @ np.linalg.inv(P + R))
-
-    @classmethod
-    def likeliest(cls, fitted: Sequence[Runs], law: LeastSquares) -> Kalman:
-        """Of some shares, those that make the fitted recordings likeliest."""
-        n = fitted[0].x.shape[2]
-
-        def surprise(found: Kalman) -> float:
-            innovations = np.concatenate([found(r).reshape(-1, n) for r in fitted])
-            return float(np.linalg.slogdet(np.cov(innovations.T))[1])
-
-        shares = [(p, s) for p in (1e-4, 1e-3, 1e-2, 0.1, 1.0) for s in (0.01, 0.1, 0.5)]
-        return min((cls.of(fitted, law, *share) for share in shares), key=surprise)
-
-    def __call__(self, runs: Runs) -> Array:
-        """Innovations; the filter starts from the first reading."""
-        x, found = runs.x[:, 0], np.empty_like(runs.x[:, 1:])
-        for k in range(found.shape[1]):
-            expected = self.law.step(x, runs.u[:, k], runs.dt[:, k])
-            found[:, k] = runs.x[:, k + 1] - expected
-            x = expected + found[:, k] @ self.gain.T
-        return found
+def scaling(healthy: Sequence[Array]) -> tuple[Array, Array]:
+    """Mean and deviation of each column; a column that never moves keeps its unit."""
+    rows = np.concatenate(list(healthy))
+    deviation = rows.std(axis=0)
+    return rows.mean(axis=0), np.where(deviation > 1e-9 * np.abs(rows).max(axis=0), deviation, 1.0)
 
 
-# --- statistics of residuals ---
+def root(covariance: Array, power: float) -> Array:
+    """A power of a covariance; directions that hardly vary count as constant."""
+    values, axes = np.linalg.eigh(covariance)
+    kept = values > 1e-8 * values[-1]
+    return np.asarray((axes[:, kept] * values[kept] ** power) @ axes[:, kept].T)
 
 
-def padded(scores: Array, samples: int) -> Array:
-    """Scores (R, K) of the last K samples, as (R, samples)."""
-    return np.concatenate([np.full((len(scores), samples - scores.shape[1]), -np.inf), scores], axis=1)
+def principal(healthy: Sequence[Array], lags: int = 0, residual: bool = True) -> Score:
+    """PCA (without lags) and DPCA: Hotelling's T2 in the components, or the squared prediction error beside them."""
+    mean, deviation = scaling(healthy)
+    z = np.concatenate([lagged((rows - mean) / deviation, lags) for rows in healthy])
+    values, axes = np.linalg.eigh(np.cov(z.T))
+    kept = min(COMPONENTS * (lags + 1), int((values > 1e-8 * values[-1]).sum()) * 3 // 4)
+    values, axes = values[::-1][:kept], axes[:, ::-1][:, :kept]
+
+    def of(rows: Array) -> Array:
+        seen = lagged((rows - mean) / deviation, lags)
+        parts = seen @ axes
+        found = (seen**2).sum(axis=1) - (parts**2).sum(axis=1) if residual else (parts**2 / values).sum(axis=1)
+        return padded(found, len(rows))
+
+    return of
 
 
-def window_mean(values: Array, window: int) -> Array:
-    """Mean over the last `window` along axis 1; what lies before the start counts as 0."""
-    total = np.concatenate([np.zeros_like(values[:, :1]), np.cumsum(values, axis=1)], axis=1)
-    ends = np.arange(1, total.shape[1])
-    return (total[:, ends] - total[:, np.maximum(ends - window, 0)]) / window
+def canonical(healthy: Sequence[Array], lags: int = 2) -> Score:
+    """CVA: the part of the whitened past that says nothing about the future (T2 of the residual space)."""
+    mean, deviation = scaling(healthy)
+    past, future = [], []
+    for rows in healthy:
+        seen = lagged((rows - mean) / deviation, lags - 1)
+        past.append(seen[:-lags])
+        future.append(seen[lags:])
+    p, f = np.concatenate(past), np.concatenate(future)
+    joint = np.cov(np.hstack([p, f]).T)
+    size = p.shape[1]
+    white = root(joint[:size, :size], -0.5)
+    canonical_axes = np.linalg.svd(white @ joint[:size, size:] @ root(joint[size:, size:], -0.5))[0]
+    J = canonical_axes[:, min(ORDER, size // 2) :].T @ white
+
+    def of(rows: Array) -> Array:
+        return padded(((lagged((rows - mean) / deviation, lags - 1) @ J.T) ** 2).sum(axis=1), len(rows))
+
+    return of
 
 
-def of_window(values: Array, violations: int, window: int) -> Array:
-    """The violations-th largest of the last `window` values (R, K)."""
-    before = np.full((len(values), window - 1), -np.inf)
-    recent = sliding_window_view(np.concatenate([before, values], axis=1), window, axis=1)
-    where = window - violations
-    return np.concatenate(
-        [np.partition(recent[i : i + 50], where, axis=2)[:, :, where] for i in range(0, len(recent), 50)]
-    )
+def least_squares(healthy: Sequence[Array], n: int, fading: float = 1.0) -> Score:
+    """Chi-square of the one-step residuals of x_next = [x u 1] theta, of one sample or faded (MEWMA)."""
+    mean, deviation = scaling(healthy)
+
+    def split(rows: Array) -> tuple[Array, Array]:
+        z = (rows - mean) / deviation
+        return np.column_stack([z[:-1], np.ones(len(z) - 1)]), z[1:, :n]
+
+    parts = [split(rows) for rows in healthy]
+    theta = np.linalg.lstsq(np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts]), rcond=None)[0]
+    left = np.concatenate([b - a @ theta for a, b in parts])
+    offset, inverse = left.mean(axis=0), np.linalg.pinv(np.atleast_2d(np.cov(left.T)))
+
+    def of(rows: Array) -> Array:
+        a, b = split(rows)
+        r = lfilter([fading], [1.0, fading - 1.0], b - a @ theta - offset, axis=0)
+        return padded(np.einsum("ki,ij,kj->k", r, inverse, r), len(rows))
+
+    return of
 
 
-def cusum(values: Array, slack: float) -> Array:
-    """Two-sided cumulative sums of standardised values (R, K, n): the largest."""
-    up, down, found = np.zeros(values[:, 0].shape), np.zeros(values[:, 0].shape), np.empty(values.shape[:2])
-    for k in range(values.shape[1]):
-        up = np.maximum(0.0, up + values[:, k] - slack)
-        down = np.maximum(0.0, down - values[:, k] - slack)
-        found[:, k] = np.maximum(up, down).max(axis=1)
+DETECTORS: dict[str, Learn] = {
+    "PCA T2": partial(principal, residual=False),
+    "PCA SPE": principal,
+    "DPCA SPE, 2 lags": partial(principal, lags=2),
+    "CVA residual, 2 lags": canonical,
+    "CVA residual, 5 lags": partial(canonical, lags=5),
+}
+
+
+# --- rules of SKAB's repository, with its own settings: healthy rows to the alarms of others ---
+
+
+def rolling(values: Array, window: int) -> Array:
+    """Median of the last values; NaN while there are fewer."""
+    found = np.full(len(values), np.nan)
+    found[window - 1 :] = np.median(sliding_window_view(values, window), axis=1)
     return found
 
 
-def squared(values: Array, inverse: Array) -> Array:
-    """v' C^-1 v of values (R, K, n)."""
-    found: Array = np.einsum("rki,ij,rkj->rk", values, inverse, values, optimize=True)
-    return found
+def limit_of_t2(components: int, count: int, p: float = 0.999) -> float:
+    """Upper control limit of Hotelling's T2."""
+    factor = components * (count - 1) * (count + 1) / (count * (count - components))
+    return float(factor * f_distribution.ppf(p, components, count - components))
 
 
-@dataclass(frozen=True)
-class Statistic:
-    """What is made of residuals.
+def t2(healthy: Array) -> Callable[[Array], Array]:
+    """T2 of all signals: median of 5 over twice its limit."""
+    mean, deviation = scaling([healthy])
+    inverse = np.linalg.inv(np.cov(((healthy - mean) / deviation).T))
+    limit = 2 * limit_of_t2(healthy.shape[1], len(healthy))
 
-    Parameters
-    ----------
-    kind : {"3 sigma", "chi2", "CUSUM", "MEWMA"}
-        The statistic.
-    number : float
-        Window of chi2, s, 0 for one sample; slack of CUSUM, in deviations; weight of the newest sample in MEWMA.
-    """
+    def of(rows: Array) -> Array:
+        z = (rows - mean) / deviation
+        return np.asarray(rolling(np.einsum("ki,ij,kj->k", z, inverse, z), 5) > limit)
 
-    kind: str
-    number: float = 0.0
-
-    @property
-    def name(self) -> str:
-        """As tables call it."""
-        if self.kind == "chi2" and self.number:
-            return f"chi2 {self.number * 1e6:g} µs" if self.number < 1e-3 else f"chi2 {self.number:g} s"
-        if self.kind == "chi2":
-            return self.kind
-        return self.kind if self.kind == "3 sigma" else f"{self.kind} {self.number:g}"
+    return of
 
 
-def residual_detectors(
-    residuals: Residuals, fitted: Sequence[Runs], statistics: Sequence[Statistic]
-) -> dict[str, Score]:
-    """The usual statistics of residuals, with the mean and covariance of the fitted recordings.
+def t2_and_q(healthy: Array) -> Callable[[Array], Array]:
+    """T2 in the components of 85 % of the variance, or Q beside them: medians of 5 over their limits."""
+    mean, deviation = scaling([healthy])
+    z = (healthy - mean) / deviation
+    covariance = np.cov(z.T)
+    values, axes = np.linalg.eigh(covariance)
+    values, axes = values[::-1], axes[:, ::-1]
+    kept = int(np.searchsorted(np.cumsum(values) / values.sum(), 0.85)) + 1
+    left = float(np.linalg.eigvals(covariance)[kept:].sum())  # in the order of LAPACK, as there
+    h = 1 - 2 * left * left**3 / (3 * left**4)
+    terms = 1 + norm.ppf(0.999) * h * math.sqrt(2 * left**2) / left + left**2 * h * (h - 1) / left**2
+    limits = limit_of_t2(kept, len(healthy)), left * terms ** (1 / h)
 
-    Parameters
-    ----------
-    residuals : callable
-        Residuals of recordings; of one object they are computed once.
-    fitted : sequence of Runs
-        What mean and covariance are taken from.
-    statistics : sequence of Statistic
-        Which.
+    def of(rows: Array) -> Array:
+        z = (rows - mean) / deviation
+        parts = z @ axes[:, :kept]
+        q = (z**2).sum(axis=1) - (parts**2).sum(axis=1)
+        return np.asarray(
+            (rolling((parts**2 / values[:kept]).sum(axis=1), 5) > limits[0]) | (rolling(q, 5) > limits[1])
+        )
 
-    Returns
-    -------
-    dict
-        Score of each.
-    """
-    healthy = np.concatenate([(r := residuals(runs)).reshape(-1, r.shape[2]) for runs in fitted])
-    mean, deviation = healthy.mean(axis=0), healthy.std(axis=0)
-    inverse = np.linalg.inv(np.cov(healthy.T))
-    step = median_step(fitted)
-    kept: dict[int, tuple[Runs, Array]] = {}
-
-    def centred(runs: Runs) -> Array:
-        if id(runs) not in kept:
-            kept[id(runs)] = (runs, residuals(runs) - mean)
-        return kept[id(runs)][1]
-
-    def score(statistic: Statistic) -> Score:
-        def of(runs: Runs) -> Array:
-            r, number = centred(runs), statistic.number
-            if statistic.kind == "3 sigma":
-                found = np.abs(r / deviation).max(axis=2)
-            elif statistic.kind == "chi2":
-                found = window_mean(squared(r, inverse), max(1, round(number / step)))
-            elif statistic.kind == "CUSUM":
-                found = cusum(r / deviation, number)
-            else:
-                found = squared(lfilter([number], [1.0, number - 1.0], r, axis=1), inverse)
-            return padded(found, runs.x.shape[1])
-
-        return of
-
-    return {statistic.name: score(statistic) for statistic in statistics}
+    return of
 
 
-def median_step(fitted: Sequence[Runs]) -> float:
-    """Median Δt, s."""
-    return float(np.median(np.concatenate([runs.dt.ravel() for runs in fitted])))
+def mset(healthy: Array) -> Callable[[Array], Array]:
+    """Multivariate state estimation: relative error of the estimate, centred mean of 60, over 0.01."""
+    mean, deviation = scaling([healthy])
+    known = (healthy - mean) / deviation
+
+    def likeness(a: Array, b: Array) -> Array:
+        apart = np.linalg.norm(a[:, None] - b[None], axis=2)
+        sizes = np.linalg.norm(a, axis=1)[:, None] + np.linalg.norm(b, axis=1)[None]
+        return np.asarray(1 - apart / sizes)
+
+    factors = lu_factor(likeness(known, known))
+
+    def of(rows: Array) -> Array:
+        weights = lu_solve(factors, likeness(known, (rows - mean) / deviation))
+        estimate = (known.T @ weights).T * deviation + mean
+        error = np.linalg.norm(rows - estimate, axis=1) / np.linalg.norm(estimate, axis=1)
+        total = np.concatenate([[0.0], np.cumsum(error)])
+        ends = np.arange(len(rows)) + 30
+        last, start = np.minimum(ends, len(rows)), np.maximum(ends - 60, 0)
+        return np.asarray((total[last] - total[start]) / (last - start) > 0.01)
+
+    return of
 
 
-# --- detectors on [x u] ---
-
-
-def hotelling(fitted: Sequence[Runs]) -> Score:
-    """Hotelling's T2 of [x u]."""
-    z = np.concatenate([runs.z.reshape(-1, runs.z.shape[2]) for runs in fitted])
-    mean, inverse = z.mean(axis=0), np.linalg.pinv(np.cov(z.T))
-    return lambda runs: squared(runs.z - mean, inverse)
-
-
-WINDOW = 10
-"""Samples of the windows of [x u]."""
-
-
-def principal_components(fitted: Sequence[Runs], share: float) -> Score:
-    """Squared prediction error of windows of [x u] behind the principal components of that share of the variance."""
-    z = np.concatenate([runs.z.reshape(-1, runs.z.shape[2]) for runs in fitted])
-    mean, deviation = z.mean(axis=0), z.std(axis=0)
-
-    def windows(values: Array) -> Array:
-        seen = sliding_window_view((values - mean) / deviation, WINDOW, axis=1)
-        return seen.reshape(*seen.shape[:2], -1)
-
-    seen = np.concatenate([(w := windows(runs.z)).reshape(-1, w.shape[2]) for runs in fitted])
-    variance, axes = np.linalg.eigh(np.cov(seen.T))
-    kept = int(np.searchsorted(np.cumsum(variance[::-1]) / variance.sum(), share)) + 1
-    axes = axes[:, ::-1][:, :kept]
-
-    def score(runs: Runs) -> Array:
-        z, found = runs.z, []
-        for i in range(0, len(z), 50):
-            w = windows(z[i : i + 50])
-            found.append((w**2).sum(axis=2) - ((w @ axes) ** 2).sum(axis=2))
-        return padded(np.concatenate(found), z.shape[1])
-
-    return score
+SKAB_RULES: dict[str, Callable[[Array], Callable[[Array], Array]]] = {
+    "T2, as its repository": t2,
+    "T2+Q, as its repository": t2_and_q,
+    "MSET, as its repository": mset,
+}

@@ -94,11 +94,6 @@ def test_every_claim_has_a_command_and_every_benchmark_a_claim():
         "regime_peers.py",
         "recorded.py",
         "detectors.py",
-        "detection_peers.py",
-        "detection_cases.py",
-        "detection_figures.py",
-        "detection_procedure.py",
-        "detection_tables.py",
         "shared_recordings.py",
     }  # parts of the others
     assert all(
