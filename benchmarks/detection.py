@@ -183,7 +183,7 @@ def report(cases: Sequence[Case], raw: Path | None) -> None:
 
 # --- the machines ---
 
-SECONDS, ONSET, BATCH = 30.0, 10.0, 120
+SECONDS, ONSET, BATCH = 30.0, 10.0, 240
 FAULTS = (
     *((kind, size) for kind in ("fan_damage", "compressor_wear", "sensor_drift", "sensor_bias") for size in (0.5, 1.0)),
     ("nozzle_stuck", 1.0), ("fuel_stuck", 1.0),
@@ -208,7 +208,7 @@ def from_whole_angle(moves: Sequence[tuple[float, float]]) -> tuple[tuple[float,
 
 def turbofan(quick: bool) -> Iterator[Case]:
     """Fitted to two pulse runs and twelve lever profiles of 40 s; ten faults on other levers."""
-    count, seeds = (20, 4) if quick else (240, 15)
+    count, seeds = (20, 4) if quick else (120, 10)
 
     def simulated(runs: list[Run]) -> list[Recording]:
         return [[t] for i in range(0, len(runs), BATCH) for t in simulate_fleet(runs[i : i + BATCH])]

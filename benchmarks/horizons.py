@@ -7,9 +7,9 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""What envelopes over several steps see that one step does not: widths, coverage and delays on the simulated turbofan.
+"""What envelopes over several steps see that one step does not: widths, coverage, delays and cost.
 
-./run python benchmarks/horizons.py turbofan      # manoeuvres and faults that were not fitted
+./run python benchmarks/horizons.py bags          # the shipped recordings of the turbofan's faults
 ./run python benchmarks/horizons.py live          # CPU time of a verdict with horizons, against one step
 ./run python benchmarks/horizons.py node          # CPU time of the node for a sample, through DDS
 ./run python benchmarks/horizons.py fit           # CPU time of a fit of ten horizons, against one step
@@ -26,8 +26,6 @@ from typing import Any
 import numpy as np
 from live_monitor import TOPICS, Child, Run, save_model
 from measure import table
-from regimes import FAULTY_MOVES, LONG, ONSET, SHORT_RUN, moved
-from turbofan_fleet import simulate_fleet
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.identification import fit
@@ -36,53 +34,14 @@ from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.terms import ARRAYS, SHAPES
 from uncertain_lti.plants.turbofan_faults import Fault
-from uncertain_lti.plants.turbofan_runs import DT, lever_moves, turbofan_signals
+from uncertain_lti.plants.turbofan_runs import DT, turbofan_signals
 from uncertain_lti.validation.blocks import cut
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ("pulses_up_large", "pulses_down_large", "levels")
 HORIZONS = (10, 20, 40)
 FAULTS = ("compressor_wear", "sensor_drift", "nozzle_stuck", "fan_damage")
-HEALTHY = {
-    "steps": [lever_moves(33.0, seed, jumps=1.0, hold=(0.8, 3.0)) for seed in (601, 602, 603)],
-    "ramps": [lever_moves(33.0, seed, jumps=0.0, rate=(0.5, 8.0), hold=(0.5, 3.0)) for seed in (604, 605, 606)],
-}
-
-
-def turbofan() -> None:
-    """Fitted to the two large pulse runs and the levels, or to eight lever profiles more; noise 1e-4.
-
-    Of every horizon: mean half-widths, share of the windows of six healthy runs of other manoeuvres inside, and of each
-    fault, on three more, the delay to the first window outside and the share outside from then on.
-    """
-    more = [moved(lever_moves(58.0, seed), LONG, 300 + seed) for seed in range(1, 9)]
-    healthy = [moved(m, SHORT_RUN, 700 + i) for i, m in enumerate([*HEALTHY["steps"], *HEALTHY["ramps"]])]
-    faulty = [moved(m, SHORT_RUN, 800 + i, fault) for fault in FAULTS for i, m in enumerate(FAULTY_MOVES)]
-    runs = iter(
-        [
-            *read_transients([ROOT / f"bags/turbofan_{name}_noise.mcap" for name in SHIPPED], turbofan_signals()),
-            *simulate_fleet(more),
-            *simulate_fleet([*healthy, *faulty]),
-        ]
-    )
-    sets = {"3 runs": [next(runs) for _ in SHIPPED]}
-    sets["11 runs"] = [*sets["3 runs"], *(next(runs) for _ in more)]
-    clean = [next(runs) for _ in healthy]
-    broken = {fault: [next(runs) for _ in FAULTY_MOVES] for fault in FAULTS}
-    rows = []
-    for name, fitted in sets.items():
-        for knots in (1, 3, 5):
-            for widths in ("growing", "constant"):
-                schedule: Any = {} if knots == 1 else {"fan_speed": knots}
-                model = fit(fitted, "qp", additive="noise", schedule=schedule, horizons=HORIZONS, widths=widths)  # type: ignore[arg-type]
-                rows += judged(model, [name, str(knots), widths], clean, broken)
-                print(f"{name}, {knots} knots, {widths}", file=sys.stderr, flush=True)
-    header = ["fitted to", "knots", "half-widths", "steps", "N1 N2 P3 P5 T5, 1e-4", "healthy inside"]
-    table(
-        f"Faults from {ONSET:g} s on: delay to the first window outside in three runs, s; share outside from then on",
-        [*header, *(f.replace("_", " ") for f in FAULTS)],
-        rows,
-    )
+ONSET = 24.0
 
 
 def judged(model: UncertainLTI, first: list[str], clean: list[Any], broken: dict[str, list[Any]]) -> list[list[str]]:
@@ -240,7 +199,7 @@ def fit_times(count: int = 1_000_000) -> None:
     )
 
 
-CLAIMS = {"turbofan": turbofan, "bags": bags, "live": live, "node": node, "fit": fit_times}
+CLAIMS = {"bags": bags, "live": live, "node": node, "fit": fit_times}
 
 
 def main() -> None:
