@@ -78,7 +78,8 @@ extras = {
     # Parquet, Feather and .mat files; CSV and .npz take numpy alone.
     "tables": ["pyarrow", "scipy"],
     "completion": ["shtab"],
-    "plots": ["matplotlib", "pillow"],
+    # Reports and interactive plots take jinja2 alone, images matplotlib.
+    "plots": ["jinja2", "markupsafe", "matplotlib"],
     # To and from python-control; MATLAB files take scipy alone.
     "control": ["control", "scipy"],
     # The pages in docs/, built by `./run docs`.

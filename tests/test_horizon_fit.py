@@ -29,8 +29,7 @@ from uncertain_lti.model.horizon import Run
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
-from uncertain_lti.reports.figures import save
-from uncertain_lti.reports.horizon_figure import horizon_figure
+from uncertain_lti.reports.figures import horizon_figure, save
 from uncertain_lti.reports.model_text import model_text
 
 STEPS = (2, 5, 11)

@@ -65,7 +65,7 @@ def test_only_the_scripts_of_the_page_may_run():
         f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'" for s in scripts
     ]
     assert "default-src 'none'" in page and not re.search(r"<(link|img|iframe)|src=[^x]|href=", page)
-    assert data_of(page)[0]["panels"][0]["title"] == f"{HOSTILE}0"
+    assert data_of(page)[0]["views"]["values"][0]["title"] == f"{HOSTILE}0"
 
 
 def test_the_library_is_as_it_was_published():
@@ -87,8 +87,11 @@ def test_a_short_recording_is_drawn_sample_by_sample():
     model = by_hand()
     verdicts = EnvelopeMonitor(model).check(Transient(t, x, rng.normal(size=(300, 1)), max_gap=1.0))
     (page,) = data_of(interactive_page("p", [plotted_check(model, verdicts)]))
-    panel = page["panels"][0]
-    assert [p["title"] for p in page["panels"]] == ["x1", "x2", "u1"] and "greatest" not in panel["values"]
+    assert list(page["views"]) == ["utilisation", "values"]  # small bounds cannot be seen beside the values
+    panel = page["views"]["values"][0]
+    assert [p["title"] for p in page["views"]["values"]] == ["x1", "x2", "u1"] and "greatest" not in panel["values"]
+    (top,) = page["top"]
+    assert top["levels"] == [1.0] and np.nanmax(array(top["values"]["least"])) > 1 and "x1" in top["note"]
     shown, drawn = times(page["times"][0]), array(panel["values"]["least"])
     assert (
         np.isnan(drawn).sum() == 1 and np.isnan(drawn[200]) and shown[200] == shown[201] == 7.0
@@ -97,9 +100,9 @@ def test_a_short_recording_is_drawn_sample_by_sample():
     assert np.array_equal(shown[keep], verdicts.transient.t)
     assert np.allclose(drawn[keep], x[:, 0], rtol=0, atol=1e-5)
     assert np.allclose(array(panel["values"]["upper"])[keep], verdicts.upper[:, 0], rtol=0, atol=1e-5, equal_nan=True)
-    marked = array(panel["values"]["marked"])[keep]
-    assert np.array_equal(~np.isnan(marked), verdicts.flags[:, 0] == 1.0)
-    assert page["alarms"][0] == pytest.approx([0.99, 1.01]) and page["silent"][0] == pytest.approx([1.99, 7.0])
+    marked = np.frombuffer(base64.b64decode(panel["values"]["marked"]["at"]), "<u4")
+    assert np.array_equal(shown[marked], verdicts.transient.t[verdicts.flags[:, 0] == 1.0])
+    assert page["alarms"][0] == pytest.approx([1.0, 1.02]) and page["silent"][0] == pytest.approx([1.99, 7.0])
 
 
 def test_horizons_of_the_model_are_views_of_the_plot():
@@ -110,21 +113,16 @@ def test_horizons_of_the_model_are_views_of_the_plot():
     model = by_hand().replace(horizons=further)
     verdicts = EnvelopeMonitor(model).check(Transient(np.arange(200) * 0.1, x, np.zeros((200, 1))))
     page = interactive_page("p", [plotted_check(model, verdicts)])
-    assert re.findall(r'<option value="(\w+)">([^<]*)', page) == [
-        ("values", "values"), ("utilisation", "utilisation, 1 step"), ("0", "utilisation, 5 steps"),
-        ("1", "utilisation, 20 steps"),
-    ]  # fmt: skip
+    views = ["utilisation, 1 step", "values", "utilisation, 5 steps", "utilisation, 20 steps"]
+    assert re.findall("<option>([^<]*)", page) == views
     (recording,) = data_of(page)
-    for i, panel in enumerate(recording["panels"][:2]):
-        for h, series in enumerate(panel["horizons"]):
-            of = verdicts.longer_utilisation[:, h, i]
-            assert np.allclose(array(series["least"]), of, atol=1e-5, equal_nan=True)
-            assert np.array_equal(~np.isnan(array(series["marked"])), np.abs(of) > 1.0)
-            assert (np.abs(of) > 1.0).any() and np.isnan(of[: (5, 20)[h]]).all()
-    assert recording["panels"][2]["horizons"] == []
-    assert "1 step" not in interactive_page(
-        "p", [plotted_check(by_hand(), EnvelopeMonitor(by_hand()).check(verdicts.transient))]
-    )
+    for h, view in enumerate(views[2:]):
+        for panel in recording["views"][view]:
+            of = verdicts.longer_utilisation[:, h, model.state_names.index(panel["title"])]
+            assert np.allclose(array(panel["values"]["least"]), of, atol=1e-5, equal_nan=True)
+            marked = np.frombuffer(base64.b64decode(panel["values"]["marked"]["at"]), "<u4")
+            assert np.array_equal(marked, np.flatnonzero(np.abs(of) > 1.0))
+            assert len(marked) and np.isnan(of[: (5, 20)[h]]).all()
 
 
 @settings(max_examples=8)
@@ -140,25 +138,30 @@ def test_nothing_is_hidden_in_a_long_recording(count, at, gap):
     model = by_hand()
     verdicts = EnvelopeMonitor(model).check(Transient(t, x, np.zeros((count, 1)), max_gap=1.0))
     (page,) = data_of(interactive_page("p", [plotted_check(model, verdicts, recordings=40)]))
-    values, shown = page["panels"][0]["values"], times(page["times"][0])
-    low, high, marked = (array(values[key]) for key in ("least", "greatest", "marked"))
-    assert len(shown) < 0.6 * count and (np.diff(shown) >= 0).all()
+    panel = next(p for p in page["views"]["values"] if p["title"] == "x1")
+    values, shown = panel["values"], times(page["times"][0])
+    low, high = (array(values[key]) for key in ("least", "greatest"))
+    marked = np.frombuffer(base64.b64decode(values["marked"]["at"]), "<u4")
+    assert len(shown) < 0.7 * count and (np.diff(shown) >= 0).all()
     assert np.nanmax(high) == pytest.approx(x[:, 0].max(), abs=1e-5) and np.nanmin(low) == pytest.approx(
         x[:, 0].min(), abs=1e-5
     )
     bad = np.flatnonzero(verdicts.flags[:, 0] == 1.0)
-    assert bool(len(bad)) == bool((~np.isnan(marked)).any())
+    assert bool(len(bad)) == bool(len(marked))
     if len(bad):
-        nearest = np.abs(shown[~np.isnan(marked)][None] - verdicts.transient.t[bad][:, None]).min(axis=1)
-        assert nearest.max() < 0.01 * count / 1000
+        nearest = np.abs(shown[marked][None] - verdicts.transient.t[bad][:, None]).min(axis=1)
+        assert nearest.max() < 0.01 * count / 400
     if 0 < len(at) < 5:
-        assert (~np.isnan(marked)).sum() == len(bad) and nearest.max() < 1e-9
+        assert len(marked) == len(bad) and nearest.max() < 1e-9
 
 
-def test_a_million_samples_fit_into_a_page():
+def test_a_long_recording_fits_into_a_page_of_two_megabytes():
     x = np.sin(np.arange(1_000_000) * 1e-4)[:, None] * np.ones(5)
-    run = Transient(np.arange(1_000_000) * 0.001, x, np.zeros((1_000_000, 2)))
-    assert len(interactive_page("p", [plotted_transient(run)])) < 12_000_000
+    run = Transient(np.arange(1_000_000) * 0.001, x, np.zeros((1_000_000, 1)))
+    assert len(interactive_page("p", [plotted_transient(run)])) < 2_000_000
+    model = by_hand(5)
+    page = interactive_page("p", [plotted_check(model, EnvelopeMonitor(model).check(run))])
+    assert 500_000 < len(page) < 2_000_000
 
 
 @pytest.fixture(scope="module")
@@ -186,9 +189,9 @@ def test_the_command_draws_models_recordings_and_checks(engine, tmp_path, capsys
     assert main(["plot", model, bad, "--violations", "9", "--window", "9", "--output", str(page), "-q"]) == 0
     assert main(["plot", model, bad, "--output", str(tmp_path / "one.png"), "-q"]) == 1
     assert main(["plot", run, "--output", str(page), "-q"]) == 0
-    titles = {panel["title"] for panel in data_of(page.read_text())[0]["panels"]}
+    titles = {panel["title"] for panel in data_of(page.read_text())[0]["views"]["values"]}
     assert main(["plot", run, "--signals", str(engine / "signals.yaml"), "--output", str(page), "-q"]) == 0
-    assert {panel["title"] for panel in data_of(page.read_text())[0]["panels"]} >= {"fan"} and len(titles) > 5
+    assert {panel["title"] for panel in data_of(page.read_text())[0]["views"]["values"]} >= {"fan"} and len(titles) > 5
 
 
 def test_what_cannot_be_drawn_is_one_sentence(engine, tmp_path, capsys):

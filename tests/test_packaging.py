@@ -47,12 +47,13 @@ LIVE = [
 ]
 
 # Where the name to import is not the name to install.
-PIP_NAME = {"PIL": "pillow", "yaml": "pyyaml"}
+PIP_NAME = {"yaml": "pyyaml"}
 ROSDEP_KEY = {
-    "PIL": "python3-pil",
     "cvxpy": "python3-cvxpy-pip",
     "highspy": "python3-cvxpy-pip",
+    "jinja2": "python3-jinja2",
     "lz4": "mcap-ros2-support",
+    "markupsafe": "python3-jinja2",
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",
     "numpy": "python3-numpy",

@@ -19,16 +19,16 @@ from PIL import Image
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.reports.figure_columns import PIXELS, DrawnColumns, TimeAxis
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
+from uncertain_lti.reports.charts import PIXELS, Columns, alarm_chart, columns_of, scores
 from uncertain_lti.reports.figures import (
-    budget_figure,
+    alarm_figure,
     coverage_figure,
     envelope_figure,
     matrices_figure,
     save,
     utilisation_figure,
 )
-from uncertain_lti.reports.width_budget import width_budget
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 LONG = "x_$the$_total <pressure>\nbehind_the_high_pressure_compressor_état_"
@@ -73,22 +73,58 @@ def test_no_violation_is_hidden_in_a_long_recording(count, jumps, gaps, back):
     """Every violated sample lies in a stretch that is marked, and every extreme is drawn."""
     model = by_hand(3, 1)
     verdicts = checked(model, count, jumps, gaps, back)
-    drawn = DrawnColumns.of(verdicts, TimeAxis(verdicts.transient).t, None)
-    assert drawn.binned and len(drawn.t) <= PIXELS
-    ends = np.append(drawn.starts[1:], drawn.stop)
-    for i in range(3):
-        x = verdicts.transient.x[:, i]
-        marked, value, _ = drawn.worst(verdicts, i, x)
-        bad = {
-            int(np.searchsorted(drawn.starts, k, side="right")) - 1 for k in np.flatnonzero(verdicts.flags[:, i] == 1)
-        }
-        assert marked.tolist() == drawn.t[sorted(bad)].tolist()
-        for b, worst in zip(sorted(bad), value, strict=True):
-            rows = np.arange(drawn.starts[b], ends[b])
-            utilisation = np.abs(verdicts.utilisation[rows, i])
-            assert worst == x[rows[np.nanargmax(utilisation)]]
-        assert np.nanmax(drawn.greatest(x)) == x.max() and np.nanmin(drawn.least(x)) == x.min()
-    assert drawn.alarm.any() == verdicts.alarm.any()
+    for drawn in (columns_of(verdicts), columns_of(verdicts, 900, fine=True)):
+        assert drawn.binned and len(drawn.t) <= 2 * PIXELS and (np.diff(drawn.t) >= 0).all()
+        low, high = drawn.extremes(verdicts.transient.x)
+        for i in range(3):
+            x, bad = verdicts.transient.x[:, i], verdicts.flags[:, i] == 1.0
+            marked = drawn.worst(bad, verdicts.utilisation[:, i], x)
+            place = np.searchsorted(drawn.starts, np.flatnonzero(bad), side="right") - 1
+            assert sorted(set(place.tolist())) == np.flatnonzero(~np.isnan(marked)).tolist()
+            for b in set(place.tolist()):
+                rows = np.arange(drawn.starts[b], np.append(drawn.starts, drawn.stop)[b + 1])
+                rows = rows[bad[rows]]
+                assert marked[b] == x[rows[np.abs(verdicts.utilisation[rows, i]).argmax()]]
+            assert np.nanmax(high[:, i]) == x.max() and np.nanmin(low[:, i]) == x.min()
+        assert drawn.alarm.any() == verdicts.alarm.any() == bool(drawn.alarms)
+
+
+def test_every_sample_is_drawn_around_a_violation():
+    t, near = np.arange(100_000) * 0.01, np.zeros(100_000, dtype=bool)
+    near[[500, 70_000]] = True
+    drawn = Columns.of(t, near=near, most=1000)
+    for k in (500, 70_000):
+        assert np.isin(np.arange(k - 100, k + 100), drawn.starts).all()
+
+
+RULES = [
+    [AlarmRule(1, 1, 1.0)],
+    [AlarmRule(1, 1, 1.3)],
+    [AlarmRule(3, 5, 1.0)],
+    [AlarmRule(2, 40, 1.0), StatisticRule("energy", 0.5, 1.4)],
+]
+
+
+@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("most", [10_000, 300])
+def test_the_score_is_over_its_threshold_just_where_the_alarm_is(rules, most):
+    rng = np.random.default_rng(1)
+    x = 0.05 * rng.normal(size=(4000, 2))
+    x[2000:2300, 1] += 0.003 * np.arange(300) * rng.choice([-1, 1], 300)
+    zeros = np.zeros((2, 2))
+    model = UncertainLTI(zeros, zeros[:, :1], zeros, zeros[:, :1], v=[0.2, 0.2], alarm=rules)
+    run = Transient(np.arange(4000) * 0.01, x, np.zeros((4000, 1)))
+    verdicts = EnvelopeMonitor(model).check(run)
+    assert 0 < verdicts.alarm.sum() < 3900
+    columns = columns_of(verdicts, most)
+    score, states = scores(model, verdicts, columns)
+    there = columns.judged & ~np.isnan(score)
+    assert there.sum() >= len(score) - 1
+    loud = (score > 1) if len(rules) > 1 else (score >= 1)
+    assert (loud[there] <= columns.alarm[there]).all() and (score[columns.alarm] >= 1).all()
+    assert states[1] > states[0]  # who did it comes first
+    chart = alarm_chart(model, verdicts, columns)
+    assert [p.title for p in chart.panels][1:] == ["x2", "x1"] and chart.panels[0].note
 
 
 def ink(path):
@@ -104,7 +140,7 @@ def test_every_size_can_be_drawn(n, count, jumps, tmp_path):
     model = by_hand(n, 20 if n == 50 else 3, LONG)
     at = {"none": (), "some": range(1, count, 50), "all": range(1, count)}[jumps]
     verdicts = checked(model, count, at, gaps=[count // 2], unknown=[count // 3] if count > 10 else ())
-    for make in (envelope_figure, utilisation_figure):
+    for make in (alarm_figure, envelope_figure, utilisation_figure):
         figure = make(model, verdicts)
         save(figure, tmp_path / "f.png", 50)
         assert 0.01 < ink(tmp_path / "f.png") < 0.8
@@ -127,30 +163,10 @@ def test_a_panel_says_what_it_shows():
 
 @pytest.mark.parametrize("n", [2, 50])
 @pytest.mark.parametrize("width", [0.0, 1.0])
-def test_matrices_budget_and_coverage(n, width, tmp_path):
+def test_matrices_and_coverage(n, width, tmp_path):
     model = by_hand(n, 4, LONG, width)
     runs = [checked(model, 60, jumps=[7] * (k % 2)) for k in range(40 if n == 50 else 1)]
     nothing = checked(model, 1)
-    figures = (
-        matrices_figure(model),
-        budget_figure(model, [v.transient for v in runs]),
-        coverage_figure(model, [*runs, nothing]),
-        coverage_figure(model, [nothing]),
-    )
+    figures = matrices_figure(model), coverage_figure(model, [*runs, nothing]), coverage_figure(model, [nothing])
     for k, figure in enumerate(figures):
         save(figure, tmp_path / f"{k}.png", 40)
-    with pytest.raises(ModelError, match="no usable transition|no recording"):
-        budget_figure(model, [nothing.transient])
-
-
-def test_the_budget_is_the_width_that_a_check_gives():
-    """Its shares are of the mean of upper - lower, over several recordings together."""
-    model = by_hand(4, 2)
-    runs = [checked(model, count, gaps=[9]) for count in (50, 300)]
-    shares, width, columns = width_budget(model, [v.transient for v in runs])
-    assert columns == ["x0", "x1", "x2", "x3", "u0", "u1", "drift", "noise"]
-    assert np.allclose(shares.sum(axis=1), 1.0)
-    judged = np.vstack([(v.upper - v.lower)[v.judged] for v in runs])
-    assert np.allclose(width, judged.mean(axis=0), rtol=1e-9)
-    assert (shares[:, 4:6] == 0).all()  # no control was given
-    assert np.allclose(shares[:, 7] * width, 2 * model.v * 2.0)

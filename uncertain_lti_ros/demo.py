@@ -34,7 +34,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
-from uncertain_lti.reports.figures import budget_figure, envelope_figure, matrices_figure, save, utilisation_figure
+from uncertain_lti.reports.figures import alarm_figure, envelope_figure, matrices_figure, save
 from uncertain_lti.reports.fit_text import fit_text
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti_ros.process import Life, living
@@ -109,11 +109,10 @@ def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     )
     event = (t, what)
     figures = {
+        "alarm.png": alarm_figure(model, offline),
         "envelope.png": envelope_figure(model, offline, states=SHOWN, event=event),
         "envelope_close.png": envelope_figure(model, offline, states=SHOWN, event=event, span=(t - 1.5, t + 1.5)),
-        "utilisation.png": utilisation_figure(model, offline, states=SHOWN),
         "matrices.png": matrices_figure(model),
-        "width_budget.png": budget_figure(model, transients),
     }
     for name, figure in figures.items():
         save(figure, output / name)

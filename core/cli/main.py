@@ -73,7 +73,7 @@ _EXTRAS = {
     **dict.fromkeys(("rclpy", "std_msgs", "sensor_msgs", "rosgraph_msgs", "std_srvs", "uncertain_lti_ros"), _ROS),
     "distributed": "install what a cluster needs: pip install 'uncertain-lti-ros[cluster]'",
     "shtab": "install what completion needs: pip install 'uncertain-lti-ros[completion]'",
-    **dict.fromkeys(("matplotlib", "PIL"), "install what figures need: pip install 'uncertain-lti-ros[plots]'"),
+    **dict.fromkeys(("jinja2", "markupsafe", "matplotlib"), "install what figures need: pip install 'uncertain-lti-ros[plots]'"),
 }
 
 

@@ -34,7 +34,7 @@ from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, co
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
     from uncertain_lti.recordings.recording import Recording
-    from uncertain_lti.reports.interactive import PlottedRecording
+    from uncertain_lti.reports.interactive import Plotted
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -135,9 +135,9 @@ def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Rec
         if page:
             plotted.append(plotted_check(model, verdicts, len(bags)))
         else:
-            from uncertain_lti.reports.figures import envelope_figure
+            from uncertain_lti.reports.figures import alarm_figure
 
-            _image(envelope_figure(model, verdicts), output)
+            _image(alarm_figure(model, verdicts), output)
     complain_of_unchecked("plot", len(bags) - checked, len(bags))
     if not checked:
         raise BagError("no recording could be checked, so nothing is drawn; name one that has the topics of the model")
@@ -147,7 +147,7 @@ def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Rec
     return ALARM if alarm else BAD_INPUT if checked < len(bags) else DONE
 
 
-def _plot_bags(options: argparse.Namespace, bags: list[Recording]) -> list[PlottedRecording]:
+def _plot_bags(options: argparse.Namespace, bags: list[Recording]) -> list[Plotted]:
     from uncertain_lti.reports.interactive import plotted_fields, plotted_transient
 
     if options.signals:
@@ -185,7 +185,7 @@ def _image(figure: Any, output: Path) -> None:
     save(figure, output, 200)
 
 
-def _write(title: str, plotted: list[PlottedRecording], output: Path) -> None:
+def _write(title: str, plotted: list[Plotted], output: Path) -> None:
     from uncertain_lti.reports.interactive import interactive_page
     from uncertain_lti.reports.page_file import write_page
 

@@ -7,295 +7,236 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""The report as one HTML page that needs nothing else: no script, no other file; figures are inside it.
+"""The report as one HTML page that needs nothing else: no script, no other file; charts are drawn inside it.
 
-Whatever comes from a file (names, units, notes, messages) is text and never HTML: every value passes `html.escape`, and
+Whatever comes from a file (names, units, notes, messages) is text and never HTML: the template escapes every value, and
 the page forbids scripts and other resources besides.
 """
 
 from __future__ import annotations
 
 import base64
-import io
-import itertools
-import os
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
-from html import escape
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from typing import Any
 
-from PIL import Image  # which matplotlib brings
+import numpy as np
+from jinja2 import Environment
+from markupsafe import Markup, escape
 
+from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.english import plural, shortlist
-from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.recordings.recording import Progress
-from uncertain_lti.reports import alt_texts, schedule_figures
-from uncertain_lti.reports import figures as plots
+from uncertain_lti.reports import charts
+from uncertain_lti.reports.charts import Chart, Columns, Map, Panel
 from uncertain_lti.reports.check_text import likeness_text, repeats_text
 from uncertain_lti.reports.detectable_text import SHOWN, condition_text, detectable_tables, detectable_words
-from uncertain_lti.reports.drawing import between_rows
 from uncertain_lti.reports.findings import APART
-from uncertain_lti.reports.horizon_figure import horizon_figure
 from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, WEIGHTS, YES
 from uncertain_lti.reports.tables import beyond, number, shortened
-from uncertain_lti.reports.width_budget import width_budget
 
-MOST_DRAWN = 8
-"""Recordings with figures of their own; those with most violations."""
-_MOST_STATES = 8
-_MOST_ROWS = 40
-_MOST_EPISODES = 20
-_DPI = 105
-_DENSITY = 2
-"""Dots of an image to each one of the page, for screens that have as many."""
-
+MOST_DRAWN = 6
+"""Recordings with charts of their own; those with most violations."""
+_COLUMNS = 700  # of a chart
+_MOST_STATES, _MOST_ROWS, _MOST_EPISODES = 8, 40, 20
 _ANSWER = {YES: "Yes", CARE: "With care", UNKNOWN: "Unknown", NO: "No"}
+_TONE = {YES: "good", CARE: "care", UNKNOWN: "care", NO: "bad"}
+_WEIGHED = {YES: "in its favour", CARE: "mind", UNKNOWN: "unknown", NO: "against it"}
 _STATE = {"quiet": "nothing", "violations": "violations", "alarm": "alarm", "unknown": "no verdict"}
 
-_STYLE = """
-:root { color-scheme: light dark; --line: #d5d9de; --ink: #1b1f24; --soft: #57606a; --good: #00684a; --care: #8a5a00;
-  --bad: #a83b00; --link: #0550ae; --page: #fff; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1060px; padding: 1.2rem; color: var(--ink); background: var(--page);
-  font: 15px/1.5 system-ui, "Segoe UI", "Liberation Sans", sans-serif; overflow-wrap: break-word; }
-h1 { font-size: 1.35rem; margin: 0 0 .2rem; } h2 { font-size: 1.1rem; margin: 2rem 0 .5rem; padding-top: .6rem;
-  border-top: 1px solid var(--line); } h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
-p { margin: .4rem 0; } .soft { color: var(--soft); } code { font-family: ui-monospace, monospace; font-size: .85em; }
-.cards { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 1rem; margin-top: .8rem; }
-.card { border: 1px solid var(--line); border-top: 5px solid var(--soft); border-radius: 4px; padding: .7rem 1rem; }
-.card.wide { grid-column: 1 / -1; }
-.card h2 { border: 0; margin: 0; padding: 0; font-size: .95rem; color: var(--soft); font-weight: 600; }
-.answer { font-size: 1.7rem; font-weight: 700; line-height: 1.25; margin: 0 0 .3rem; }
-.good { border-top-color: var(--good); } .care { border-top-color: var(--care); } .bad { border-top-color: var(--bad); }
-.good > .answer, b.good { color: var(--good); } .care > .answer, b.care { color: var(--care); }
-.bad > .answer, b.bad { color: var(--bad); }
-ul { margin: .3rem 0; padding-left: 0; list-style: none; } li { margin: .35rem 0; }
-.table { overflow-x: auto; } table { border-collapse: collapse; font-size: .87rem; margin: .4rem 0; }
-th, td { padding: .22rem .6rem; border-bottom: 1px solid var(--line); text-align: right; vertical-align: top;
-  font-variant-numeric: tabular-nums; }
-th { font-weight: 600; color: var(--soft); } th:first-child, td:first-child, .left { text-align: left; }
-td:first-child { min-width: 6.5rem; max-width: 24rem; } td code { overflow-wrap: anywhere; }
-.left > code { display: block; min-width: 9rem; }
-figure { margin: .8rem 0; } figcaption { font-size: .85rem; color: var(--soft); }
-figure label { display: block; overflow-x: auto; position: relative; }
-figure img { display: block; max-width: 100%; height: auto; }
-figure input { position: absolute; opacity: 0; } label:focus-within { outline: 1px dotted var(--soft); }
-figure label:has(input:checked) img { max-width: none; }
-nav a { margin-right: 1rem; } a { color: var(--link); }
-.tap { display: none; }
-@media (max-width: 720px) { .cards { grid-template-columns: minmax(0, 1fr); } body { padding: .7rem; }
-  .tap { display: inline; } figure label { cursor: zoom-in; } figure label:has(input:checked) { cursor: zoom-out; } }
-@media screen and (prefers-color-scheme: dark) {
-  :root { --line: #3a3f45; --ink: #e6e6e6; --soft: #a2a9b1; --good: #3fce9d; --care: #e0ab4a; --bad: #ff9159;
-    --link: #79b8ff; --page: #1a1a1a; }
-  figure img { filter: invert(.8980392) hue-rotate(180deg); } }
-@media print { body { max-width: none; padding: 0; font-size: 10.5pt; } nav, .tap { display: none; }
-  figure label:has(input:checked) img { max-width: 100%; } figure img, tr, .card { break-inside: avoid; }
-  h2, h3 { break-after: avoid; } figcaption { break-before: avoid; } .table { overflow: visible; }
-  table { font-size: .72rem; } th, td { padding: .15rem .35rem; } td:first-child { min-width: 0; } }
-"""
+Block = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text; columns but the first stand to the right unless they are `left`; `most` rows are shown."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: Sequence[int] = ()
+    most: int = _MOST_ROWS
 
 
 def html_report(
     model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any], progress: Progress | None = None
 ) -> str:
     """The report as one page."""
-    name = os.path.basename(facts["model"]["file"]) or "model"
-    title = f"{name}: may I rely on it, and what happened?"
+    name = charts.base_name(facts["model"]["file"] or "model")
     makers = [
-        partial(_first_screen, name, facts),
-        *_recordings(model, checked, facts),
-        partial(_tightness, model, checked, facts),
-        *([] if model.schedule is None else [partial(_regimes, model, facts)]),
-        partial(_trust, facts),
-        partial(_origin, facts),
+        lambda: list(_recordings(model, checked, facts)),
+        lambda: list(_tightness(model, facts)),
+        lambda: list(_regimes(facts)),
+        lambda: list(_trust(facts)),
+        lambda: list(_origin(facts)),
     ]
-    going: Iterable[Any] = makers if progress is None else progress(makers, len(makers))
-    parts = [maker() for maker in going]
+    going: Any = makers if progress is None else progress(makers, len(makers))
     return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
-        "style-src 'unsafe-inline'\">\n"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{_text(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
-        + "\n".join(parts)
-        + f'\n<p class="soft">Written by uncertain-lti {_text(facts["version"])}.</p>\n</body>\n</html>\n'
-    )
+        environment()
+        .from_string(asset("report.html"))
+        .render(
+            name=name, summary=_summary(facts), version=facts["version"], style=Markup(asset("report.css")),
+            cards=list(_cards(facts)), first=_first(model, checked, facts),
+            blocks=[block for make in going for block in make()],
+        )
+    )  # fmt: skip
 
 
-# --- sections ---------------------------------------------------------------------------------------------------
+@cache
+def environment() -> Environment:
+    """Templates: what they are given is escaped, and control characters are replaced."""
+    made = Environment(autoescape=True, finalize=lambda value: value if isinstance(value, Markup) else printable(value))
+    made.filters["name"] = _name
+    return made
 
 
-def _first_screen(name: str, facts: Mapping[str, Any]) -> str:
+def asset(name: str) -> str:
+    """A file of this room."""
+    return files("uncertain_lti.reports").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def printable(value: object) -> str:
+    """A value of a file as text of the page."""
+    return "".join(c if c.isprintable() or c == " " else "\N{REPLACEMENT CHARACTER}" for c in str(value))
+
+
+def _name(value: object) -> Markup:
+    """A name: where a line must end inside it, it ends after a low line, a slash or a dash."""
+    return Markup("<wbr>").join(escape(printable(part)) for part in re.split(r"(?<=[_/-])(?=[^_/-])", str(value)))
+
+
+# --- first screen ------------------------------------------------------------------------------------------------
+
+
+def _cards(facts: Mapping[str, Any]) -> Iterator[Block]:
     rely, happened = facts["rely"], facts["happened"]
-    tone = {YES: "good", CARE: "care", UNKNOWN: "care", NO: "bad"}
     reasons = sorted(rely["reasons"], key=lambda r: WEIGHTS.index(r["weight"]))
-    words = {YES: "in its favour", CARE: "mind", UNKNOWN: "unknown", NO: "against it"}
-    listed = "".join(
-        f'<li><b class="{tone[r["weight"]]}">{words[r["weight"]]}:</b> {_text(_without_address(r["text"]))}</li>'
-        for r in reasons[:6]
-    )
+    listed: list[Block] = [
+        {"lead": _WEIGHED[r["weight"]], "tone": _TONE[r["weight"]], "text": _cut(r["text"])} for r in reasons[:6]
+    ]
     if len(reasons) > 6:
-        listed += f'<li class="soft">and {len(reasons) - 6} more <a href="#trust">below</a></li>'
-    states = [h["state"] for h in happened]
-    if "alarm" in states:
-        what, look = "Alarm", "bad"
-    elif "violations" in states:
-        what, look = "Violations, no alarm", "care"
-    elif "quiet" in states:
-        what, look = ("Nothing left its bounds", "good") if "unknown" not in states else ("Partly unknown", "care")
-        if look == "good" and (rely["answer"] == NO or any("proves nothing" in r["text"] for r in reasons)):
-            what, look = "Nothing left its bounds, which says little here", "care"
-    else:
-        what, look = "Unknown", "care"
+        listed.append({"soft": True, "text": f"and {len(reasons) - 6} more", "to": "trust"})
+    yield {"title": "May I rely on it?", "tone": _TONE[rely["answer"]], "answer": _ANSWER[rely["answer"]]} | {
+        "list": listed
+    }
+    what, look = _headline(facts)
     order = sorted(happened, key=lambda h: ["alarm", "unknown", "violations", "quiet"].index(h["state"]))
-    items = "".join(
-        f"<li><b>{_name(os.path.basename(h['recording']) or h['recording'])}</b>: {_text(h['text'])}.</li>"
-        for h in order[:5]
-    )
+    items: list[Block] = [{"lead": charts.base_name(h["recording"]), "text": f"{h['text']}."} for h in order[:5]]
     if len(order) > 5:
-        items += f'<li class="soft">and {len(order) - 5} more recordings <a href="#recordings">below</a></li>'
+        items.append({"soft": True, "text": f"and {len(order) - 5} more recordings", "to": "recordings"})
     if rely["answer"] == NO and look == "bad":
-        items += '<li class="soft">The model is not to be relied on: the machine may be well, and the model wrong.</li>'
-    rule = facts["rule"]
-    conditions = f", {rule['conditions']}" if rule["conditions"] else ""
-    return (
-        f"<header><h1>{_text(name)}</h1>"
-        f'<p class="soft">{_text(_summary(facts))}. Alarm rule: {_rule(rule)}, margin '
-        f"{number(rule['margin'])}{_text(conditions)}.</p>"
-        '<nav><a href="#recordings">What happened</a><a href="#tight">How tight</a>'
-        + '<a href="#regimes">Regimes</a>'
-        * bool(facts["model"]["regimes"])
-        + '<a href="#trust">How far to trust it</a><a href="#origin">Where it comes from</a></nav></header>\n'
-        f'<div class="cards"><section class="card {tone[rely["answer"]]}"><h2>May I rely on it?</h2>'
-        f'<p class="answer">{_ANSWER[rely["answer"]]}</p><ul>{listed}</ul></section>\n'
-        f'<section class="card {look}"><h2>What happened?</h2><p class="answer">{what}</p><ul>{items}</ul></section>\n'
-        f"{_sees(facts)}</div>"
-    )
-
-
-def _sees(facts: Mapping[str, Any]) -> str:
-    """Which faults the model sees, on the first screen."""
+        text = "The model is not to be relied on: the machine may be well, and the model wrong."
+        items.append({"soft": True, "text": text})
+    yield {"title": "What happened?", "tone": look, "answer": what, "list": items}
     faults = facts["validation"] and facts["validation"]["detectable"]
     if not faults or faults["refused"]:
         why = faults["refused"] if faults else "run uncertain-lti validate MODEL --output MODEL"
-        answer, items = "Unknown", f"<li>{_text(why)}</li>"
+        answer, seen = "Unknown", [{"text": why}]
     else:
-        answer, words = f"Within {number(faults['within'])} s, from these sizes on", detectable_words(faults)
-        items = "".join(f"<li>{_text(text)}</li>" for text in words[:SHOWN])
-        items += '<li class="soft">and more <a href="#trust">below</a></li>'
-    return (
-        f'<section class="card wide"><h2>Which faults would it see?</h2><p class="answer">{_text(answer)}</p>'
-        f"<ul>{items}</ul></section>"
-    )
+        answer = f"Within {number(faults['within'])} s, from these sizes on"
+        seen = [{"text": text} for text in detectable_words(faults)[:SHOWN]]
+        seen.append({"soft": True, "text": "and more", "to": "trust"})
+    yield {"title": "Which faults would it see?", "tone": "", "answer": answer, "list": seen, "wide": True}
 
 
-def _rule(rule: Mapping[str, Any]) -> str:
-    if rule["window"] == 1:
-        return "at every violation"
-    return f"{rule['violations']} of the last {rule['window']} verdicts violated"
+def _headline(facts: Mapping[str, Any]) -> tuple[str, str]:
+    states, rely = [h["state"] for h in facts["happened"]], facts["rely"]
+    if "alarm" in states:
+        return "Alarm", "bad"
+    if "violations" in states:
+        return "Violations, no alarm", "care"
+    if "quiet" not in states:
+        return "Unknown", "care"
+    if "unknown" in states:
+        return "Partly unknown", "care"
+    if rely["answer"] == NO or any("proves nothing" in r["text"] for r in rely["reasons"]):
+        return "Nothing left its bounds, which says little here", "care"
+    return "Nothing left its bounds", "good"
 
 
 def _summary(facts: Mapping[str, Any]) -> str:
-    model = facts["model"]
+    model, fit, rule = facts["model"], facts["model"]["fit"], facts["rule"]
     text = f"{plural(len(model['states']), 'state')}, {plural(len(model['controls']), 'control')}"
     if model["schedule"]:
         text += f"; {plural(len(model['regimes']), 'regime')} over {model['schedule']}"
-    fit = model["fit"]
     if "criterion" in fit:
         text += f"; fitted by criterion {'(11)' if fit['criterion'] == 'lp' else '(10)'}"
         if "transitions" in fit:
-            text += (
-                f" to {plural(fit['transitions'], 'transition')} of {plural(fit.get('transients', '?'), 'recording')}"
-            )
-    return text
+            runs = plural(fit.get("transients", "?"), "recording")
+            text += f" to {plural(fit['transitions'], 'transition')} of {runs}"
+    said = f"{rule['violations']} of the last {rule['window']} verdicts violated"
+    said = "at every violation" if rule["window"] == 1 else said
+    conditions = f", {rule['conditions']}" if rule["conditions"] else ""
+    return f"{text}. Alarm rule: {said}, margin {number(rule['margin'])}{conditions}."
 
 
-def _recordings(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> list[partial[str]]:
+# --- sections ----------------------------------------------------------------------------------------------------
+
+
+def _first(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> Block:
+    """What happened and when in the recording with most violations, of those with an alarm if there are any."""
     recordings = facts["recordings"]
+    worst = max(range(len(checked)), key=lambda i: (recordings[i]["alarm"], recordings[i]["violated"]))
+    columns = charts.columns_of(checked[worst], _COLUMNS)
+    return _chart(charts.alarm_chart(model, checked[worst], columns), charts.heading(checked[worst]))
+
+
+def _recordings(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> Iterator[Block]:
+    recordings = facts["recordings"]
+    yield _heading("recordings", "What happened")
     drawn = sorted(range(len(recordings)), key=lambda i: -recordings[i]["violated"])[:MOST_DRAWN]
-    return [
-        partial(_all_recordings, model, checked, facts),
-        *(partial(_recording, model, checked[i], recordings[i]) for i in sorted(drawn)),
-    ]
-
-
-def _all_recordings(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> str:
-    recordings = facts["recordings"]
-    parts = ['<h2 id="recordings">What happened</h2>']
-    if len(recordings) > 1:
-        rows = [
-            [
-                _name(os.path.basename(r["recording"])),
-                str(r["verdicts"]),
-                str(r["violated"]),
-                str(r["episode_count"]),
-                _text(_STATE[h["state"]]),
-            ]
-            for r, h in zip(recordings, facts["happened"], strict=True)
-        ]
-        parts.append(_table(("recording", "verdicts", "violated", "episodes", "what"), rows, most=200))
-        figure = plots.coverage_figure(model, checked)
-        parts.append(_figure(figure, "Violated shares, recording by recording", alt_texts.coverage_text(recordings)))
+    for i in sorted(drawn):
+        yield from _recording(model, checked[i], recordings[i], len(recordings) > 1)
+    if len(recordings) == 1:
+        return
     if len(recordings) > MOST_DRAWN:
-        parts.append(f'<p class="soft">Drawn are the {MOST_DRAWN} recordings with most violations.</p>')
-    return "\n".join(parts)
+        yield _soft(f"Drawn are the {MOST_DRAWN} recordings with most violations.")
+    rows = [
+        [charts.base_name(r["recording"]), str(r["verdicts"]), str(r["violated"]), _share(r["violated"], r["verdicts"]),
+         str(r["episode_count"]), _STATE[h["state"]]]
+        for r, h in zip(recordings, facts["happened"], strict=True)
+    ]  # fmt: skip
+    yield _heading("", "All recordings", "h3")
+    yield _table(("recording", "verdicts", "violated", "share", "episodes", "what"), rows, most=200)
 
 
-def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any]) -> str:
-    states = facts["states"]
-    parts = [f"<h3>{_name(os.path.basename(facts['recording']) or facts['recording'])}</h3>"]
+def _recording(model: UncertainLTI, verdicts: Verdicts, facts: Mapping[str, Any], several: bool) -> Iterator[Block]:
+    yield _heading("", charts.base_name(facts["recording"]), "h3")
+    columns = charts.columns_of(verdicts, _COLUMNS)
+    if several:
+        yield _chart(charts.alarm_chart(model, verdicts, columns))
+    if model.n > _MOST_STATES:
+        yield _chart(charts.utilisation_map(model, verdicts, columns))
     silent = f" Without a verdict, or not used: {', '.join(facts['no_verdict'])}." if facts["no_verdict"] else ""
-    parts.append(
-        f"<p>{plural(facts['samples'], 'sample')} over {number(facts['seconds'])} s, "
-        f"{plural(facts['verdicts'], 'verdict')}, "
-        f"{facts['violated']} of them violated.{_text(silent)} "
-        f"Outside the fitted ranges: {facts['outside_domain']}.</p>"
+    yield _text(
+        f"{plural(facts['samples'], 'sample')} over {number(facts['seconds'])} s, "
+        f"{plural(facts['verdicts'], 'verdict')}, {facts['violated']} of them violated.{silent} "
+        f"Outside the fitted ranges: {facts['outside_domain']}."
     )
-    parts += [f"<p>{_text(text)}.</p>" for text in (*facts["unknown"], *repeats_text(facts), *likeness_text(facts))]
-    parts += [f'<p class="soft">{_text(note)}</p>' for note in facts["notes"][:5]]
-    worst = sorted(model.state_names, key=lambda name: -states[name]["violations"])[:_MOST_STATES]
-    shown = [name for name in model.state_names if name in worst]
-    some = f"{len(shown)} of {plural(model.n, 'state')}, those with most violations. " if len(shown) < model.n else ""
-    parts.append(
-        _figure(
-            plots.envelope_figure(model, verdicts, shown),
-            f"{some}Recorded values between their one-step bounds; marks: violated, at the foot of a panel as well",
-            alt_texts.envelope_text(facts, shown),
-        )
-    )
+    for text in (*facts["unknown"], *repeats_text(facts), *likeness_text(facts)):
+        yield _text(f"{text}.")
+    for note in facts["notes"][:5]:
+        yield _soft(note)
     if facts["episodes"]:
-        parts.append(_episodes(facts))
-    closer = _close_up(verdicts, facts)
-    if closer is not None:
-        episode, *span = closer
+        yield from _episodes(facts)
+    worst = sorted(model.state_names, key=lambda name: -facts["states"][name]["violations"])[:_MOST_STATES]
+    shown = [name for name in model.state_names if name in worst]
+    if (closer := _close_up(verdicts, facts)) is not None:
+        episode, low, high = closer
         bad = [name for name in shown if name in episode["states"]]
-        parts.append(
-            _figure(
-                plots.envelope_figure(model, verdicts, bad, span=(span[0], span[1])),
-                f"Closer: {alt_texts.episode_text(episode)}",
-                alt_texts.beginning_text(episode),
-            )
-        )
-    parts.append(
-        _figure(
-            plots.utilisation_figure(model, verdicts),
-            "Utilisation: where between its bounds each sample lay, -1 and 1 at the bounds",
-            alt_texts.utilisation_text(facts, model.state_names),
-        )
-    )
+        near = charts.columns_of(verdicts, _COLUMNS, (low, high))
+        yield _chart(charts.envelope_chart(model, verdicts, near, bad), "Closer: recorded values and their bounds")
+    whole = charts.envelope_chart(model, verdicts, columns, shown)
+    yield _chart(whole) | {"kind": "details", "text": "Recorded values between their bounds, over all of the time"}
     if model.horizons:
-        parts.append(
-            _figure(
-                horizon_figure(model, verdicts),
-                "Utilisation over horizons: after how many steps a state lies outside its envelope",
-                "A map of the utilisation of each state over time, with one row for each number of steps.",
-            )
-        )
-    return "\n".join(parts)
+        yield _chart(charts.horizon_chart(model, verdicts, columns, shown))
 
 
 def _close_up(verdicts: Verdicts, facts: Mapping[str, Any]) -> tuple[Mapping[str, Any], float, float] | None:
@@ -317,275 +258,299 @@ def _close_up(verdicts: Verdicts, facts: Mapping[str, Any]) -> tuple[Mapping[str
     return (episode, low, high) if high - low < 0.5 * float(t[-1]) else None
 
 
-def _episodes(facts: Mapping[str, Any]) -> str:
+def _episodes(facts: Mapping[str, Any]) -> Iterator[Block]:
     rows = []
     for e in facts["episodes"][:_MOST_EPISODES]:
         where = sorted(e["states"].items(), key=lambda item: -item[1]["violations"])
         listed = [f"{shortened(name)} ({s['violations']}, worst {_utilisation(s)})" for name, s in where]
-        rows.append(
-            [
-                f"{e['first']['t']:.4f}",
-                _text(shortlist(listed, 4)),  # early, where a phone shows it without scrolling
-                str(e["verdicts_violated"]),
-                "yes" if e["alarm"] else "",
-                f"{e['last']['t']:.4f}",
-            ]
-        )
+        alarm = "yes" if e["alarm"] else ""  # the states early, where a phone shows them without scrolling
+        first, last = f"{e['first']['t']:.4f}", f"{e['last']['t']:.4f}"
+        rows.append([first, shortlist(listed, 4), str(e["verdicts_violated"]), alarm, last])
+    more = f"; the first {_MOST_EPISODES} of them" if facts["episode_count"] > _MOST_EPISODES else ""
+    yield _text(f"Episodes (violations with fewer than {APART} verdicts between them): {facts['episode_count']}{more}.")
     header = ("first [s]", "states (violations, worst utilisation)", "violated", "alarm", "last [s]")
-    text = f"<p>Episodes (violations with fewer than {APART} verdicts between them): {facts['episode_count']}.</p>"
-    if facts["episode_count"] > _MOST_EPISODES:
-        text += f'<p class="soft">The first {_MOST_EPISODES}; <code>--json</code> has more.</p>'
-    return text + _table(header, rows, left=(1,))
+    yield _table(header, rows, left=(1,))
 
 
 def _utilisation(state: Mapping[str, Any]) -> str:
     return "without width" if state["utilisation"] is None else beyond(state["utilisation"])
 
 
-def _tightness(model: UncertainLTI, checked: Sequence[Verdicts], facts: Mapping[str, Any]) -> str:
+def _tightness(model: UncertainLTI, facts: Mapping[str, Any]) -> Iterator[Block]:
+    yield _heading("tight", "How tight")
+    yield _text(
+        "Bounds that contain everything are worth something only where they are narrow. Widths of the one-step bounds, "
+        "in recorded units, over all recordings checked:"
+    )
     rows = []
     for state in facts["model"]["states"]:
         here = [r["states"][state["name"]] for r in facts["recordings"]]
-        judged = [s["verdicts"] for s in here]
-        total = sum(judged)
-        width = sum(s["mean_width"] * n for s, n in zip(here, judged, strict=True) if n) / total if total else None
-        spans = [s["range"] for s in here if s["range"] is not None]
-        span = max(spans, default=None)
+        total = sum(s["verdicts"] for s in here)
+        width = sum(s["mean_width"] * s["verdicts"] for s in here if s["verdicts"]) / total if total else None
+        span = max((s["range"] for s in here if s["range"] is not None), default=None)
         bad = sum(s["violations"] for s in here)
         worst = [s["worst"]["utilisation"] for s in here if s["violations"]]
+        largest = max((s["max_width"] for s in here if s["max_width"] is not None), default=None)
         rows.append(
             [
-                _name(state["name"]) + (f" [{_text(state['unit'])}]" if state["unit"] else ""),
-                number(state["mean_width"]),
-                number(width),
-                number(max((s["max_width"] for s in here if s["max_width"] is not None), default=None)),
-                number(span),
+                state["name"] + (f" [{state['unit']}]" if state["unit"] else ""),
+                *map(number, (state["mean_width"], width, largest, span)),
                 f"{width / span:.1%}" if width is not None and span else "-",
                 str(bad),
-                f"{100 * bad / total:.3g} %" if total else "-",
+                _share(bad, total),
                 "-" if not worst else "no width" if None in worst else beyond(max(worst, key=abs)),
             ]
         )
-    header = (
-        "state", "mean width when fitted", "mean width here", "largest here", "range here", "width/range", "violated",
-        "of the verdicts", "worst utilisation",
+    yield _table(
+        ("state", "mean width when fitted", "mean width here", "largest here", "range here", "width/range", "violated",
+         "of the verdicts", "worst utilisation"), rows, most=200,
     )  # fmt: skip
-    parts = [
-        '<h2 id="tight">How tight</h2>',
-        "<p>Bounds that contain everything are worth something only where they are narrow. Widths of the one-step "
-        "bounds, in recorded units, over all recordings checked:</p>",
-        _table(header, rows, most=200),
-    ]
-    try:
-        figure = plots.budget_figure(model, [v.transient for v in checked])
-        shows = alt_texts.budget_text(model, *width_budget(model, [v.transient for v in checked])[::2])
-        parts.append(_figure(figure, "Which element contributes how much of the mean width of each state", shows))
-    except ModelError:
-        pass  # no transition: the reasons above say so
-    if model.schedule is None:
-        figure = plots.matrices_figure(model)
-        caption = "The matrices and their half-widths, for normalised quantities"
-        parts.append(_figure(figure, caption, alt_texts.matrices_text(model)))
-    return "\n".join(parts)
+    names = (*model.state_names, *model.control_names)
+    if model.schedule is None and len(names) <= 16:
+        yield _text("Elements of A and B with their half-widths, 1/s of normalised quantities:")
+        nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
+        cells = [
+            [name, *(f"{a:.3g} ± {b:.2g}" for a, b in zip(*pair, strict=True))]
+            for name, *pair in zip(model.state_names, nominal.tolist(), half.tolist(), strict=True)
+        ]
+        yield _table(("rate of", *names), cells)
 
 
-def _regimes(model: UncertainLTI, facts: Mapping[str, Any]) -> str:
-    """Data, widths and verdicts in each regime of a scheduled model, and its elements over the schedule."""
-    blocks, names = facts["model"]["regimes"], [state["name"] for state in facts["model"]["states"]]
-    parts = [
-        '<h2 id="regimes">Regimes</h2>',
-        f"<p>The model is scheduled on {_text(facts['model']['schedule'])}: between two knots its elements are "
-        "interpolated, and a mode has its own. A transition counts for the regime that has the largest weight.</p>",
-        *(f"<p>{_text(text)}.</p>" for text in facts["model"]["regimes_in_words"]),
-    ]
+def _regimes(facts: Mapping[str, Any]) -> Iterator[Block]:
+    """Data, widths and verdicts in each regime of a scheduled model."""
+    blocks, names = facts["model"]["regimes"], [state["name"] for state in facts["model"]["states"]][:_MOST_STATES]
+    if not blocks:
+        return
+    yield _heading("regimes", "Regimes")
+    yield _text(
+        f"The model is scheduled on {facts['model']['schedule']}: between two knots its elements are interpolated, and "
+        "a mode has its own. A transition counts for the regime that has the largest weight."
+    )
+    for text in facts["model"]["regimes_in_words"]:
+        yield _text(f"{text}.")
     rows = []
     for r, block in enumerate(blocks):
         here = [recording["regimes"][r] for recording in facts["recordings"]]
         judged, bad = sum(h["verdicts"] for h in here), sum(h["violated"] for h in here)
-        transitions = "unknown" if block["transitions"] is None else str(block["transitions"])
+        known = "unknown" if block["transitions"] is None else str(block["transitions"])
+        of = [[s for h in here if (s := h["states"][name])["verdicts"]] for name in names]
+        widths = [(sum(s["mean_width"] * s["verdicts"] for s in o), sum(s["verdicts"] for s in o)) for o in of]
         rows.append(
             [
-                _text(block["regime"]),
-                transitions if block["known"] else '<b class="care">0, not visited</b>',
-                "" if block["tied_to"] is None else _text(blocks[block["tied_to"]]["regime"]),
+                block["regime"],
+                known if block["known"] else "0, not visited",
+                "" if block["tied_to"] is None else blocks[block["tied_to"]]["regime"],
                 str(judged),
                 f"{1 - bad / judged:.3%}" if judged else "-",
                 str(sum(h["unknown_regime"] for h in here)),
-                *(
-                    number(sum(w * n for w, n in _widths(here, name)) / judged if judged else None)
-                    for name in names[:_MOST_STATES]
-                ),
+                *(number(width / count if count else None) for width, count in widths),
             ]
         )
-    widths = [f"{shortened(name)}: mean width here" for name in names[:_MOST_STATES]]
-    header = ("regime", "fitted transitions", "shares elements of", "verdicts", "inside", "unknown regime", *widths)
-    parts.append(_table(header, rows, left=(2,)))
-    figure = schedule_figures.regimes_figure(model)
-    parts.append(_figure(figure, "Regime by regime: data of the fit, mean one-step widths, time constants"))
-    figure = schedule_figures.elements_figure(model)
-    parts.append(_figure(figure, "Elements over the schedule with their half-widths, for normalised quantities"))
-    return "\n".join(parts)
+    header = ("regime", "fitted transitions", "shares elements of", "verdicts", "inside", "unknown regime")
+    yield _table((*header, *(f"{shortened(name)}: mean width here" for name in names)), rows, left=(2,))
 
 
-def _widths(regimes: Sequence[Mapping[str, Any]], name: str) -> list[tuple[float, int]]:
-    """Mean width of a state and verdicts, of each recording with some in a regime."""
-    return [(s["mean_width"], s["verdicts"]) for s in (r["states"][name] for r in regimes) if s["verdicts"]]
-
-
-def _trust(facts: Mapping[str, Any]) -> str:
-    parts = ['<h2 id="trust">How far to trust it</h2>']
-    v = facts["validation"]
-    if v is None:
-        parts.append(
-            "<p>The model has not been validated. Where its recordings are, run "
-            "<code>uncertain-lti validate MODEL --output MODEL</code>: it leaves out one recording after the other, "
-            "and says how often the others' bounds hold on it, and how many false alarms an hour to expect.</p>"
+def _trust(facts: Mapping[str, Any]) -> Iterator[Block]:
+    yield _heading("trust", "How far to trust it")
+    if (v := facts["validation"]) is None:
+        yield _text(
+            "The model has not been validated. Where its recordings are, run `uncertain-lti validate MODEL --output "
+            "MODEL`: it leaves out one recording after the other, and says how often the others' bounds hold on it, "
+            "and how many false alarms an hour to expect."
         )
     else:
-        what = "recording" if v["kind"] == "transients" else "block"
-        low, high = v["inside_interval"]
-        under = f", {_text(v['condition_short'])}" if v["condition_short"] else ""
-        parts.append(
-            f"<p>Left out one {v['what']} at a time ({_text(v['parts'])}): {_text(v['verdicts'])} verdicts in "
-            f"{number(v['hours'])} h"
-            + (
-                ""
-                if v["inside"] is None
-                else f", {v['inside']:.3%} inside all bounds "
-                f"({v['confidence']:.0%} interval {low:.3%} to {high:.3%}{under})"
-            )
-            + f"; whole {what}s inside: {_text(v['parts_inside'])}.</p>"
-        )
-        rows = [
-            [
-                _name(name),
-                "-" if s["inside"] is None else f"{s['inside']:.3%}",
-                str(s["parts_inside"]),
-                number(s["mean_width_left_out"]),
-                number(s["mean_width_full"]),
-            ]
-            for name, s in v["states"].items()
-        ]
-        header = ("left out", "inside", f"{what}s inside", "mean width", "mean width of the full fit")
-        parts.append(_table(header, rows, most=200))
-        rows = [
-            [
-                f"{a['violations']} of {a['window']}, margin {number(a['margin'])}",
-                str(a["alarms"]),
-                number(a["per_hour"]),
-                f"{number(a['interval'][0])} to {'unknown' if a['interval'][1] is None else number(a['interval'][1])}",
-            ]
-            for a in v["false_alarms"]
-        ]
-        parts.append(_table(("alarm rule", "false alarms", "per hour", f"interval{under}"), rows))
-        if (faults := v["detectable"]) and not faults["refused"]:
-            parts.append(f"<h3>Which faults it sees</h3><p>{_text(condition_text(faults))}.</p>")
-            parts += [
-                _table(header, [[_text(cell) for cell in row] for row in rows], most=200)
-                for header, rows in detectable_tables(faults)
-            ]
-        parts += [f"<p>{_text(line)}.</p>" for line in [v["condition"], v["words"], *v["notes"]] if line]
+        yield from _validated(v)
     if facts["model"]["messages"]:
-        listed = "".join(f"<li>{_text(_without_address(m))}</li>" for m in facts["model"]["messages"])
-        parts.append(f"<h3>What the fit had to say</h3><ul>{listed}</ul>")
-    reasons = "".join(f"<li><b>{_text(r['weight'])}</b>: {_text(r['text'])}</li>" for r in facts["rely"]["reasons"])
-    parts.append(f"<h3>Every reason for the answer above</h3><ul>{reasons}</ul>")
-    return "\n".join(parts)
+        yield _heading("", "What the fit had to say", "h3")
+        for message in facts["model"]["messages"]:
+            yield _text(_cut(message))
+    yield _heading("", "Every reason for the answer above", "h3")
+    yield _table(("weight", "reason"), [[r["weight"], r["text"]] for r in facts["rely"]["reasons"]], left=(1,))
 
 
-def _origin(facts: Mapping[str, Any]) -> str:
+def _validated(v: Mapping[str, Any]) -> Iterator[Block]:
+    what = "recording" if v["kind"] == "transients" else "block"
+    low, high = v["inside_interval"]
+    under = f", {v['condition_short']}" if v["condition_short"] else ""
+    inside = "" if v["inside"] is None else (
+        f", {v['inside']:.3%} inside all bounds ({v['confidence']:.0%} interval {low:.3%} to {high:.3%}{under})"
+    )  # fmt: skip
+    yield _text(
+        f"Left out one {v['what']} at a time ({v['parts']}): {v['verdicts']} verdicts in {number(v['hours'])} h{inside}"
+        f"; whole {what}s inside: {v['parts_inside']}."
+    )
+    rows = [
+        [name, "-" if s["inside"] is None else f"{s['inside']:.3%}", str(s["parts_inside"]),
+         number(s["mean_width_left_out"]), number(s["mean_width_full"])]
+        for name, s in v["states"].items()
+    ]  # fmt: skip
+    heads = ("left out", "inside", f"{what}s inside", "mean width", "mean width of the full fit")
+    yield _table(heads, rows, most=200)
+    rows = [
+        [f"{a['violations']} of {a['window']}, margin {number(a['margin'])}", str(a["alarms"]), number(a["per_hour"]),
+         f"{number(a['interval'][0])} to {'unknown' if a['interval'][1] is None else number(a['interval'][1])}"]
+        for a in v["false_alarms"]
+    ]  # fmt: skip
+    yield _table(("alarm rule", "false alarms", "per hour", f"interval{under}"), rows)
+    if (faults := v["detectable"]) and not faults["refused"]:
+        yield _heading("", "Which faults it sees", "h3")
+        yield _text(f"{condition_text(faults)}.")
+        for header, rows in detectable_tables(faults):
+            yield _table(header, rows, most=200)
+    for line in (v["condition"], v["words"], *v["notes"]):
+        if line:
+            yield _text(f"{line}.")
+
+
+def _origin(facts: Mapping[str, Any]) -> Iterator[Block]:
     model = facts["model"]
-    rows = [["model checked with", _name(model["file"]), _code(model["sha256"] or "none")]]
-    rows += [["fitted to", _name(s["file"]), _code(s["sha256"])] for s in model["sources"]]
-    rows += [["checked", _name(f["file"]), _code(f["sha256"])] for r in facts["recordings"] for f in r["files"]]
-    signals = [
-        [kind, _name(s["name"]), _text(s["unit"] or "-"), _name(s["topic"] or "-"), _code(s["field"])]
-        for kind, group in (
-            ("state", model["states"]),
-            ("control", model["controls"]),
-            ("scheduling", model["scheduling"]),
-        )
-        for s in group
-    ]
+    yield _heading("origin", "Where it comes from")
+    rows = [["model checked with", model["file"], model["sha256"] or "none"]]
+    rows += [["fitted to", s["file"], s["sha256"]] for s in model["sources"]]
+    rows += [["checked", f["file"], f["sha256"]] for r in facts["recordings"] for f in r["files"]]
+    yield _table(("what", "file", "sha256"), rows, left=(1, 2), most=300)
     origin = {**model["fit"], "clock": model["clock"] or "-", "median step [s]": number(model["dt_median"])}
-    about = [[_text(key), _text(number(v) if isinstance(v, float) else v)] for key, v in origin.items()]
+    about = [[key, str(number(v) if isinstance(v, float) else v)] for key, v in origin.items()]
+    yield _table(("fit", ""), about, left=(1,))
     sets = [("", model["eigenvalues"]), *((block["regime"], block["eigenvalues"]) for block in model["regimes"])]
-    eigenvalues = [
-        f"<p>Eigenvalues of A{_text(f' at {where}' if where else '')} [1/s]: "
-        + ", ".join(f"{a:.4g}{b:+.4g}j" if b else f"{a:.4g}" for a, b in pairs)
-        + "</p>"
-        for where, pairs in sets[:_MOST_ROWS]
-        if pairs
+    for where, pairs in sets[:_MOST_ROWS]:
+        values = ", ".join(f"{a:.4g}{b:+.4g}j" if b else f"{a:.4g}" for a, b in pairs)
+        if pairs:
+            yield _text(f"Eigenvalues of A{f' at {where}' if where else ''} [1/s]: {values}")
+    signals = [
+        [kind, s["name"], s["unit"] or "-", s["topic"] or "-", s["field"]]
+        for kind, group in (("state", "states"), ("control", "controls"), ("scheduling", "scheduling"))
+        for s in model[group]
     ]
-    return "\n".join(
-        [
-            '<h2 id="origin">Where it comes from</h2>',
-            _table(("what", "file", "sha256"), rows, left=(1, 2), most=300),
-            _table(("fit", ""), about, left=(1,)),
-            *eigenvalues,
-            _table(("signal", "name", "unit", "topic", "field"), signals, left=(1, 2, 3, 4), most=300),
-        ]
-    )
+    yield _table(("signal", "name", "unit", "topic", "field"), signals, left=(1, 2, 3, 4), most=300)
 
 
-# --- pieces -----------------------------------------------------------------------------------------------------
+def _heading(id: str, text: str, kind: str = "h2") -> Block:
+    return {"kind": kind, "id": id, "text": text}
 
 
-def _text(value: object) -> str:
-    """A value of a file as text of the page."""
-    return escape("".join(c if c.isprintable() or c == " " else "\N{REPLACEMENT CHARACTER}" for c in str(value)))
+def _text(text: str) -> Block:
+    return {"kind": "p", "text": text}
 
 
-def _name(value: object) -> str:
-    """A name as text of the page: where a line must end inside it, it ends after a low line, a slash or a dash."""
-    return "<wbr>".join(map(_text, re.split(r"(?<=[_/-])(?=[^_/-])", str(value))))
+def _soft(text: str) -> Block:
+    return {"kind": "soft", "text": text}
 
 
-def _code(value: object) -> str:
-    return f"<code>{_text(value)}</code>"
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], **more: Any) -> Block:
+    return {"kind": "table", "table": Table(header, rows, **more)}
 
 
-def _without_address(text: str) -> str:
-    return text[:400] + (" ..." if len(text) > 400 else "")
+def _cut(text: object) -> str:
+    """The beginning of a text of a file."""
+    return str(text)[:400] + (" ..." if len(str(text)) > 400 else "")
 
 
-def _table(
-    header: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (), most: int = _MOST_ROWS
-) -> str:
-    """Cells are HTML already; columns but the first stand to the right unless named."""
-    listed = list(rows)
-    classes = ['class="left"' if i in left else "" for i in range(len(header))]
-    head = "".join(f"<th {c}>{_text(cell)}</th>" for cell, c in zip(header, classes, strict=True))
-    body = "".join(
-        "<tr>" + "".join(f"<td {c}>{cell}</td>" for cell, c in zip(row, classes, strict=True)) + "</tr>\n"
-        for row in listed[:most]
-    )
-    more = (
-        f'<p class="soft">and {len(listed) - most} more rows, in <code>--json</code></p>' if len(listed) > most else ""
-    )
-    return f'<div class="table"><table><thead><tr>{head}</tr></thead><tbody>\n{body}</tbody></table></div>{more}'
+def _share(part: int, total: int) -> str:
+    return f"{100 * part / total:.3g} %" if total else "-"
 
 
-def _figure(figure: Any, caption: str, shows: str = "") -> str:
-    """An image of a figure, which a tap enlarges; `shows` says what is seen in it to those who do not see it.
+# --- charts ------------------------------------------------------------------------------------------------------
 
-    The image is in strips, one per row of panels, so that a page that is printed can end between two of them.
-    """
-    image = plots.pixels(figure, _DPI * _DENSITY)
-    height, width, _ = image.shape
-    # 256 colours, none far from one drawn, at half the bytes. Median cut turns colour scales grey in a white image.
-    coloured = Image.fromarray(image).quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    edges = [0, *between_rows(figure, image), height]
-    strips = []
-    for k, (top, bottom) in enumerate(itertools.pairwise(edges)):
-        piece = io.BytesIO()
-        coloured.crop((0, top, width, bottom)).save(piece, "PNG")
-        alt = _text(f"{caption}. {shows}" if shows else caption) if not k else ""
-        strips.append(
-            f'<img src="data:image/png;base64,{base64.b64encode(piece.getvalue()).decode("ascii")}" alt="{alt}" '
-            f'width="{width / _DENSITY:g}" height="{(bottom - top) / _DENSITY:g}">'
-        )
-    return (
-        f'<figure><label><input type="checkbox" aria-label="enlarge the figure">{"".join(strips)}</label>'
-        f'<figcaption>{_text(caption)} <span class="tap">(tap to enlarge)</span></figcaption></figure>'
-    )
+_W, _H = 2000, 1000  # of the drawing's own coordinates, which the page stretches
+
+
+def _chart(chart: Chart, name: str = "") -> Block:
+    """A chart as the template draws it: paths in its own coordinates, which the page stretches, and texts beside."""
+    c = chart.columns
+    low, high = c.limits
+
+    def span(begin: float, end: float) -> tuple[str, str]:
+        return f"{(begin - low) / (high - low) * _W:.1f}", f"{max((end - begin) / (high - low) * _W, 3.0):.1f}"
+
+    return {
+        "kind": "chart",
+        "chart": {
+            "name": name or chart.name, "words": f"{name or chart.name}. {chart.words}", "legend": chart.keys,
+            "label": c.label, "alarms": [span(*s) for s in c.alarms], "silent": [span(*s) for s in c.silent],
+            "ticks": [(_percent(v, low, high), f"{v:.10g}") for v in _ticks(low, high, 6)],
+            "panels": [_map(p) if isinstance(p, Map) else _panel(p, c) for p in chart.panels],
+        },
+    }  # fmt: skip
+
+
+def _panel(panel: Panel, c: Columns) -> Block:
+    low, high = panel.limits
+    x = np.rint((c.t - c.limits[0]) / (c.limits[1] - c.limits[0]) * _W)
+
+    def y(values: Array) -> Array:
+        return np.clip(np.rint((high - values) / (high - low) * _H), 0, _H)
+
+    paths = []
+    if len(panel.levels) == 2:
+        top, bottom = y(np.array(panel.levels[::-1]))
+        paths.append(("bounds", f"M0 {top:.0f}H{_W}V{bottom:.0f}H0Z"))
+    for series in panel.series:
+        of = [series.low] if series.high is None else [series.low, series.high]
+        known = np.logical_and.reduce(np.isfinite(of), axis=0)
+        role = series.role if len(of) == 1 or series.role in ("bounds", "score") else f"{series.role} filled"
+        paths.append((role, _path(x, [y(v) for v in of], known, c.apart)))
+    if len(panel.levels) == 1:
+        paths.append(("level", f"M0 {y(np.array(panel.levels))[0]:.0f}H{_W}"))
+    if panel.marks is not None:
+        at = np.flatnonzero(~np.isnan(panel.marks))
+        if len(at):
+            paths.append(("foot", "".join(f"M{a:.0f} 960V1000" for a in dict.fromkeys(x[at].tolist()))))
+            dots = zip(x[at].tolist(), y(panel.marks[at]).tolist(), strict=True)
+            paths.append(("violated", "".join(f"M{a:.0f} {b:.0f}h0" for a, b in dots)))
+    values = list(panel.levels) + [v for v in _ticks(low, high, 3) if not panel.levels or v > 1.9]
+    ticks = [(_percent(v, high, low), f"{v:.6g}".replace("e+0", "e")) for v in values]
+    return {"title": panel.heading, "note": panel.note, "count": panel.count, "paths": paths, "ticks": ticks}
+
+
+def _path(x: Array, sides: Sequence[Array], known: Mask, apart: Mask) -> str:
+    """A line, or the area between two, in pieces where something lies between."""
+    pieces = []
+    for a, b in charts.runs(known):
+        cuts = [a, *(int(k) + a for k in np.flatnonzero(apart[a:b]) if k), b]
+        for i, j in zip(cuts[:-1], cuts[1:], strict=True):
+            points = [f"{p:.0f} {q:.0f}" for p, q in zip(x[i:j].tolist(), sides[0][i:j].tolist(), strict=True)]
+            if len(sides) > 1:
+                back = zip(x[i:j][::-1].tolist(), sides[1][i:j][::-1].tolist(), strict=True)
+                points += [f"{p:.0f} {q:.0f}" for p, q in back] + ["Z"]
+            pieces.append("M" + " ".join(points) + "h0" * (len(points) == 1))
+    return "".join(pieces)
+
+
+def _map(drawn: Map) -> Block:
+    """A map as an image of a pixel per cell: blue as far as the bound is used, orange beyond it."""
+    values = drawn.values
+    with np.errstate(invalid="ignore"):
+        alpha = np.where(np.isnan(values), 70, 255 * np.clip(values, 0.0, 1.0))
+    colour = np.where((values > 1.0)[..., None], (213, 94, 0), (0, 114, 178))
+    colour = np.where(np.isnan(values)[..., None], (140, 140, 140), colour)
+    pixels = np.dstack([colour, alpha]).astype(np.uint8)
+    rows = [(100 * (k + 0.5) / len(drawn.rows), row) for k, row in enumerate(drawn.rows)]
+    facts = {"title": drawn.title, "note": drawn.note, "count": drawn.count, "rows": rows}
+    return facts | {"image": base64.b64encode(_png(pixels)).decode("ascii"), "height": max(15 * len(rows), 30)}
+
+
+def _png(pixels: Any) -> bytes:
+    """An image (height, width, 4) as PNG."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    height, width, _ = pixels.shape
+    lines = np.zeros((height, 1 + 4 * width), dtype=np.uint8)  # each begins with its filter, none
+    lines[:, 1:] = pixels.reshape(height, -1)
+    head = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(lines.tobytes())) + chunk(
+        b"IEND", b""
+    )  # fmt: skip
+
+
+def _percent(value: float, low: float, high: float) -> str:
+    return f"{100 * (value - low) / (high - low):.2f}"
+
+
+def _ticks(low: float, high: float, most: int) -> list[float]:
+    """Round numbers between two, at most about so many."""
+    step = 10.0 ** math.floor(math.log10((high - low) / most))
+    step *= next((k for k in (1, 2, 5) if (high - low) / (k * step) <= most), 10)
+    return [k * step + 0.0 for k in range(math.ceil(low / step), math.floor(high / step) + 1)]

@@ -10,7 +10,7 @@
 """An interactive plot as one HTML file that needs nothing else: zoom and hover, in any browser, without a network.
 
 The drawing in the browser is done by uPlot (`assets/README.md`). The page lets no other script run and loads nothing.
-Long recordings are drawn by stretches with their least and greatest value, and sample by sample around violations.
+Long recordings are drawn in columns with their least and greatest value, and sample by sample around violations.
 """
 
 from __future__ import annotations
@@ -18,284 +18,170 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdicts import Verdicts
-from uncertain_lti.reports.figure_columns import DrawnColumns, TimeAxis, forward
+from uncertain_lti.reports import charts
+from uncertain_lti.reports.charts import Columns, Panel, Series, Spans
+from uncertain_lti.reports.html import asset, environment
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.signal_map import Signal
 
-MOST_NUMBERS = 1_500_000
-"""Numbers in a page, 6 MB of them; recordings and signals share them."""
-
+MOST_NUMBERS = 330_000
+"""Numbers in a page, 1.8 MB of them; recordings and signals share them."""
 _FEWEST = 500
-_FARTHEST = 1000.0  # utilisation that is written
+
+Placed = tuple[Columns, Panel]
 
 
 @dataclass(frozen=True)
-class Series:
-    """Values of one quantity over the times of a recording, as drawn; NaN parts two lines.
-
-    `least` (P,): least value of each stretch, or each sample; `greatest` (P,): greatest values; None if every stretch
-    is one sample; `lower` (P,): least lower bounds; `upper` (P,): greatest upper bounds; `marked` (P,): the worst
-    violated value of each stretch; NaN where none is.
-    """
-
-    least: Array
-    greatest: Array | None = None
-    lower: Array | None = None
-    upper: Array | None = None
-    marked: Array | None = None
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One signal.
-
-    `title`: its name; `unit`: its unit, or empty; `time`: which of the recording's times it is drawn over; `values`: in
-    recorded units; `word`: what a single value is called; `rank`: panels with more are shown first; `utilisation`:
-    where between the bounds it lay; `horizons`: the same by each of the recording's horizons.
-    """
-
-    title: str
-    unit: str
-    time: int
-    values: Series
-    word: str = "recorded"
-    rank: float = 0.0
-    utilisation: Series | None = None
-    horizons: tuple[Series, ...] = ()
-
-
-@dataclass(frozen=True)
-class PlottedRecording:
+class Plotted:
     """One recording as it is plotted.
 
-    `name`: its name; `note`: A sentence below the heading; `times`: s since the start; panels name one of them by its
-    place; `panels`: its signals; `alarms, silent`: begin and end of each stretch of alarm, and of each without a
-    verdict, s; `horizons`: what each of the model's horizons is called.
+    `note`: a sentence below the heading; `views`: what can be chosen to be drawn, its name and its panels; `top`: a
+    panel above those of every view; `alarms, silent`: stretches of alarm, and without a verdict, s.
     """
 
     name: str
     note: str
-    times: list[Array]
-    panels: list[Panel]
-    alarms: list[tuple[float, float]] = field(default_factory=list)
-    silent: list[tuple[float, float]] = field(default_factory=list)
-    horizons: tuple[str, ...] = ()
+    views: list[tuple[str, list[Placed]]]
+    top: list[Placed] = field(default_factory=list)
+    alarms: Spans = field(default_factory=list)
+    silent: Spans = field(default_factory=list)
 
 
-def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) -> PlottedRecording:
-    """A recording that was checked: states between their bounds, controls, alarms."""
-    transient = verdicts.transient
-    axis = TimeAxis(transient)
-    violated = verdicts.violated
-    drawn = DrawnColumns.detailed(
-        axis.t, transient.segment, verdicts.judged, verdicts.alarm, violated | verdicts.alarm,
-        _stretches(recordings, (8 + 3 * len(model.steps)) * model.n + 2 * model.m),
-    )  # fmt: skip
-    panels = []
-
-    def utilisation_series(utilisation: Array, flags: Any) -> Series:
-        clipped = np.clip(utilisation, -_FARTHEST, _FARTHEST)
-        return _series(drawn, clipped, marked=_worst(drawn, flags, clipped, clipped))
-
-    for i, signal in enumerate(model.signals.states):
-        x, utilisation = transient.x[:, i], np.clip(verdicts.utilisation[:, i], -_FARTHEST, _FARTHEST)
-        flags = verdicts.flags[:, i] == 1.0
-        values = _series(drawn, x, verdicts.lower[:, i], verdicts.upper[:, i], _worst(drawn, flags, utilisation, x))
-        shares = utilisation_series(utilisation, flags)
-        longer = verdicts.longer_utilisation[:, :, i].T
-        horizons = tuple(utilisation_series(u, np.abs(u) > 1.0) for u in longer)
-        panels.append(Panel(signal.name, signal.unit, 0, values, "recorded", float(flags.sum()), shares, horizons))
-    panels += _controls(drawn, transient, model.signals.controls)
-    judged, bad = int(verdicts.judged.sum()), int(violated.sum())
-    note = f"{plural(judged, 'verdict')}, {bad} of them violated" + _loops(axis) + _how(drawn, len(axis.t)) + "."
-    return PlottedRecording(
-        _name(transient.name), note, [_times(drawn)], panels,
-        _runs(drawn, drawn.alarm), _runs(drawn, ~drawn.judged, skip_first=True), horizon_words(model),
-    )  # fmt: skip
-
-
-def horizon_words(model: UncertainLTI) -> tuple[str, ...]:
-    """Each horizon of a model by its steps and, where the model knows its step, its time."""
-    step = model.sampling.dt_median
-    return tuple(f"{h} steps" + ("" if step is None else f" ({h * step:.3g} s)") for h in model.steps)
-
-
-def plotted_transient(transient: Transient, recordings: int = 1) -> PlottedRecording:
-    """The signals of a recording, without a model."""
-    axis = TimeAxis(transient)
-    none = np.zeros(len(axis.t), dtype=bool)
-    count = transient.x.shape[1] + transient.u.shape[1]
-    drawn = DrawnColumns.detailed(axis.t, transient.segment, none, none, none, _stretches(recordings, 2 * count))
-    units = (
-        {s.name: s.unit for s in (*transient.signals.states, *transient.signals.controls)} if transient.signals else {}
-    )
-    panels = [
-        Panel(name, units.get(name, ""), 0, _series(drawn, column))
-        for names, columns in ((transient.state_names, transient.x), (transient.control_names, transient.u))
-        for name, column in zip(names, columns.T, strict=True)
+def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) -> Plotted:
+    """A recording that was checked: the alarm's score, utilisation, states between their bounds, controls."""
+    numbers = (6 + 2 * len(model.steps)) * model.n + 2 * model.m + 3
+    columns = charts.columns_of(verdicts, _stretches(recordings, numbers), fine=True)
+    views = [charts.utilisation_chart(model, verdicts, columns), charts.envelope_chart(model, verdicts, columns)]
+    views += [charts.utilisation_chart(model, verdicts, columns, row=1 + h) for h in range(len(model.steps))]
+    words = ["utilisation" + ", 1 step" * bool(model.steps), "values", *_horizons(model)]
+    placed = [
+        sorted(((columns, p) for p in chart.panels if isinstance(p, Panel)), key=lambda placed: -placed[1].rank)
+        for chart in views
     ]
-    note = plural(len(axis.t), "sample") + _loops(axis) + _how(drawn, len(axis.t)) + "."
-    return PlottedRecording(_name(transient.name), note, [_times(drawn)], panels)
+    run = verdicts.transient
+    placed[1] += _panels(columns, run.u, [(s.name, s.unit) for s in model.signals.controls], "control")
+    top = charts.alarm_chart(model, verdicts, columns, 0).panels[0]
+    assert isinstance(top, Panel)
+    note = f"{charts.heading(verdicts)}. {top.title}: {top.note}{_how(columns)}."
+    return Plotted(
+        charts.base_name(run.name), note, list(zip(words, placed, strict=True)), [(columns, top)], columns.alarms,
+        columns.silent,
+    )  # fmt: skip
+
+
+def _horizons(model: UncertainLTI) -> list[str]:
+    return [f"utilisation, {plural(steps, 'step')}" for steps in model.steps]
+
+
+def plotted_transient(transient: Transient, recordings: int = 1) -> Plotted:
+    """A recording that was read with a signals file, and not checked."""
+    numbers = 2 * (len(transient.state_names) + len(transient.control_names)) + 2
+    columns = Columns.of(transient.t, transient.segment, most=_stretches(recordings, numbers))
+    units = {s.name: s.unit for s in transient.signals.signals} if transient.signals else {}
+    panels = []
+    for names, values, role in (
+        (transient.state_names, transient.x, "recorded"), (transient.control_names, transient.u, "control"),
+    ):  # fmt: skip
+        panels += _panels(columns, values, [(name, units.get(name, "")) for name in names], role)
+    note = f"{plural(len(transient.t), 'sample')}{_how(columns)}."
+    return Plotted(charts.base_name(transient.name), note, [("values", panels)])
 
 
 def plotted_fields(
     name: str, fields: Sequence[tuple[str, str, Array, Array]], note: str, recordings: int = 1
-) -> PlottedRecording:
-    """Numbers of messages over their time of arrival, without a signals file.
-
-    `fields` (messages,): topic, path, time in s and value of each.
-    """
-    times: list[Array] = []
+) -> Plotted:
+    """Numbers of messages over their time of arrival: topic, path, time in s and value of each."""
     panels = []
     for topic, path, recorded, values in fields:
-        t, _ = forward(recorded)
-        none = np.zeros(len(t), dtype=bool)
-        zero = np.zeros(len(t), dtype=np.int32)
-        drawn = DrawnColumns.detailed(t, zero, none, none, none, _stretches(recordings, 3 * len(fields)))
-        times.append(_times(drawn))
-        panels.append(Panel(f"{topic} {path}", "", len(times) - 1, _series(drawn, values), "value"))
-    return PlottedRecording(_name(name), note, times, panels)
+        columns = Columns.of(recorded, most=_stretches(recordings, 4 * len(fields)))
+        panels += _panels(columns, values[:, None], [(f"{topic} {path}", "")], "recorded")
+    return Plotted(charts.base_name(name), note, [("values", panels)])
 
 
-def interactive_page(title: str, recordings: Sequence[PlottedRecording]) -> str:
+def interactive_page(title: str, recordings: Sequence[Plotted]) -> str:
     """The page."""
-    horizons = max((recording.horizons for recording in recordings), key=len, default=())
     data = {"recordings": [_packed(recording) for recording in recordings]}
-    further = "".join(f'<option value="{k}">utilisation, {words}</option>' for k, words in enumerate(horizons))
     packed = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    uplot, own = _asset("uPlot.iife.min.js").rstrip("\n"), _asset("plot.js").rstrip("\n")
-    allowed = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'" for script in (uplot, own)
-    )
-    keys = "".join(
-        f'<span class="key" style="background:{colour}"></span>{word}'
-        for colour, word in (
-            ("#56B4E9", "bounds"), ("var(--ink)", "recorded"), ("#D55E00", "violated"), ("#F0E442", "alarm"),
-            ("#999999", "no verdict"),
+    scripts = [asset(name).rstrip("\n") for name in ("uPlot.iife.min.js", "plot.js")]
+    allowed = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    views = list(dict.fromkeys(view for recording in recordings for view, _ in recording.views))
+    style = f"{asset('uPlot.min.css')}\n{asset('plot.css')}"
+    return (
+        environment()
+        .from_string(asset("plot.html"))
+        .render(
+            title=title, views=views, allowed=allowed, style=Markup(style), data=Markup(packed),
+            scripts=[Markup(script) for script in scripts],
         )
     )  # fmt: skip
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; script-src {allowed}; '
-        "style-src 'unsafe-inline'\">\n"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{_asset('uPlot.min.css')}\n{_asset('plot.css')}</style>\n</head>\n<body>\n"
-        f"<h1>{escape(title)}</h1>\n"
-        '<div id="bar"><select id="recording" aria-label="recording"></select>'
-        '<select id="view" aria-label="what is drawn"><option value="values">values</option>'
-        f'<option value="utilisation">utilisation{", 1 step" if horizons else ""}</option>{further}</select>'
-        '<button id="whole">whole</button><button id="in" aria-label="zoom in">+</button>'
-        '<button id="out" aria-label="zoom out">&minus;</button>'
-        '<button id="before">&#9664; alarm</button><button id="after">alarm &#9654;</button>'
-        '<span id="range" aria-live="polite"></span></div>\n'
-        f'<p id="note"></p>\n<p id="keys">{keys}</p>\n'
-        "<p>Drag: zoom; double click: whole; Shift and drag: move; Ctrl and wheel: zoom; on a phone two fingers.</p>\n"
-        '<details id="signals"></details>\n<main id="panels"></main>\n'
-        "<noscript><p>This page draws with JavaScript, which is switched off.</p></noscript>\n"
-        f'<script type="application/json" id="data">{packed}</script>\n'
-        f"<script>{uplot}</script>\n<script>{own}</script>\n</body>\n</html>\n"
-    )
-
-
-def _asset(name: str) -> str:
-    return files("uncertain_lti.reports").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def _stretches(recordings: int, numbers: int) -> int:
-    """Stretches of one recording that has this many numbers in each."""
+    """Columns of one recording that has this many numbers in each."""
     return max(MOST_NUMBERS // (max(recordings, 1) * max(numbers, 1)), _FEWEST)
 
 
-def _controls(drawn: DrawnColumns, transient: Transient, signals: Sequence[Signal]) -> list[Panel]:
+def _panels(columns: Columns, values: Array, names: Sequence[tuple[str, str]], role: str) -> list[Placed]:
+    low, high = columns.extremes(np.where(np.isfinite(values), values, np.nan) if len(values) < 1e6 else values)
     return [
-        Panel(signal.name, signal.unit, 0, _series(drawn, column), "control", -1.0)
-        for signal, column in zip(signals, transient.u.T, strict=True)
+        (columns, Panel(name, (Series(role, low[:, i], high[:, i] if columns.binned else None),), unit))
+        for i, (name, unit) in enumerate(names)
     ]
 
 
-def _series(
-    drawn: DrawnColumns, values: Array, lower: Array | None = None, upper: Array | None = None,
-    marked: Array | None = None,
-) -> Series:  # fmt: skip
-    finite = np.where(np.isfinite(values), values, np.nan)
-    of = drawn.broken
-    return Series(
-        of(drawn.least(finite))[1],
-        of(drawn.greatest(finite))[1] if drawn.binned else None,
-        None if lower is None else of(drawn.least(lower))[1],
-        None if upper is None else of(drawn.greatest(upper))[1],
-        None if marked is None else of(marked)[1],
-    )
+def _packed(recording: Plotted) -> dict[str, Any]:
+    axes: dict[int, int] = {}
+    placed = [*recording.top, *(p for _, panels in recording.views for p in panels)]
+    times: list[str] = []
+    for columns, _ in placed:
+        if id(columns) not in axes:
+            axes[id(columns)] = len(times)
+            at = np.flatnonzero(columns.apart)  # what parts two lines is drawn with the second
+            times.append(_text(np.insert(columns.t, at, columns.t[at]).astype("<f8")))
 
+    def panel(placed: Placed) -> dict[str, Any]:
+        columns, drawn = placed
+        return {
+            "title": drawn.title, "unit": drawn.unit, "time": axes[id(columns)], "note": drawn.note,
+            "rank": drawn.rank if drawn.rank < 1e300 else None, "levels": drawn.levels,
+            "word": next(s.role for s in drawn.series if s.role != "bounds"), "values": _series(columns, drawn),
+        }  # fmt: skip
 
-def _times(drawn: DrawnColumns) -> Array:
-    """Where each is drawn, s; what parts two lines is drawn with the second."""
-    at = np.flatnonzero(drawn.after)
-    return np.insert(drawn.t, at, drawn.t[at])
-
-
-def _worst(drawn: DrawnColumns, flags: Any, utilisation: Array, values: Array) -> Array:
-    """Of each stretch the value at its violated sample that lies farthest out; NaN where none is."""
-    found = np.full(len(drawn.starts), np.nan)
-    rows = np.flatnonzero(flags)
-    if len(rows):
-        place = np.searchsorted(drawn.starts, rows, side="right") - 1
-        order = np.argsort(np.abs(utilisation[rows]), kind="stable")
-        found[place[order]] = values[rows[order]]
-    return found
-
-
-def _runs(drawn: DrawnColumns, which: Any, skip_first: bool = False) -> list[tuple[float, float]]:
-    which = which.copy()
-    if skip_first:
-        which[:1] = False
-    return [(begin, begin + length) for begin, length in drawn.spans(which)]
-
-
-def _packed(recording: PlottedRecording) -> dict[str, Any]:
     return {
-        "name": recording.name,
-        "note": recording.note,
-        "times": [_text(np.asarray(t, dtype="<f8")) for t in recording.times],
-        "panels": [
-            {
-                "title": panel.title,
-                "unit": panel.unit,
-                "time": panel.time,
-                "word": panel.word,
-                "rank": panel.rank,
-                "values": _packed_series(panel.values),
-                "utilisation": None if panel.utilisation is None else _packed_series(panel.utilisation),
-                "horizons": [_packed_series(series) for series in panel.horizons],
-            }
-            for panel in recording.panels
-        ],
-        "alarms": recording.alarms,
+        "name": recording.name, "note": recording.note, "times": times, "top": [panel(p) for p in recording.top],
+        "views": {view: [panel(p) for p in panels] for view, panels in recording.views}, "alarms": recording.alarms,
         "silent": recording.silent,
-    }
+    }  # fmt: skip
 
 
-def _packed_series(series: Series) -> Mapping[str, Any]:
-    """Each array less the middle of all, so that four bytes a number tell neighbours apart."""
-    present = {key: value for key, value in vars(series).items() if value is not None}
+def _series(columns: Columns, panel: Panel) -> Mapping[str, Any]:
+    """Each array less the middle of all, so that four bytes a number tell neighbours apart; marks are few."""
+    at = np.flatnonzero(columns.apart)
+    present: dict[str, Array] = {}
+    for series in panel.series:
+        names = ("lower", "upper") if series.role == "bounds" else ("least", "greatest")
+        sides = (series.high, None) if series.role == "score" else (series.low, series.high)
+        present |= {n: np.insert(a, at, np.nan) for n, a in zip(names, sides, strict=True) if a is not None}
+    marks = {}
+    if panel.marks is not None:
+        marked = np.insert(panel.marks, at, np.nan)
+        there = np.flatnonzero(~np.isnan(marked))
+        present["marked"], marks = marked[there], {"at": _text(there.astype("<u4"))}
     every = np.concatenate([value[np.isfinite(value)] for value in present.values()])
     offset = float((every.min() + every.max()) / 2) if len(every) else 0.0
     with np.errstate(over="ignore"):
         return {
-            key: {"offset": offset, "data": _text(np.asarray(value - offset, dtype="<f4"))}
+            key: {"offset": offset, "data": _text((value - offset).astype("<f4"))} | (marks if key == "marked" else {})
             for key, value in present.items()
         }
 
@@ -304,18 +190,10 @@ def _text(array: Any) -> str:
     return base64.b64encode(array.tobytes()).decode("ascii")
 
 
-def _name(path: str) -> str:
-    return os.path.basename(path) or path
-
-
-def _loops(axis: TimeAxis) -> str:
-    return f", {axis.loops + 1} passes one behind the other" if axis.loops else ""
-
-
-def _how(drawn: DrawnColumns, samples: int) -> str:
-    if not drawn.binned:
+def _how(columns: Columns) -> str:
+    if not columns.binned:
         return ""
     return (
-        f". {samples} samples are drawn as {len(drawn.starts)} stretches with their least and greatest value; where "
-        "bounds are violated, sample by sample"
+        f". {columns.stop - int(columns.starts[0])} samples are drawn as {len(columns.starts)} columns with their "
+        "least and greatest value; where bounds are violated, sample by sample"
     )

@@ -6,24 +6,29 @@
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
   const times = page.recordings.map((r) => r.times.map((t) => Array.from(new Float64Array(bytes(t)))));
   const numbers = (a) => Array.from(new Float32Array(bytes(a.data)), (v) => (Number.isNaN(v) ? null : v + a.offset));
+  const placed = (a, count) => { // the few that are there among so many
+    const found = new Array(count).fill(null), values = numbers(a);
+    new Uint32Array(bytes(a.at)).forEach((place, i) => { found[place] = values[i]; });
+    return found;
+  };
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const element = (name, text) => Object.assign(document.createElement(name), { textContent: text ?? "" });
   const FIRST = 8; // panels shown at first
 
-  let recording = 0, view = "values", plots = [], busy = false, shown = [];
+  let recording = 0, view = $("view").value, plots = [], busy = false, shown = new Set();
 
   function colours() {
     const ink = dark.matches ? "#e6e6e6" : "#000000";
     return {
       ink, soft: dark.matches ? "#a2a9b1" : "#57606a", grid: dark.matches ? "#33383e" : "#e6e8ea",
       bounds: "#56B4E9", band: dark.matches ? "rgba(86,180,233,.38)" : "rgba(86,180,233,.5)",
-      violated: dark.matches ? "#ff8a3d" : "#D55E00",
+      score: dark.matches ? "rgba(230,230,230,.6)" : "rgba(0,0,0,.6)", violated: dark.matches ? "#ff8a3d" : "#D55E00",
       alarm: dark.matches ? "rgba(240,228,66,.22)" : "rgba(240,228,66,.45)", silent: "rgba(140,140,140,.3)",
     };
   }
 
-  // Where between its bounds a signal lay, by the chosen horizon; none while values are drawn.
-  const shares = (panel) => (view === "values" ? null : view === "utilisation" ? panel.utilisation : panel.horizons[view]);
+  const views = () => page.recordings[recording].views;
+  const panels = () => [...page.recordings[recording].top, ...(views()[view] ?? []).filter((p) => shown.has(p.title))];
   const number = (v) => (v == null ? "–" : String(Number(v.toPrecision(7))));
 
   function shade(u, c) {
@@ -44,9 +49,9 @@
   function columns(panel) {
     const c = colours(), series = [{ label: "time [s]", value: (u, v) => number(v) }];
     const data = [times[recording][panel.time]];
-    const bands = [], source = shares(panel) ?? panel.values;
+    const bands = [], source = panel.values;
     const add = (label, a, stroke, width, more) => {
-      data.push(numbers(a));
+      data.push(a.at ? placed(a, data[0].length) : numbers(a));
       series.push({ label, stroke, width, points: { show: false }, value: (u, v) => number(v), ...more });
       return data.length - 1;
     };
@@ -55,7 +60,8 @@
       bands.push({ series: [upper, lower], fill: c.band });
     }
     const held = panel.word === "control" && !source.greatest ? { paths: uPlot.paths.stepped({ align: 1 }) } : {};
-    const least = add(source.greatest ? "least" : shares(panel) ? "utilisation" : panel.word, source.least, c.ink, 1, held);
+    const filled = panel.word === "score" ? { fill: c.score } : {};
+    const least = add(source.greatest ? "least" : panel.word, source.least, c.ink, 1, { ...held, ...filled });
     if (source.greatest) bands.push({ series: [add("greatest", source.greatest, c.ink, 1), least], fill: c.ink });
     if (source.marked) {
       add("violated", source.marked, c.violated, 1, {
@@ -74,7 +80,7 @@
     const pub = (type) => type === "mousemove" || type === "mouseleave";
     const u = new uPlot({
       width: holder.clientWidth, height: 170, series, bands,
-      scales: { x: { time: false }, y: shares(panel) ? { range: limited } : {} },
+      scales: { x: { time: false }, y: panel.levels.length ? { range: limited(panel) } : {} },
       axes: [axis, { ...axis, size: room }],
       cursor: {
         drag: { x: true, y: false, dist: 4 },
@@ -83,7 +89,7 @@
       },
       hooks: {
         drawClear: [(self) => shade(self, c)],
-        draw: [(self) => shares(panel) && limits(self, c)],
+        draw: [(self) => limits(self, panel.levels, c)],
         setScale: [(self, key) => key === "x" && follow(self)],
       },
     }, data, holder);
@@ -92,15 +98,16 @@
     return u;
   }
 
-  function limited(u, low, high) {
-    const most = Math.min(Math.max(1.25, 1.1 * Math.max(Math.abs(low ?? 0), Math.abs(high ?? 0))), 5);
-    return [-most, most];
-  }
+  const limited = (panel) => (u, low, high) => { // score from 0 on, utilisation around it
+    const size = 1.1 * Math.max(Math.abs(low ?? 0), Math.abs(high ?? 0));
+    return panel.levels.length > 1 ? [-Math.min(Math.max(1.25, size), 5), Math.min(Math.max(1.25, size), 5)]
+      : [0, Math.min(Math.max(1.5, size), 10)];
+  };
 
-  function limits(u, c) { // the bounds of a utilisation
-    u.ctx.strokeStyle = c.bounds;
+  function limits(u, levels, c) { // the bounds of a utilisation, the threshold of a score
+    u.ctx.strokeStyle = levels.length > 1 ? c.bounds : c.violated;
     u.ctx.lineWidth = devicePixelRatio;
-    for (const v of [-1, 1]) {
+    for (const v of levels) {
       const y = Math.round(u.valToPos(v, "y", true)) + 0.5;
       u.ctx.beginPath();
       u.ctx.moveTo(u.bbox.left, y);
@@ -191,10 +198,10 @@
     const now = page.recordings[recording], holder = $("panels");
     holder.replaceChildren();
     $("note").textContent = now.note;
-    now.panels.forEach((panel, i) => {
-      if (!shown[i] || (view !== "values" && !shares(panel))) return;
-      const box = element("section");
-      box.append(element("h2", panel.title + (view === "values" && panel.unit ? ` [${panel.unit}]` : "")));
+    panels().forEach((panel) => {
+      const box = element("section"), head = element("h2", panel.title + (panel.unit ? ` [${panel.unit}]` : ""));
+      head.append(element("small", panel.note));
+      box.append(head);
       holder.append(box);
       plots.push(draw(panel, box));
     });
@@ -204,28 +211,25 @@
 
   function choose(index) {
     recording = index;
-    const panels = page.recordings[recording].panels;
-    const most = panels.map((p, i) => [p.rank, i]).sort((a, b) => b[0] - a[0] || a[1] - b[1]);
-    shown = panels.map(() => false);
-    for (const [, i] of most.slice(0, FIRST)) shown[i] = true;
+    const every = new Map(Object.values(views()).flat().map((p) => [p.title, p.rank]));
+    const most = [...every].sort((a, b) => b[1] - a[1]).map(([title]) => title);
+    shown = new Set(most.slice(0, FIRST));
     const list = $("signals");
     list.replaceChildren(element("summary", ""));
-    const count = () => {
-      list.firstChild.textContent = `signals (${shown.filter(Boolean).length} of ${panels.length} drawn)`;
-    };
-    panels.forEach((panel, i) => {
-      const label = element("label"), box = Object.assign(element("input"), { type: "checkbox", checked: shown[i] });
-      box.addEventListener("change", () => { shown[i] = box.checked; count(); render(true); });
-      label.append(box, " " + panel.title);
+    const count = () => { list.firstChild.textContent = `signals (${shown.size} of ${every.size} drawn)`; };
+    for (const title of every.keys()) {
+      const label = element("label"), box = Object.assign(element("input"), { type: "checkbox", checked: shown.has(title) });
+      box.addEventListener("change", () => { shown[box.checked ? "add" : "delete"](title); count(); render(true); });
+      label.append(box, " " + title);
       list.append(label);
-    });
+    }
     count();
     render(false);
   }
 
   page.recordings.forEach((r, i) => $("recording").append(Object.assign(element("option", r.name), { value: i })));
   $("recording").hidden = page.recordings.length < 2;
-  $("view").hidden = !page.recordings.some((r) => r.panels.some((p) => p.utilisation));
+  $("view").hidden = $("view").options.length < 2;
   $("keys").hidden = $("view").hidden;
   for (const id of ["before", "after"]) $(id).hidden = $("view").hidden;
   $("recording").addEventListener("change", () => choose(Number($("recording").value)));

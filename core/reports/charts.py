@@ -1,0 +1,462 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Charts over time: what is drawn of a recording, said once; images, the report and the interactive page draw it.
+
+A long recording is drawn in columns. Each has the least and the greatest value of its samples, and a mark wherever a
+single sample of it was violated, so that nothing is hidden.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array, Mask
+from uncertain_lti.base.english import plural, shortlist, times
+from uncertain_lti.base.errors import ModelError, refuse_other
+from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.verdicts import Verdicts
+
+PIXELS = 1200
+"""Columns of an image."""
+FEW = 8
+"""States that are drawn one by one; more become the rows of a map."""
+FARTHEST = 1000.0
+"""Utilisation and score that are drawn at most."""
+Spans = list[tuple[float, float]]
+
+
+def forward(t: Array) -> tuple[Array, int]:
+    """Times (samples,) in s that never go back, and how many passes follow the first: each begins after the last."""
+    steps = np.diff(t)
+    loops = int((steps < 0).sum())
+    if not loops:
+        return t, 0
+    ahead = steps[steps > 0]
+    steps[steps < 0] = float(np.median(ahead)) if len(ahead) else 1.0
+    return np.concatenate([[0.0], np.cumsum(steps)]), loops
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Stretches of samples that are drawn as one; of a short recording every sample.
+
+    `starts` (P,): first sample of each; `stop`: end of the last; `t` (P,): where each is drawn, s; `edges` (P, 2): its
+    begin and end, s; `apart` (P,): whether it is not joined to the one before; `binned`: whether some hold several
+    samples; `alarm, judged` (P,): whether any of its samples has one; `loops`: passes after the first.
+    """
+
+    starts: NDArray[np.intp]
+    stop: int
+    t: Array
+    edges: Array
+    apart: Mask
+    binned: bool
+    alarm: Mask
+    judged: Mask
+    loops: int = 0
+
+    @classmethod
+    def of(
+        cls, t: Array, segment: NDArray[np.int32] | None = None, judged: Mask | None = None, alarm: Mask | None = None,
+        near: Mask | None = None, most: int = PIXELS, span: tuple[float, float] | None = None,
+    ) -> Columns:  # fmt: skip
+        """At most about `most` columns (two per pixel where all samples fit), finer around instants that are `near`."""
+        t, loops = forward(t)
+        first, stop = 0, len(t)
+        if span is not None:
+            first, stop = int(np.searchsorted(t, span[0])), int(np.searchsorted(t, span[1], side="right"))
+        count = stop - first
+        here = slice(first, stop)
+        broken = np.zeros(count, dtype=bool)
+        if segment is not None:
+            broken[1:] = np.diff(segment[here]) != 0
+        chosen = np.ones(count, dtype=bool)
+        if count > 2 * most:
+            joined = broken if int(broken.sum()) <= most // 2 else np.zeros(count, dtype=bool)
+            chosen = joined | (np.arange(count) % math.ceil(count / most * (1 if near is None else 2)) == 0)
+            if near is not None:
+                onsets = np.flatnonzero(near[here] & ~np.concatenate([[False], near[here][:-1]]))
+                onsets = onsets[:: math.ceil(len(onsets) / max(most // 20, 1)) or 1]
+                reach = min(most // (4 * max(len(onsets), 1)), 2000)
+                for onset in onsets:
+                    chosen[max(onset - reach, 0) : onset + reach + 2] = True
+        starts = np.flatnonzero(chosen) + first
+        ends = np.append(starts[1:], stop)[: len(starts)]
+        nothing = np.zeros(len(t), dtype=bool)
+        alarmed, known = (
+            np.logical_or.reduceat((nothing if a is None else a)[:stop], starts) if count else nothing[:0]
+            for a in (alarm, judged)
+        )
+        apart = broken[starts - first]
+        begins = np.where(apart, t[starts], t[np.maximum(starts - 1, first)]) if count else t[:0]
+        edges, middle = np.column_stack([begins, t[ends - 1]]), (t[starts] + t[ends - 1]) / 2
+        return cls(starts, stop, middle, edges, apart, len(starts) < count, alarmed, known, loops)
+
+    @property
+    def label(self) -> str:
+        """Label of the axis, which says when passes were put one behind the other."""
+        return "time [s]" + (f", {self.loops + 1} passes one behind the other" if self.loops else "")
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Begin and end of what is drawn, s."""
+        low, high = (float(self.edges[0, 0]), float(self.edges[-1, 1])) if len(self.t) else (0.0, 1.0)
+        return low, high if high > low else low + 1.0
+
+    @cached_property
+    def alarms(self) -> Spans:
+        """Each stretch of alarm, from the verdict that raised it to the one that ended it."""
+        if self.binned:
+            return self._spans(self.alarm)
+        return [(float(self.t[a]), float(self.t[min(b, len(self.t) - 1)])) for a, b in runs(self.alarm)]
+
+    @cached_property
+    def silent(self) -> Spans:
+        """Each stretch without a verdict, pauses of the recording too."""
+        which = ~self.judged
+        if not self.binned:
+            which[:1] = False
+        pauses = [(float(self.edges[k - 1, 1]), float(self.edges[k, 0])) for k in np.flatnonzero(self.apart) if k]
+        return self._spans(which) + pauses
+
+    def _spans(self, which: Mask) -> Spans:
+        return [(float(self.edges[a, 0]), float(self.edges[b - 1, 1])) for a, b in runs(which)]
+
+    def extremes(self, values: Array) -> tuple[Array, Array]:
+        """Least and greatest of each column (P, k) of the finite ones of some values (samples, k)."""
+        if not self.binned:
+            return values[self.starts], values[self.starts]
+        low, high = (np.empty((len(self.starts), values.shape[1])) for _ in range(2))
+        for c, (a, b) in enumerate(zip(self.starts.tolist(), [*self.starts[1:].tolist(), self.stop], strict=True)):
+            part = np.ascontiguousarray(values[a:b].T)  # several times as fast as along the rows
+            np.fmin.reduce(part, axis=1, out=low[c])
+            np.fmax.reduce(part, axis=1, out=high[c])
+        return low, high
+
+    def worst(self, bad: Mask, utilisation: Array, values: Array) -> Array:
+        """Of each column (P,) the value at its violated sample that lies farthest out; NaN where none is."""
+        found = np.full(len(self.starts), np.nan)
+        first = int(self.starts[0]) if len(self.starts) else self.stop
+        rows = np.flatnonzero(bad[first : self.stop]) + first
+        order = rows[np.argsort(np.abs(utilisation[rows]), kind="stable")]
+        found[np.searchsorted(self.starts, order, side="right") - 1] = values[order]
+        return found
+
+
+@dataclass(frozen=True)
+class Series:
+    """One quantity: `low` (P,) of each column and, where that differs, `high` (P,); `role` chooses how it looks."""
+
+    role: str
+    low: Array
+    high: Array | None = None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Series over one axis.
+
+    `limits`: of the axis; `marks` (P,): violated values, NaN where none is; `levels`: lines across; `rank`: how much it
+    is worth seeing; `count`: violated samples; `note`: what stands at its right.
+    """
+
+    title: str
+    series: tuple[Series, ...]
+    unit: str = ""
+    limits: tuple[float, float] = (0.0, 1.0)
+    marks: Array | None = None
+    levels: tuple[float, ...] = ()
+    rank: float = 0.0
+    count: int = 0
+    note: str = ""
+
+    @property
+    def heading(self) -> str:
+        """Name and unit."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+
+@dataclass(frozen=True)
+class Map:
+    """Rows of a size over time, `values` (rows, P): 1 is the bound, beyond it is violated, NaN unknown."""
+
+    title: str
+    rows: tuple[str, ...]
+    values: Array
+    note: str = ""
+    count: int = 0
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Panels over the time of one recording.
+
+    `name`: what is drawn; `heading`: of the recording; `keys`: roles and words of the legend.
+    """
+
+    name: str
+    heading: str
+    columns: Columns
+    panels: tuple[Panel | Map, ...]
+    keys: tuple[tuple[str, str], ...]
+
+    @property
+    def words(self) -> str:
+        """What is seen, for those who do not see it."""
+        c, found = self.columns, [f"{self.heading}."]
+        if c.alarms:
+            found.append(f"The alarm is raised {times(len(c.alarms))}, first at {c.alarms[0][0]:.8g} s.")
+        bad = sorted((p for p in self.panels if p.count), key=lambda p: -p.count)
+        outside = [f"{p.title} {times(p.count)}{self._since(p)}" for p in bad]
+        found += [f"Outside its bounds: {shortlist(outside, 6)}."] if bad else []
+        inside = [p.title for p in self.panels if isinstance(p, Panel) and p.marks is not None and not p.count]
+        found += [f"Always inside: {shortlist(inside, 6)}."] if inside and c.judged.any() else []
+        return " ".join(found)
+
+    def _since(self, panel: Panel | Map) -> str:
+        if isinstance(panel, Map) or panel.marks is None or not (there := np.flatnonzero(~np.isnan(panel.marks))).size:
+            return ""
+        return f" from {self.columns.t[there[0]]:.6g} s"
+
+
+ALARMED = (("alarm", "alarm"), ("silent", "no verdict"))
+
+
+def columns_of(
+    verdicts: Verdicts, most: int = PIXELS, span: tuple[float, float] | None = None, fine: bool = False
+) -> Columns:
+    """Columns of a recording that was checked; `fine` has every sample around violations and alarms."""
+    run = verdicts.transient
+    near = verdicts.violated | verdicts.alarm if fine else None
+    return Columns.of(run.t, run.segment, verdicts.judged, verdicts.alarm, near, most, span)
+
+
+def alarm_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, most: int = 6) -> Chart:
+    """What happened and when: the alarm's score over its threshold, then the states that did it."""
+    score, states = scores(model, verdicts, columns)
+    greatest = float(np.nanmax(score, initial=0.0))
+    top = float(np.clip(1.1 * greatest, 1.5, 6.0))
+    note = "never over it" if greatest <= 1 else f"greatest {greatest:.3g}"
+    if columns.alarm.any():
+        first = int(columns.starts[columns.alarm.argmax()])
+        raised = verdicts.raised(first + int(verdicts.alarm[first:].argmax()))
+        note = raised[0].words if raised else note
+    capped = np.minimum(score, FARTHEST)
+    panel = Panel(
+        "alarm score, 1 is the threshold", (Series("score", np.where(np.isnan(capped), np.nan, 0.0), capped),),
+        limits=(0.0, top), levels=(1.0,), rank=math.inf, note=note,
+    )  # fmt: skip
+    chosen = [model.state_names[i] for i in np.argsort(-states, kind="stable")[:most]]
+    below = utilisation_chart(model, verdicts, columns, chosen)
+    name = "What happened, and when: the alarm's score over its threshold, then where between its bounds each state lay"
+    if model.n > most:
+        name += f" ({most} of {model.n} states, those that did most)"
+    keys = (("score", "score, utilisation"), ("bounds", "inside the bounds"), ("violated", "violated"), *ALARMED)
+    return Chart(name, below.heading, columns, (panel, *below.panels), keys)
+
+
+def scores(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[Array, Array]:
+    """The greatest score of any rule over its threshold in each column (P,), and of each state (n,) in the alarm.
+
+    The score of a statistic is what it is over its threshold; that of containment the violated verdicts over those
+    that raise the alarm or, where one is enough, the utilisation over the margin.
+    """
+    reached = [_size(*columns.extremes(verdicts.utilisation))]
+    where = columns.alarm if columns.alarm.any() else columns.judged
+    states = _most(reached[0][where])
+    found = []
+    for r, rule in enumerate(verdicts.alarms.rules):
+        if not isinstance(rule, AlarmRule):
+            continue
+        table = verdicts.horizon_utilisation[:, 1 + model.steps.index(rule.horizon)] if rule.horizon > 1 else None
+        raised = columns.extremes(verdicts.rule_alarms[:, r : r + 1].astype(np.float64))[1][:, 0] > 0
+        if rule.violations == 1:
+            size = reached[0] if table is None else _size(*columns.extremes(table))
+            value = _fmax(size) / rule.margin
+        else:
+            with np.errstate(invalid="ignore"):
+                beyond = verdicts.flags == 1.0 if table is None else np.abs(table) > rule.margin
+                bad = np.logical_or.reduce(beyond, axis=1)
+            given = np.flatnonzero(verdicts.judged)
+            total = np.concatenate([[0], np.cumsum(bad[given])])
+            ends = np.arange(1, len(total))
+            full = np.full((len(bad), 1), np.nan)
+            full[given, 0] = (total[ends] - total[np.maximum(ends - rule.window, 0)]) / rule.violations
+            value = columns.extremes(full)[1][:, 0]
+        below = np.minimum(value, 1.0 - 1.0 / max(rule.violations, 2) if rule.violations > 1 else 1.0)
+        found.append(np.where(raised, np.fmax(value, 1.0), below))  # a masked state, or --grace, raises nothing
+    if len(names := verdicts.statistic_names):
+        over = _size(*columns.extremes(verdicts.statistics))
+        found.append(_fmax(over))
+        most = _most(over[where])
+        of = {name: i for i, name in enumerate(model.state_names)}
+        for name, size in zip(names, most, strict=True):
+            if (i := of.get(name.partition("/")[2])) is not None:
+                states[i] = max(states[i], size)
+    score = _fmax(np.stack(found, axis=1))
+    return np.where(columns.alarm, np.fmax(score, 1.0), score), states
+
+
+def _size(low: Array, high: Array) -> Array:
+    return np.fmax(np.abs(low), np.abs(high))
+
+
+def _fmax(values: Array) -> Array:
+    """Greatest of each row; NaN where there is none."""
+    greatest: Array = np.fmax.reduce(values, axis=1, initial=np.nan)
+    return greatest
+
+
+def _most(values: Array) -> Array:
+    greatest: Array = np.nan_to_num(np.fmax.reduce(values, axis=0, initial=0.0), posinf=1e9)
+    return greatest
+
+
+def envelope_chart(
+    model: UncertainLTI, verdicts: Verdicts, columns: Columns, states: Sequence[str] | None = None
+) -> Chart:
+    """Each state between its one-step bounds, in recorded units."""
+    chosen = chosen_states(model, verdicts, states)
+    x = verdicts.transient.x
+    low, high = columns.extremes(x)
+    lower, upper = columns.extremes(verdicts.lower)[0], columns.extremes(verdicts.upper)[1]
+    panels = []
+    for i in chosen:
+        bad = verdicts.flags[:, i] == 1.0
+        marks = columns.worst(bad, verdicts.utilisation[:, i], x[:, i])
+        sides = np.concatenate([lower[:, i], low[:, i]]), np.concatenate([upper[:, i], high[:, i]])
+        series = Series("bounds", lower[:, i], upper[:, i]), _series("recorded", low[:, i], high[:, i], columns)
+        panels.append(_panel(model, columns, i, series, _limits(*sides), marks, bad))
+    keys = (("bounds", "one-step bounds"), ("recorded", "recorded"), ("violated", "violated"), *ALARMED)
+    return Chart("Recorded values between their one-step bounds", heading(verdicts), columns, tuple(panels), keys)
+
+
+def utilisation_chart(
+    model: UncertainLTI, verdicts: Verdicts, columns: Columns, states: Sequence[str] | None = None, row: int = 0
+) -> Chart:
+    """Where between its bounds each state lay, -1 and 1 at the bounds; `row` 0 is one step, others the horizons."""
+    chosen = chosen_states(model, verdicts, states)
+    values = verdicts.utilisation if row == 0 else verdicts.longer_utilisation[:, row - 1]
+    low, high = columns.extremes(values)
+    panels = []
+    for i in chosen:
+        with np.errstate(invalid="ignore"):
+            bad = verdicts.flags[:, i] == 1.0 if row == 0 else np.abs(values[:, i]) > 1.0
+        size = _size(low[:, i], high[:, i])
+        limit = float(np.clip(1.1 * size[np.isfinite(size)].max(initial=0.0), 1.25, 4.0))
+        marks = columns.worst(bad, values[:, i], values[:, i])
+        a, b, marks = (np.clip(v, -FARTHEST, FARTHEST) for v in (low[:, i], high[:, i], marks))
+        series = (_series("utilisation", a, b, columns),)
+        panels.append(_panel(model, columns, i, series, (-limit, limit), marks, bad, levels=(-1.0, 1.0)))
+    over = "" if row == 0 else f" over {model.steps[row - 1]} steps"
+    keys = (("bounds", "inside the bounds"), ("utilisation", "utilisation"), ("violated", "violated"), *ALARMED)
+    name = f"Utilisation{over}: where between its bounds each state lay, -1 and 1 at the bounds"
+    return Chart(name, heading(verdicts), columns, tuple(panels), keys)
+
+
+def utilisation_map(
+    model: UncertainLTI, verdicts: Verdicts, columns: Columns, states: Sequence[str] | None = None
+) -> Chart:
+    """Greatest |utilisation| of many states over time, a row each."""
+    chosen = chosen_states(model, verdicts, states)
+    size = _size(*columns.extremes(verdicts.utilisation))[:, chosen].T
+    bad = (columns.extremes(verdicts.flags)[1][:, chosen] == 1.0).T
+    values = np.where(bad, 2.0, np.minimum(size, 1.0))
+    rows = tuple(model.state_names[i] for i in chosen)
+    drawn = Map("|utilisation|", rows, values, count=int(verdicts.violated.sum()))
+    return Chart("Utilisation of each state over time", heading(verdicts), columns, (drawn,), MAPPED)
+
+
+MAPPED = (("full", "at its bound"), ("violated", "violated"), ("alarm", "alarm"), ("silent", "no verdict"))
+
+
+def horizon_chart(
+    model: UncertainLTI, verdicts: Verdicts, columns: Columns, states: Sequence[str] | None = None
+) -> Chart:
+    """Greatest |utilisation| over time, of each state a map with a row per number of steps."""
+    table, step = verdicts.horizon_utilisation, model.sampling.dt_median
+    rows = tuple(f"{h} ({h * step:.3g} s)" if step is not None else str(h) for h in (1, *model.steps))
+    panels = []
+    for i in chosen_states(model, verdicts, states):
+        values = _size(*columns.extremes(table[:, :, i])).T
+        with np.errstate(invalid="ignore"):
+            outside = (np.abs(table[:, :, i]) > 1.0).sum(axis=0).tolist()
+        note = f"outside: {', '.join(map(str, outside))}"
+        panels.append(Map(model.state_names[i], rows, values, note, sum(outside)))
+    name = "Utilisation over horizons: after how many steps a state lies outside its envelope"
+    return Chart(name, heading(verdicts), columns, tuple(panels), MAPPED)
+
+
+def chosen_states(model: UncertainLTI, verdicts: Verdicts, states: Sequence[str] | None) -> list[int]:
+    """Positions of the states to draw."""
+    refuse_other(model, UncertainLTI, "model", "give the model that the recording was checked with", ModelError)
+    refuse_other(
+        verdicts, Verdicts, "verdicts", "give what EnvelopeMonitor(model).check(transient) returned", ModelError
+    )
+    names = list(model.state_names if states is None else states)
+    for name in names:
+        if name not in model.state_names:
+            raise ModelError(f"there is no state '{name}' to draw; states are {', '.join(model.state_names)}")
+    return [model.state_names.index(name) for name in names]
+
+
+def heading(verdicts: Verdicts) -> str:
+    """Name of a recording, its verdicts and how many were violated."""
+    judged, bad = int(verdicts.judged.sum()), int(verdicts.violated.sum())
+    what = f"{bad} violated ({100 * bad / judged:.3g} %)" if bad else "none violated" if judged else "nothing is known"
+    return f"{base_name(verdicts.transient.name)}: {plural(judged, 'verdict')}, {what}"
+
+
+def base_name(path: str | os.PathLike[str]) -> str:
+    """The last part of a path."""
+    return os.path.basename(path) or str(path)
+
+
+def runs(flags: Mask) -> list[tuple[int, int]]:
+    """[start, stop) of every run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _series(role: str, low: Array, high: Array, columns: Columns) -> Series:
+    return Series(role, low, high if columns.binned else None)
+
+
+def _panel(
+    model: UncertainLTI, columns: Columns, i: int, series: tuple[Series, ...], limits: tuple[float, float],
+    marks: Array, bad: Mask, levels: tuple[float, ...] = (),
+) -> Panel:  # fmt: skip
+    signal = model.signals.states[i]
+    first = int(columns.starts[0]) if len(columns.starts) else 0
+    count = int(bad[first : columns.stop].sum())
+    unit = "" if levels else signal.unit
+    note = f"violated {count:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if count else ""
+    return Panel(signal.name, series, unit, limits, marks, levels, float(bad.sum()), count, note)
+
+
+def _limits(lower: Array, upper: Array) -> tuple[float, float]:
+    """Of an axis: everything, unless a few far values would flatten the rest; those are then marked at its edge."""
+    lower, upper = lower[np.isfinite(lower)], upper[np.isfinite(upper)]
+    if not len(lower) or not len(upper):
+        return 0.0, 1.0
+    bottom, top = float(lower.min()), float(upper.max())
+    low, high = float(np.quantile(lower, 0.02)), float(np.quantile(upper, 0.98))
+    if top - bottom > 8.0 * (high - low) > 0.0:
+        bottom, top = max(bottom, low - (high - low)), min(top, high + (high - low))
+    room = 0.08 * (top - bottom) or 0.05 * max(abs(top), 1e-12)
+    return bottom - room, top + room
