@@ -132,7 +132,7 @@ class Columns:
         if not self.binned:
             which[:1] = False
         pauses = [(float(self.edges[k - 1, 1]), float(self.edges[k, 0])) for k in np.flatnonzero(self.apart) if k]
-        return self._spans(which) + pauses
+        return sorted(self._spans(which) + pauses)
 
     def _spans(self, which: Mask) -> Spans:
         return [(float(self.edges[a, 0]), float(self.edges[b - 1, 1])) for a, b in runs(which)]
