@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from coil import coil_runs
 from detectors import DETECTORS, WINDOWS, Array, Learn, averaged, least_squares, table
 from shared_recordings import airborne, crazypad_labels
 from turbofan_fleet import simulate_fleet
@@ -41,7 +42,6 @@ from tanks import Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, fit
 from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti.plants.coil import coil_runs
 from uncertain_lti.plants.turbofan_faults import Fault
 from uncertain_lti.plants.turbofan_runs import DT, LARGE, Run, lever_moves, make_run
 

@@ -11,10 +11,10 @@
 
 import numpy as np
 import pytest
+from coil import STEP_NS, C, L, R, coil_runs, inductance
 from scipy.linalg import expm
 
 from uncertain_lti import EnvelopeMonitor, fit
-from uncertain_lti.plants.coil import STEP_NS, C, L, R, coil_runs, inductance
 
 
 def test_the_coil_saturates_in_both_directions():

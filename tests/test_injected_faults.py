@@ -13,6 +13,7 @@ import json
 
 import numpy as np
 import pytest
+from coil import coil_runs
 from engine_bag import SIGNALS, engine_bag
 from tanks import DT, Tanks
 
@@ -20,7 +21,6 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.plants.coil import coil_runs
 from uncertain_lti.plants.leibov import leibov2006, transient
 from uncertain_lti.reports.detectable_text import detectable_data, detectable_text, detectable_words
 from uncertain_lti.signals.signal_map import Signal, SignalMap

@@ -67,13 +67,14 @@ COMMANDS: tuple[Command, ...] = (
 _FIT = "install what fitting needs: pip install 'uncertain-lti-ros[fit]'"
 _ROS = "source a ROS 2 Jazzy installation, or pip install 'uncertain-lti-ros[ros]'"
 _READ = "install what recordings need: pip install uncertain-lti-ros, or rosdep with the folder rosdep of its source"
+_FIGURES = "install what figures need: pip install 'uncertain-lti-ros[plots]'"
 _EXTRAS = {
     **dict.fromkeys(("lz4", "mcap", "rosbags", "tqdm", "zstandard"), _READ),
     **dict.fromkeys(("cvxpy", "osqp", "daqp", "piqp", "highspy", "scipy"), _FIT),
     **dict.fromkeys(("rclpy", "std_msgs", "sensor_msgs", "rosgraph_msgs", "std_srvs", "uncertain_lti_ros"), _ROS),
     "distributed": "install what a cluster needs: pip install 'uncertain-lti-ros[cluster]'",
     "shtab": "install what completion needs: pip install 'uncertain-lti-ros[completion]'",
-    **dict.fromkeys(("jinja2", "markupsafe", "matplotlib"), "install what figures need: pip install 'uncertain-lti-ros[plots]'"),
+    **dict.fromkeys(("jinja2", "markupsafe", "matplotlib"), _FIGURES),
 }
 
 

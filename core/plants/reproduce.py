@@ -34,7 +34,7 @@ from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.plants.turbofan import engine
 from uncertain_lti.plants.turbofan_control import operating_point, trim
 from uncertain_lti.plants.turbofan_runs import DT, LARGE, NOISE, SMALL, make_run, simulate
-from uncertain_lti.reports.figures import ENVELOPE, RECORDED, VIOLATED
+from uncertain_lti.reports.figures import envelope_figure, save, utilisation_figure
 from uncertain_lti.reports.tables import number, table
 from uncertain_lti.sampling.transient import Transient
 
@@ -187,8 +187,9 @@ def reproduce(
         name = label.replace("±", "both").replace("+", "up").replace("%", "")
         name = f"{name}_{case.model.fit_summary['criterion']}_{case.model.fit_summary['additive']}"
         case.model.save(folder / f"{name}.model.json")
-    check_figure(chosen, folder / "check.png")
-    check_figure(first, folder / "check_paper_pulses.png")
+    for name, case in (("check", chosen), ("check_paper_pulses", first)):
+        save(envelope_figure(case.model, case.verdicts), folder / f"{name}.png")
+        save(utilisation_figure(case.model, case.verdicts), folder / f"{name}_utilisation.png")
     data = {
         "cases": [c.data() for c in cases],
         "direct_search": searches,
@@ -197,7 +198,7 @@ def reproduce(
     for name, text in (("reproduce.json", json.dumps(data, indent=1)), ("reproduce.txt", "\n\n".join(lines))):
         with whole_file(folder / name) as stream:
             stream.write(f"{text}\n".encode())
-    say(f"models, figures (check.png, check_paper_pulses.png), reproduce.txt and reproduce.json are in {folder}")
+    say(f"models, figures (check*.png), reproduce.txt and reproduce.json are in {folder}")
     return data
 
 
@@ -299,49 +300,3 @@ def search_text(searches: Sequence[dict[str, Any]]) -> str:
     ]  # fmt: skip
     header = ("identified from", "(10), exact", "direct search", "above", "exact [s]", "direct [s]", "ratio of times")
     return "The paper's solver, direct search by golden section, and the exact one\n" + table(header, rows)
-
-
-def check_figure(case: Case, path: str | os.PathLike[str]) -> None:
-    """The paper's figure: each state between the bounds; next to it the same relative to the bounds' centre.
-
-    Left, in recorded units, as the paper draws it; the bounds are so close there that right shows what they leave.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    verdicts, model = case.verdicts, case.model
-    t, x = verdicts.transient.t, verdicts.transient.x
-    X = model.operating_point.X
-    figure = Figure(figsize=(12, 13), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes: Any = figure.subplots(model.n, 2, sharex=True)
-    for i, signal in enumerate(model.signals.states):
-        lower, upper = verdicts.lower[:, i], verdicts.upper[:, i]
-        bad = verdicts.flags[:, i] == 1.0
-        left, right = axes[i]
-        left.fill_between(t, lower, upper, color=ENVELOPE, alpha=0.6, label="one-step bounds")
-        left.plot(t, x[:, i], color=RECORDED, linewidth=1.0, label="recorded")
-        left.set_ylabel(f"{signal.name.replace('_', ' ')}\n[{signal.unit}]")
-        centre = 0.5 * (lower + upper)
-        scale = 1e3 / X[i]
-        low, high = (lower - centre) * scale, (upper - centre) * scale
-        right.fill_between(t, low, high, color=ENVELOPE, alpha=0.6, linewidth=0)
-        right.plot(t, (x[:, i] - centre) * scale, color=RECORDED, linewidth=1.0)
-        right.plot(t[bad], (x[bad, i] - centre[bad]) * scale, ".", color=VIOLATED)
-        right.set_ylabel("from the centre\n[1e-3 of the scale]")
-        right.set_title(f"{case.inside[i]:.0%} inside", loc="right", fontsize="small")
-        for axis in (left, right):
-            axis.grid(alpha=0.25)
-            axis.margins(x=0.01)
-        if bad.any():
-            left.plot(t[bad], x[bad, i], ".", color=VIOLATED, label="violated")
-    shown = {label: handle for row in axes for handle, label in zip(*row[0].get_legend_handles_labels(), strict=True)}
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), frameon=False)
-    for axis in axes[-1]:
-        axis.set_xlabel("time [s]")
-    figure.suptitle(
-        f"Lever from 68 to 60 deg. Identified by (10) from pulses of {case.name}: {case.inside_all:.0%} of the "
-        f"transitions inside all bounds"
-    )
-    with whole_file(path) as stream:
-        figure.savefig(stream, dpi=110, format=os.path.splitext(path)[1][1:] or "png")
