@@ -28,7 +28,7 @@ from uncertain_lti.cli.command import (
     print_notes,
     print_summary,
 )
-from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, complain_of_unchecked, deployed_monitor
+from uncertain_lti.cli.deployed import add_rule_arguments, checks, deployed_monitor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,14 +66,9 @@ def run(options: argparse.Namespace) -> int:
         copies = targets(options.write, bags)
     results = []
     refused: list[dict[str, str]] = []
-    for bag, copy in zip(bags, copies, strict=True):
-        reading = options.progress.iterate("reading")
-        found = check_or_complain("check", deployed, bag, len(bags) > 1, reading)
-        if isinstance(found, str):
-            refused.append({"recording": str(bag.path), "error": found})
-            continue
-        verdicts, decisions = found
-        print_notes(options, verdicts.transient.notes)
+    copy_of = dict(zip(bags, copies, strict=True))
+    for bag, verdicts, decisions in checks("check", options, deployed, bags, refused):
+        copy = copy_of[bag]
         data = check_data(model, verdicts, samples=options.json)
         results.append(data)
         print_summary(options, check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
@@ -87,7 +82,6 @@ def run(options: argparse.Namespace) -> int:
                 f"{plural(made.messages, 'message')} and the verdicts below {made.topics} written to {made.path}",
             )
     status = ALARM if any(r["alarm"] for r in results) else BAD_INPUT if refused else DONE
-    complain_of_unchecked("check", len(refused), len(bags))
     if options.json:
         of_all = "unknown" if refused and status != ALARM else outcome(results)
         ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}

@@ -12,10 +12,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from uncertain_lti.base.english import plural
-from uncertain_lti.cli.command import complain
+from uncertain_lti.cli.command import complain, print_notes
 
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
@@ -102,22 +103,26 @@ def check_recording(
     return deployed.check(transient, *heard), decisions
 
 
-def check_or_complain(
-    command: str, deployed: DeployedMonitor, recording: Recording, several: bool, progress: Progress | None = None
-) -> tuple[Verdicts, Decisions] | str:
-    """Read and judge one recording; of several, one that cannot be checked keeps none of the others from it."""
+def checks(
+    command: str,
+    options: argparse.Namespace,
+    deployed: DeployedMonitor,
+    bags: Sequence[Recording],
+    refused: list[dict[str, str]],
+) -> Iterator[tuple[Recording, Verdicts, Decisions]]:
+    """Read and judge recordings; of several, one that cannot be checked is `refused` and keeps none of the others."""
     from uncertain_lti.base.errors import BagError, SignalError
 
-    try:
-        return check_recording(deployed, recording, progress)
-    except (BagError, SignalError) as error:
-        if not several:
-            raise
-        complain(command, str(error))
-        return str(error)
-
-
-def complain_of_unchecked(command: str, unchecked: int, recordings: int) -> None:
-    """Say how many recordings were not checked, if any."""
-    if unchecked:
-        complain(command, f"{unchecked} of {plural(recordings, 'recording')} not checked, as said above")
+    for bag in bags:
+        try:
+            verdicts, decisions = check_recording(deployed, bag, options.progress.iterate("reading"))
+        except (BagError, SignalError) as error:
+            if len(bags) == 1:
+                raise
+            complain(command, str(error))
+            refused.append({"recording": str(bag.path), "error": str(error)})
+            continue
+        print_notes(options, verdicts.transient.notes)
+        yield bag, verdicts, decisions
+    if refused:
+        complain(command, f"{len(refused)} of {plural(len(bags), 'recording')} not checked, as said above")

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli.command import (
@@ -29,7 +29,7 @@ from uncertain_lti.cli.command import (
     print_notes,
     print_summary,
 )
-from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, complain_of_unchecked, deployed_monitor
+from uncertain_lti.cli.deployed import add_rule_arguments, checks, deployed_monitor
 
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(
         parser,
         about="a model file (an image of its elements), recordings (their signals), or a model file and then "
-        "recordings (states between their bounds)",
+        "recordings (what happened, and when)",
         metavar="WHAT",
     )
     parser.add_argument("--signals", metavar="FILE", help="signals file: draw its signals, not every number that moves")
@@ -59,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the plot."""
     from uncertain_lti.recordings.formats import group_recordings
+    from uncertain_lti.reports.page_file import HOLDS, page_target
 
     named = _names_model(options.bags[0])
     model = load_model(options.bags[0]) if named else None
@@ -66,16 +67,26 @@ def run(options: argparse.Namespace) -> int:
     if model is not None and options.signals:
         raise ModelError(f"--signals {options.signals}: the model has its signals; leave the option out")
     bags = group_recordings(paths, layout=None if model is None else model.signals.table) if paths else []
-    output = _target(options.output or ("plot.html" if bags else "plot.png"), options.bags[0] if named else "", bags)
+    output = Path(options.output or ("plot.html" if bags else "plot.png"))
+    page = output.suffix == ".html"
+    if output.suffix not in HOLDS:
+        raise BagError(f"{output}: a plot is a page or an image; end the name in .html, .png, .svg or .pdf")
+    if page and not bags:
+        raise ModelError(f"{output}: a model alone is drawn as an image; end the name in .png, .svg or .pdf")
+    if not page and model is None:
+        raise BagError(f"{output}: recordings without a model are drawn as a page; end the name in .html")
+    if not page and len(bags) > 1:
+        raise BagError(f"{output}: an image shows one recording; name one, or end the name in .html")
+    page_target(output, options.bags[0] if named else "", bags)
     status = DONE
-    if model is not None and not bags:
-        _image(_model_figure(model), output)
-    elif model is not None:
+    if model is None:
+        _write("Recorded", bags, _recorded(options, bags), output)
+    elif bags:
         status = _plot_check(options, model, bags, output)
     else:
-        if output.suffix != ".html":
-            raise BagError(f"{output}: recordings without a model are drawn as a page; end the name in .html")
-        _write(f"Recorded: {_listed(bags)}", _plot_bags(options, bags), output)
+        from uncertain_lti.reports.figures import matrices_figure, save
+
+        save(matrices_figure(model), output, 200)
     print_summary(options, f"plot written to {output}")
     if options.json:
         recordings = [str(bag.path) for bag in bags]
@@ -93,72 +104,41 @@ def _names_model(path: str) -> bool:
         return stream.read(100).lstrip()[:1] == b"{"
 
 
-def _target(output: str, model_file: str, bags: list[Recording]) -> Path:
-    from uncertain_lti.reports.page_file import IMAGES, image_target, page_target
-
-    kind = os.path.splitext(output)[1]
-    if kind == ".html":
-        if not bags:
-            raise ModelError(f"{output}: a model alone is drawn as an image; end the name in .png, .svg or .pdf")
-        path = page_target(output, model_file, bags)
-        assert path is not None
-        return path
-    if kind not in IMAGES:
-        raise BagError(f"{output}: a plot is a page or an image; end the name in .html, .png, .svg or .pdf")
-    return image_target(output, model_file, bags)
-
-
-def _model_figure(model: UncertainLTI) -> Any:
-    from uncertain_lti.reports.figures import matrices_figure
-
-    return matrices_figure(model)
-
-
 def _plot_check(options: argparse.Namespace, model: UncertainLTI, bags: list[Recording], output: Path) -> int:
     """Plot recordings that are checked; the exit status."""
-    from uncertain_lti.reports.interactive import plotted_check
-
-    page = output.suffix == ".html"
-    if not page and len(bags) > 1:
-        raise BagError(f"{output}: an image shows one recording; name one, or end the name in .html")
     deployed = deployed_monitor(options, model)
     model = deployed.monitor.model  # with the rules that are judged by
-    plotted, alarm, checked = [], False, 0
-    for bag in bags:
-        found = check_or_complain("plot", deployed, bag, len(bags) > 1, options.progress.iterate("reading"))
-        if isinstance(found, str):
-            continue
-        verdicts, _ = found
-        checked += 1
-        print_notes(options, verdicts.transient.notes)
-        alarm |= bool(verdicts.alarm.any())
-        if page:
+    plotted: list[Plotted] = []
+    alarm, checked, refused = False, 0, list[dict[str, str]]()
+    for _, verdicts, _ in checks("plot", options, deployed, bags, refused):
+        alarm, checked = alarm or bool(verdicts.alarm.any()), checked + 1
+        if output.suffix == ".html":
+            from uncertain_lti.reports.interactive import plotted_check
+
             plotted.append(plotted_check(model, verdicts, len(bags)))
         else:
-            from uncertain_lti.reports.figures import alarm_figure
+            from uncertain_lti.reports.figures import alarm_figure, save
 
-            _image(alarm_figure(model, verdicts), output)
-    complain_of_unchecked("plot", len(bags) - checked, len(bags))
+            save(alarm_figure(model, verdicts), output, 200)
     if not checked:
         raise BagError("no recording could be checked, so nothing is drawn; name one that has the topics of the model")
-    if page:
-        name = os.path.basename(options.bags[0])
-        _write(f"{name}: {_listed(bags)}", plotted, output)
-    return ALARM if alarm else BAD_INPUT if checked < len(bags) else DONE
+    if plotted:
+        _write(os.path.basename(options.bags[0]), bags, plotted, output)
+    return ALARM if alarm else BAD_INPUT if refused else DONE
 
 
-def _plot_bags(options: argparse.Namespace, bags: list[Recording]) -> list[Plotted]:
+def _recorded(options: argparse.Namespace, bags: list[Recording]) -> list[Plotted]:
     from uncertain_lti.reports.interactive import plotted_fields, plotted_transient
 
     if options.signals:
         from uncertain_lti import read_transients
 
-        runs = read_transients(
-            [bag.path for bag in bags], options.signals, progress=options.progress.iterate("reading")
-        )
+        reading = options.progress.iterate("reading")
+        runs = read_transients([bag.path for bag in bags], options.signals, progress=reading)
         for transient in runs:
             print_notes(options, transient.notes)
         return [plotted_transient(transient, len(runs)) for transient in runs]
+    from uncertain_lti.base.english import shortlist
     from uncertain_lti.proposal.reading import moving_numbers
 
     plotted = []
@@ -167,34 +147,23 @@ def _plot_bags(options: argparse.Namespace, bags: list[Recording]) -> list[Plott
         print_notes(options, bag.warnings)
         if not fields:
             raise BagError(f"{bag.path}: no number in it moves; `uncertain-lti topics {bag.path}` lists what it holds")
-        note = "Every number that moves, over the time of arrival."
-        if left:
-            note += f" Left out: {'; '.join(left[:8])}" + (f"; and {len(left) - 8} more" if len(left) > 8 else "") + "."
+        note = "Every number that moves, over the time of arrival." + f" Left out: {shortlist(left, 8)}." * bool(left)
         plotted.append(plotted_fields(str(bag.path), fields, note, len(bags)))
     return plotted
 
 
-def _listed(bags: list[Recording]) -> str:
-    names = [os.path.basename(bag.path) or str(bag.path) for bag in bags]
-    return names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
-
-
-def _image(figure: Any, output: Path) -> None:
-    from uncertain_lti.reports.figures import save
-
-    save(figure, output, 200)
-
-
-def _write(title: str, plotted: list[Plotted], output: Path) -> None:
+def _write(title: str, bags: list[Recording], plotted: list[Plotted], output: Path) -> None:
+    from uncertain_lti.base.english import shortlist
     from uncertain_lti.reports.interactive import interactive_page
     from uncertain_lti.reports.page_file import write_page
 
-    write_page(output, interactive_page(title, plotted))
+    names = [os.path.basename(bag.path) or str(bag.path) for bag in bags]
+    write_page(output, interactive_page(f"{title}: {shortlist(names, 1)}", plotted))
 
 
 COMMAND = Command(
     "plot",
-    "draw a model, recordings, or recordings between the bounds of a model",
+    "draw a model, recordings, or what happened in recordings by a model",
     add_arguments,
     run,
     quiet=SILENT,

@@ -23,10 +23,9 @@ from uncertain_lti.cli.command import (
     add_recordings,
     load_model,
     print_json,
-    print_notes,
     print_summary,
 )
-from uncertain_lti.cli.deployed import add_rule_arguments, check_or_complain, complain_of_unchecked, deployed_monitor
+from uncertain_lti.cli.deployed import add_rule_arguments, checks, deployed_monitor
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,20 +46,13 @@ def run(options: argparse.Namespace) -> int:
 
     model = load_model(options.model)
     bags = group_recordings(options.bags, layout=model.signals.table)
-    output = page_target(options.output or (None if options.json else "report.html"), options.model, bags)
+    output = options.output or (None if options.json else "report.html")
+    if output is not None:
+        page_target(output, options.model, bags)
     deployed = deployed_monitor(options, model)
     model = deployed.monitor.model  # with the rules that are judged by
-    checked = []
     refused: list[dict[str, str]] = []
-    for bag in bags:
-        found = check_or_complain("report", deployed, bag, len(bags) > 1, options.progress.iterate("reading"))
-        if isinstance(found, str):
-            refused.append({"recording": str(bag.path), "error": found})
-            continue
-        verdicts, _ = found
-        print_notes(options, verdicts.transient.notes)
-        checked.append(verdicts)
-    complain_of_unchecked("report", len(refused), len(bags))
+    checked = [verdicts for _, verdicts, _ in checks("report", options, deployed, bags, refused)]
     if not checked:
         return BAD_INPUT
     facts = findings(model, options.model, checked, deployed.monitor.rule, deployed.words())

@@ -17,8 +17,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from importlib.resources import files
 from typing import Any
 from xml.sax.saxutils import quoteattr
+
+from jinja2 import Environment
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import may_replace, whole_file
@@ -124,27 +127,10 @@ def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
         ]
         verdicts += [("alarm", [(f"{base}/{o.name}/data", VIOLATED)]) for o in _ALARMS]
         tabs.append((f"verdicts{numbers}", verdicts))
-    lines = [
-        "<?xml version='1.0' encoding='UTF-8'?>",
-        "<root>",
-        ' <tabbed_widget name="Main Window" parent="main_window">',
-    ]
-    for name, plots in tabs:
-        lines += [f'  <Tab containers="1" tab_name={_attribute(name)}>', "   <Container>"]
-        sizes = ";".join([f"{1 / len(plots):.6f}"] * len(plots))
-        lines.append(f'    <DockSplitter orientation="-" sizes="{sizes}" count="{len(plots)}">')
-        for title, drawn in plots:
-            lines.append(f"     <DockArea name={_attribute(title)}>")
-            lines.append('      <plot mode="TimeSeries" style="Lines" flip_x="false" flip_y="false">')
-            lines.append("       <limitY/>")
-            lines += [f'       <curve name={_attribute(curve)} color="{colour}"/>' for curve, colour in drawn]
-            lines += ["      </plot>", "     </DockArea>"]
-        lines += ["    </DockSplitter>", "   </Container>", "  </Tab>"]
-    lines += [
-        '  <currentTabIndex index="0"/>', " </tabbed_widget>", ' <use_relative_time_offset enabled="1"/>', " <Plugins>",
-        '  <plugin ID="DataLoad MCAP"/>', " </Plugins>", " <customMathEquations/>", " <snippets/>", "</root>",
-    ]  # fmt: skip
-    return "\n".join(lines) + "\n"
+    made = Environment(trim_blocks=True, keep_trailing_newline=True)
+    made.filters["attribute"] = _attribute
+    text = files("uncertain_lti.reports").joinpath("assets", "plotjuggler.xml").read_text(encoding="utf-8")
+    return made.from_string(text).render(tabs=tabs)
 
 
 def write_layouts(

@@ -19,30 +19,19 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, whole_file
 from uncertain_lti.recordings.recording import Recording
 
-IMAGES = {".png": b"\x89PNG", ".svg": b"<svg", ".pdf": b"%PDF"}
-"""Endings of images, and what their files hold near the beginning."""
+HOLDS = {".html": b"<html", ".png": b"\x89PNG", ".svg": b"<svg", ".pdf": b"%PDF"}
+"""Endings of pages and images, and what their files hold near the beginning."""
 
 
-def page_target(output: str | os.PathLike[str] | None, model_file: str, bags: Sequence[Recording]) -> Path | None:
-    """Where the page goes; an older page is replaced, a recording or the model never."""
-    if output is None:
-        return None
-    return _target(Path(output), model_file, bags, holds=b"<html", kind="page", example="report.html")
-
-
-def image_target(output: str | os.PathLike[str], model_file: str, bags: Sequence[Recording]) -> Path:
-    """Where an image goes; an older one of the same format is replaced, a recording or the model never."""
+def page_target(output: str | os.PathLike[str], model_file: str, bags: Sequence[Recording]) -> Path:
+    """Where a page or an image goes; an older one of the same format is replaced, a recording or the model never."""
     path = Path(output)
-    return _target(path, model_file, bags, holds=IMAGES[path.suffix], kind="image", example="plot.png")
-
-
-def _target(path: Path, model_file: str, bags: Sequence[Recording], *, holds: bytes, kind: str, example: str) -> Path:
+    image = path.suffix in HOLDS and path.suffix != ".html"
     for other in (*([Path(model_file)] if model_file else []), *(part for bag in bags for part in bag.parts)):
         if path.exists() and other.exists() and path.samefile(other):
-            raise BagError(
-                f"{path}: is what the {'report' if kind == 'page' else 'plot'} is about; choose another name"
-            )
-    return target(path, holds=holds, kind=kind, example=example)
+            raise BagError(f"{path}: is what the {'plot' if image else 'report'} is about; choose another name")
+    kind, example = ("image", "plot.png") if image else ("page", "report.html")
+    return target(path, holds=HOLDS.get(path.suffix, b"<html"), kind=kind, example=example)
 
 
 def write_page(path: str | os.PathLike[str], page: str) -> None:
