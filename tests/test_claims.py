@@ -89,6 +89,7 @@ def test_every_claim_has_a_command_and_every_benchmark_a_claim():
         assert "`" in row[1] or row[1] == "the same" or set(row[0]) == {"-"}, row
     named = " ".join(COMMANDS)
     shared = {
+        "coil.py",
         "measure.py",
         "peers.py",
         "regime_peers.py",
