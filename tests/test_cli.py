@@ -237,30 +237,6 @@ def test_nothing_but_an_older_file_of_its_kind_is_written_over(folder, capsys):
         assert main(arguments) == 0, arguments
 
 
-def test_alarm_rule_that_cannot_be(folder, capsys):
-    assert fitted(folder, "--additive", "noise") == 0
-    capsys.readouterr()
-    for rule in (["--violations", "3", "--window", "2"], ["--margin", "0"], ["--violations", "0"]):
-        said = refused(capsys, ["check", str(folder / "m.model.json"), str(folder / "run.mcap"), *rule])
-        assert "alarm:" in said
-
-
-def test_damaged_model_files(folder, capsys):
-    assert fitted(folder, "--additive", "noise") == 0
-    path = folder / "m.model.json"
-    whole = json.loads(path.read_text())
-    for change, words in (
-        ({"format": "uncertain-lti/9"}, "uncertain-lti/9"),
-        ({"dA": [[-1.0, 0.0], [0.0, 0.0]]}, "dA"),
-        ({"A": [[1.0]]}, "A"),
-        ({"v": [0.0, "x"]}, "v"),
-    ):
-        path.write_text(json.dumps({**whole, **change}))
-        capsys.readouterr()
-        said = refused(capsys, ["check", str(path), str(folder / "run.mcap")])
-        assert words in said and "m.model.json" in said
-
-
 def test_recordings_that_break_readers(recordings, folder, capsys):
     odd = recordings / "odd"
     assert fitted(folder, "--additive", "noise") == 0

@@ -26,7 +26,6 @@ A block is run by its language. Comments above it say more:
 import contextlib
 import html
 import importlib
-import inspect
 import io
 import os
 import re
@@ -43,7 +42,6 @@ import yaml
 from processes import children, own_domain
 
 from uncertain_lti import SignalMap, UncertainLTI
-from uncertain_lti.base.compiled import uncompiled
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.monitor.outputs import OUTPUTS
 
@@ -407,29 +405,3 @@ def read_text(page: Path) -> str:
     """What a page says, without its tags; long dashes as they were typed."""
     text = html.unescape(re.sub(r"<[^>]+>", " ", page.read_text()))
     return text.replace("\u2013", "--")
-
-
-def test_public_docstrings_name_their_arguments():
-    """Every argument of what is public is described under its own name, and no other is."""
-    package = importlib.import_module("uncertain_lti")
-    things = [getattr(package, n) for n in package.__all__]
-    things += [importlib.import_module("uncertain_lti.identification.archive").fit_archive]
-    things += [
-        getattr(importlib.import_module("uncertain_lti.model.interchange"), n) for n in ("to_control", "from_control")
-    ]
-    things += [package.UncertainLTI.bounds, package.Transient.from_dataframe, package.Transient.from_csv]
-    for thing in things:
-        text = inspect.getdoc(thing) or ""
-        if "Parameters\n---" not in text:
-            continue
-        section = re.split(r"\n\w[\w ]*\n-{3,}", text.split("Parameters\n")[1].split("\n", 1)[1])[0]
-        described = set()
-        for line in section.splitlines():
-            if match := re.fullmatch(r"(\*{0,2}\w+(?:, \*{0,2}\w+)*)(?: : .*)?", line):
-                described |= {name.lstrip("*") for name in match[1].split(", ")}
-        if "._" in thing.__module__:  # a compiled class has no signature
-            thing = getattr(
-                uncompiled(thing.__module__.replace("uncertain_lti.", "").replace("._", ".")), thing.__name__
-            )
-        there = set(inspect.signature(thing).parameters) - {"self", "cls"}
-        assert there == described, (thing, there ^ described)

@@ -24,7 +24,7 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.compiled import uncompiled
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model import bounds
-from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for
+from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy
 
 
 def levels(values: list[float], rng: np.random.Generator, count: int = 1000) -> Transient:
@@ -91,10 +91,6 @@ def test_one_sample_and_many_agree_compiled_or_not(size: int, cells: int, seed: 
             *terms, np.zeros(size), np.ones(size), least, greatest, 1.0, np.ones(n, bool), measure.occupied
         )
         assert [judge.judge(row.tolist(), row[:n].tolist(), 0.1).outside_domain for row in z] == expected.tolist()
-
-
-def test_cells_follow_the_number_of_samples() -> None:
-    assert [cells_for(count) for count in (0, 100, 255, 256, 2304, 10**9)] == [0, 0, 0, 4, 12, MOST_CELLS]
 
 
 def a_file(folder: Path) -> tuple[UncertainLTI, dict[str, Any]]:

@@ -16,8 +16,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 
@@ -105,8 +103,3 @@ def test_every_example_is_run_here_and_listed_in_the_documentation():
         if path.suffix in (".py", ".ipynb"):
             assert f'"{path.name}"' in tested
             assert f"examples/{path.name}" in page
-
-
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
-def test_a_script_is_short(path):
-    assert len(path.read_text().splitlines()) <= 90

@@ -82,15 +82,6 @@ def test_every_room_says_what_it_is_for_and_what_it_may_import():
     assert [p.name for p in (ROOT / "core").glob("*.py")] == ["__init__.py"]
 
 
-def test_the_core_knows_no_ros():
-    for path in modules().values():
-        tree = ast.parse(path.read_text())
-        names = [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
-        names += [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
-        tops = {name.split(".")[0] for name in names}
-        assert not tops & {"rclpy", "std_msgs", "sensor_msgs", "uncertain_lti_ros"}, path
-
-
 def test_every_command_has_a_file_and_is_registered():
     from uncertain_lti.cli.command import Command
     from uncertain_lti.cli.main import COMMANDS

@@ -51,13 +51,6 @@ def test_normalisation_is_as_method_section_1_states_it(data: st.DataObject) -> 
     np.testing.assert_allclose(point.recorded_x(deviation), x, rtol=1e-12, atol=1e-9)
 
 
-def test_identity_changes_nothing() -> None:
-    point = OperatingPoint.identity(2, 1)
-    x, u = np.array([1.5, -2.0]), np.array([0.1])
-    assert point.normalise_x(x).tolist() == point.recorded_x(x).tolist() == x.tolist()
-    assert point.normalise_u(u).tolist() == u.tolist()
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
