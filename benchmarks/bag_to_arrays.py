@@ -10,11 +10,8 @@
 """Bags into arrays, side by side with rosbags and mcap-ros2-support (pip install mcap-ros2-support) in one run.
 
 python benchmarks/bag_to_arrays.py most      # a million messages, nearly all of the bag wanted, against both peers
-python benchmarks/bag_to_arrays.py images    # one small topic among large images
-python benchmarks/bag_to_arrays.py eighth    # one topic of eight
 python benchmarks/bag_to_arrays.py memory    # peak memory of a process of its own, by size of the bag
 python benchmarks/bag_to_arrays.py samples   # the whole way to samples (t, x, u), against message by message
-python benchmarks/bag_to_arrays.py bags      # several large bags, in processes side by side and one after the other
 python benchmarks/bag_to_arrays.py all --quick    # everything, a tenth of the size
 
 Recordings are written into --folder, or into one that is thrown away. Peers decode a tenth of the messages (all with
@@ -37,22 +34,8 @@ from pathlib import Path
 
 import numpy as np
 from measure import best, peak_memory, table
-from recorded import (
-    CAMERA,
-    COMPRESSIONS,
-    FRAMES,
-    JAZZY,
-    ROBOT,
-    START_NS,
-    Topic,
-    imu,
-    payloads,
-    pictures,
-    write,
-    write_messages,
-)
+from recorded import COMPRESSIONS, FRAMES, JAZZY, ROBOT, payloads, write
 
-from uncertain_lti.recordings import mcap_batches
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.recordings.mcap_records import crc32
@@ -146,115 +129,21 @@ def most(folder, scale, share):
         size = path.stat().st_size
         mine, columns, (first, second) = against_peers(path, PATHS, count, (rosbags, mcap_ros2), share)
         rows.append(
-            [compression, chunk, frames, f"{size / 1e6:.0f} MB", f"{mine:.2f} s", *shares(path, PATHS)]
+            [compression, chunk, frames, f"{size / 1e6:.0f} MB", f"{mine:.2f} s"]
             + [f"{first / mine:.0f}", f"{second / mine:.0f}", str(columns.alone)]
         )
         keep_or_drop(folder, path)
-    header = ["compression", "chunks", "frame_id", *WHERE, "decoded alone"]
-    table(f"{count} messages: JointState, Odometry, Imu, Float64MultiArray, of each all", header, rows)
-
-
-def images(folder, scale, share):
-    """One small topic among large images: chunks are decompressed for it whole."""
-    number = max(int(1200 * scale), 40)
-    wanted = {"/imu": PATHS["/imu"]}
-    rows = []
-    for compression in COMPRESSIONS:
-        path = folder / f"images_{number}_{compression}.mcap"
-        if not path.exists():
-            topics = (Topic("/imu", "sensor_msgs/msg/Imu", imu), CAMERA)
-            inertial = payloads(topics[0], 10 * number, FRAMES[:1], 1)
-            bundled = [inertial[10 * i : 10 * i + 10] for i in range(number)]
-            write_messages(path, topics, mixed(bundled, pictures(number, 2)), compression)
-        rows.append(where_it_goes(path, wanted, 10 * number, share, [compression]))
-        keep_or_drop(folder, path)
-    table(f"{10 * number} Imu messages among {number} images of 640 x 480", ["compression", *WHERE], rows)
-
-
-def mixed(bundled, shown):
-    """Several small messages, then an image, and so on: time, number of the topic, content."""
-    at = START_NS
-    for several, picture in zip(bundled, shown, strict=True):
-        for data in several:
-            at += 3_000_000
-            yield at, 0, data
-        yield at, 1, picture
-
-
-def eighth(folder, scale, share):
-    """One topic of eight that are alike."""
-    count = int(1e6 * scale) // 8
-    topics = [Topic(f"{topic.name}{more}", topic.type, topic.make) for more in ("", "_2") for topic in ROBOT]
-    wanted = {"/imu": PATHS["/imu"]}
-    rows = []
-    for compression in COMPRESSIONS:
-        path = folder / f"eight_{count}_{compression}.mcap"
-        if not path.exists():
-            streams = [payloads(topic, count, FRAMES[:1], seed) for seed, topic in enumerate(topics)]
-            write(path, topics, streams, compression)
-        rows.append(where_it_goes(path, wanted, count, share, [compression]))
-        keep_or_drop(folder, path)
-    table(f"{count} Imu messages of {8 * count} messages of eight topics", ["compression", *WHERE], rows)
-
-
-WHERE = ["file", "ours", "reading the file", "decompression", "checksums", "the rest"]
-WHERE += ["× faster than rosbags", "× faster than mcap-ros2-support"]
-
-
-def where_it_goes(path, paths, count, share, begin):
-    """A row with the parts of the time."""
-    mine, _, (first, second) = against_peers(path, paths, count, (rosbags, mcap_ros2), share)
-    return [
-        *begin,
-        f"{path.stat().st_size / 1e6:.0f} MB",
-        f"{mine:.3f} s",
-        *shares(path, paths),
-        f"{first / mine:.0f}",
-        f"{second / mine:.0f}",
+    header = [
+        "compression",
+        "chunks",
+        "frame_id",
+        "file",
+        "ours",
+        "× faster than rosbags",
+        "× than mcap-ros2-support",
+        "decoded alone",
     ]
-
-
-def shares(path, paths):
-    """Shares of the time of one run without reading ahead, as text."""
-    with clocked() as parts:
-        began = time.perf_counter()
-        ours(path, paths)
-        whole = time.perf_counter() - began
-    rest = whole - sum(parts.values())
-    return [f"{100 * part / whole:.0f} %" for part in (*parts.values(), rest)]
-
-
-@contextlib.contextmanager
-def clocked():
-    """Time spent in the parts of loading a block, s, where nothing is read ahead, so that they add up."""
-    parts = dict.fromkeys(("read", "inflate", "sum"), 0.0)
-
-    def timed(part, function):
-        def run(*arguments):
-            began = time.perf_counter()
-            result = function(*arguments)
-            parts[part] += time.perf_counter() - began
-            return result
-
-        return run
-
-    class Stream:
-        def __init__(self, stream):
-            self.seek, self.readinto = stream.seek, timed("read", stream.readinto)
-
-    loader = mcap_batches._Loader
-    made, inflate, together, ahead = loader.__init__, loader._inflate, loader._inflate_together, mcap_batches._AHEAD
-
-    def make(self, contents, stream):
-        made(self, contents, Stream(stream))
-
-    loader.__init__, loader._inflate, mcap_batches.crc32 = make, timed("inflate", inflate), timed("sum", crc32)
-    loader._inflate_together, mcap_batches._AHEAD = timed("inflate", together), 0
-    try:
-        yield parts
-    finally:
-        loader.__init__, loader._inflate, mcap_batches.crc32 = made, inflate, crc32
-        loader._inflate_together, mcap_batches._AHEAD = together, ahead
+    table(f"{count} messages: JointState, Odometry, Imu, Float64MultiArray, of each all", header, rows)
 
 
 def memory(folder, scale, share):
@@ -301,7 +190,7 @@ def samples(folder, scale, share):
     reading, stream = best(lambda: read_stream(Bag(path, indexed=True), signals))
     sampling, _ = best(lambda: sample(stream, signals))
     alone, slow = best(lambda: sample_by_message(stream, signals), 1)
-    assert (slow.t_ns.tobytes(), slow.x.tobytes(), slow.u.tobytes()) == (
+    assert (slow.t_ns.tobytes(), slow.x.tobytes(), slow.held.tobytes()) == (
         transient.t_ns.tobytes(),
         transient.x.tobytes(),
         transient.u.tobytes(),
@@ -310,25 +199,6 @@ def samples(folder, scale, share):
     header = ["read_transients", "reading", "sampling", "message by message", "× faster"]
     table(f"{len(stream.topic)} messages of three topics into {len(transient)} samples", header, rows)
     keep_or_drop(folder, path)
-
-
-def bags(folder, scale, share):
-    """Several large recordings: processes side by side."""
-    count = int(1e6 * scale)
-    source = recording(folder, count, "zstd", "768 KiB", "one")
-    paths = []
-    for number in range(4):
-        paths.append(folder / f"run{number}_of_robot.mcap")
-        if not paths[-1].exists():
-            os.link(source, paths[-1])
-    alone, one = best(lambda: read_transients(paths, robot(), processes=1), 2)
-    beside, two = best(lambda: read_transients(paths, robot()), 2)
-    assert all(a.x.tobytes() == b.x.tobytes() and a.u.tobytes() == b.u.tobytes() for a, b in zip(one, two, strict=True))
-    rows = [[f"{alone:.2f} s", f"{beside:.2f} s", f"{alone / beside:.2f}"]]
-    table(f"Four bags of {count} messages", ["one process", f"{os.cpu_count()} cores", "× faster"], rows)
-    for path in paths:
-        path.unlink()
-    keep_or_drop(folder, source)
 
 
 KEEP = False
@@ -344,7 +214,7 @@ def main():
     """One command per claim."""
     if sys.argv[1:2] == ["peak"]:
         return peak(sys.argv[2])
-    commands = {f.__name__: f for f in (most, images, eighth, memory, samples, bags)}
+    commands = {f.__name__: f for f in (most, memory, samples)}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("claims", nargs="+", choices=[*commands, "all"])
     parser.add_argument("--quick", action="store_true", help="a tenth of the size")

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,33 +109,6 @@ def commands(frame: str) -> Any:
     return message("std_msgs/msg/Float64MultiArray", layout=layout, data=_sentinels(12))
 
 
-def camera(frame: str) -> Any:
-    """640 x 480 in colour; what it shows is put in by `pictures`."""
-    return message(
-        "sensor_msgs/msg/Image",
-        header=_header(frame),
-        height=480,
-        width=640,
-        encoding="rgb8",
-        is_bigendian=0,
-        step=1920,
-        data=np.zeros(640 * 480 * 3, np.uint8),
-    )
-
-
-def pictures(count: int, seed: int) -> list[bytes]:
-    """Encoded images: a moving slope of colour with the noise of a sensor above a dark floor."""
-    noise = np.random.default_rng(seed)
-    plain = bytes(JAZZY.serialize_cdr(camera("camera"), CAMERA.type))
-    head = plain[: len(plain) - 640 * 480 * 3]
-    grain = noise.integers(0, 8, (8, 480 * 1920), dtype=np.uint8)
-    slope = np.add.outer(np.arange(480), np.arange(1920) // 3) // 4
-    lit = np.repeat(np.arange(480) < 240, 1920)
-    return [
-        head + (((slope + i).ravel().astype(np.uint8) + grain[noise.integers(8)]) * lit).tobytes() for i in range(count)
-    ]
-
-
 START_NS = 1_700_000_000_000_000_000
 ROBOT = (
     Topic("/joint_states", "sensor_msgs/msg/JointState", joint_state),
@@ -143,7 +116,6 @@ ROBOT = (
     Topic("/imu", "sensor_msgs/msg/Imu", imu),
     Topic("/commands", "std_msgs/msg/Float64MultiArray", commands),
 )
-CAMERA = Topic("/camera", "sensor_msgs/msg/Image", camera)
 
 
 def payloads(topic: Topic, count: int, frames: Sequence[str], seed: int) -> list[bytes]:
@@ -179,33 +151,18 @@ def write(
     step_ns: int = 1_000_000,
 ) -> Path:
     """One message of each topic in turn as long as it has some, and a step of time until the next turn."""
-    return write_messages(path, topics, _in_turn(streams, step_ns), compression, chunk_size)
-
-
-def write_messages(
-    path: Path,
-    topics: Sequence[Topic],
-    messages: Iterable[tuple[int, int, bytes]],
-    compression: str = "zstd",
-    chunk_size: int = 768 << 10,
-) -> Path:
-    """Messages in order: time in ns, number of the topic among `topics`, content."""
-    with open(path, "wb") as stream:
-        writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
+    with open(path, "wb") as file:
+        writer = Writer(file, chunk_size=chunk_size, compression=COMPRESSIONS[compression])
         writer.start(profile="ros2", library="benchmark")
         channels = []
         for topic in topics:
             text = JAZZY.generate_msgdef(topic.type, ros_version=2)[0]
             schema = writer.register_schema(topic.type, "ros2msg", text.encode())
             channels.append(writer.register_channel(topic.name, "cdr", schema))
-        for time, number, data in messages:
-            writer.add_message(channels[number], time, data, time)
+        for i in range(max(map(len, streams))):
+            for number, stream in enumerate(streams):
+                if i < len(stream):
+                    time = START_NS + i * step_ns + number * 1000
+                    writer.add_message(channels[number], time, stream[i], time)
         writer.finish()
     return path
-
-
-def _in_turn(streams: Sequence[Sequence[bytes]], step_ns: int) -> Iterator[tuple[int, int, bytes]]:
-    for i in range(max(map(len, streams))):
-        for number, stream in enumerate(streams):
-            if i < len(stream):
-                yield START_NS + i * step_ns + number * 1000, number, stream[i]
