@@ -9,11 +9,9 @@
 
 """Metadata and layout of the package, read by pip and by colcon; tool settings are in pyproject.toml."""
 
-import runpy
-import sys
+import os
 from pathlib import Path
 from xml.etree import ElementTree
-from zlib import crc32
 
 from setuptools import Extension, find_packages, setup
 
@@ -34,37 +32,35 @@ def share(folder: str) -> list[tuple[str, list[str]]]:
     return list(by_folder.items())
 
 
+COMPILED = {
+    "kernel.arithmetic": "-O3",  # its loops are vectorised
+    "monitor.envelope_monitor": "-O1",
+    "monitor.intake": "-O1",
+    "monitor.sender": "-O1",
+    "monitor.stream": "-O1",
+    "monitor.verdict": "-O1",
+    "monitor.verdict_messages": "-O1",
+    "recordings.message_reader": "-O2",
+    "sampling.sampler": "-O2",
+}
+"""Modules that are compiled, and how: the kernel, and typed Python of the live chain."""
+
+
 def compiled() -> list[Extension]:
-    """The modules of the live chain as C extensions, from the files that run uncompiled; none without Cython 3.
+    """The modules in `COMPILED`, all of them required.
 
-    Each is optional: without a C compiler or Python's headers, or where compiling fails, Python runs the same files.
-    Contraction of a * b + c is off, so that both give the same bits.
+    Contraction of a * b + c is off, so that every machine gives the same bits.
     """
-    try:
-        from Cython import __version__
-        from Cython.Build import cythonize
+    from Cython.Build import cythonize
 
-        if int(__version__.split(".")[0]) < 3:
-            return []
-        extensions = []
-        for dotted in runpy.run_path(str(ROOT / "core/base/compiled.py"))["MODULES"]:
-            room, name = dotted.split(".")
-            source = (ROOT / "core" / room / f"{name}.py").read_bytes()
-            copy = Path("build/compiled") / room / f"_{name}.py"
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            text = source + f"\nSOURCE = {crc32(source)}\n".encode()
-            if not copy.exists() or copy.read_bytes() != text:
-                copy.write_bytes(text)
-            arguments = ["-O3", "-ffp-contract=off"]
-            extensions.append(Extension(f"uncertain_lti.{room}._{name}", [str(copy)], extra_compile_args=arguments))
-        directives = {"language_level": 3, "boundscheck": True, "wraparound": True, "binding": True}
-        extensions = cythonize(extensions, compiler_directives=directives, quiet=True)
-    except Exception as error:  # a compiler of another kind fails in its own way, and must not end an installation
-        print(f"not compiled, so the live chain runs in Python: {error!r}", file=sys.stderr)
-        return []
-    for extension in extensions:
-        extension.optional = True  # cythonize drops it
-    return extensions
+    extensions = []
+    for dotted, level in COMPILED.items():
+        path = Path("core", *dotted.split("."))
+        source = next(str(path.with_suffix(end)) for end in (".pyx", ".py") if (ROOT / path).with_suffix(end).exists())
+        arguments = [level, "-g0", "-ffp-contract=off"]
+        extensions.append(Extension(f"uncertain_lti.{dotted}", [source], extra_compile_args=arguments))
+    found: list[Extension] = cythonize(extensions, build_dir="build/cython", language_level=3, quiet=True)
+    return found
 
 
 extras = {
@@ -115,6 +111,7 @@ setup(
     package_dir=CORE,
     package_data={
         "uncertain_lti": ["py.typed"],
+        "uncertain_lti.kernel": ["*.pxi", "*.pyi", "*.pyx"],
         "uncertain_lti.plants": ["*.json"],
         "uncertain_lti.reports": ["assets/*"],
         NAME: ["*.xml"],
@@ -127,6 +124,7 @@ setup(
         *share("launch"),
     ],
     ext_modules=compiled(),
+    options={"build_ext": {"parallel": os.cpu_count()}},
     zip_safe=False,
     install_requires=["lz4", "mcap", "numpy>=1.26", "PyYAML", "rosbags", "tqdm", "zstandard"],
     extras_require=extras,

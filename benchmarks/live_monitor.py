@@ -471,11 +471,11 @@ class Run:
         return self.child(__file__, "--part", *arguments)
 
     def monitor(self, folder: str, which: str = "", armed: bool = False) -> Child:
-        """The monitor of this checkout, or of the other one; `which` may name "before" and "uncompiled"."""
+        """The monitor of this checkout, or of the other one; `which` may name "before"."""
         path = Path(folder) / MODEL
         save_model(path, self.n, self.rate, armed)
         code = "import sys; from uncertain_lti_ros.envelope_monitor import main; sys.exit(main())"
-        environment = {"UNCERTAIN_LTI_PURE_PYTHON": "yes"} if "uncompiled" in which else {}
+        environment: dict[str, str] = {}
         if "before" in which:
             checkout = str(Path(self.before).resolve() / "tests" / "checkout")
             environment["PYTHONPATH"] = os.pathsep.join(filter(None, [checkout, os.environ.get("PYTHONPATH")]))
@@ -533,8 +533,7 @@ class Run:
 
 BARE = "bare, default executor", "bare, events executor"
 VERSIONS = {
-    f"{when}{how}, {heard}": ("monitor", f"{when}{how}", outputs)
-    for how in ("", " uncompiled")
+    f"{when}, {heard}": ("monitor", when, outputs)
     for when in ("before", "now")
     for heard, outputs in (("all outputs heard", TOPICS), ("~/violation heard", ["violation"]))
 }
@@ -618,7 +617,7 @@ def compare_versions(before: str, rates: list[float], sizes: list[int], seconds:
                     each = ours / theirs
                     rows.append(
                         [
-                            f"{n}", f"{rate:g}", name.removeprefix("now").strip(" ,") or "compiled",
+                            f"{n}", f"{rate:g}", name.removeprefix("now").strip(" ,"),
                             f"{np.median(theirs):.0f}", f"{np.median(ours):.0f}", f"{np.median(each):.2f}",
                             f"{each.min():.2f} to {each.max():.2f}",
                         ]

@@ -14,6 +14,8 @@ live monitor never loads a solver, a plotting library or a bag reader.
 """
 
 from importlib import import_module
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -28,6 +30,12 @@ if TYPE_CHECKING:
     from uncertain_lti.validation.fitted_model import validate as validate
 
 __version__ = "0.2.0"
+
+if not any((Path(__file__).parent / f"kernel/arithmetic{ending}").exists() for ending in EXTENSION_SUFFIXES):
+    raise ImportError(
+        "uncertain_lti is not compiled for this Python; install a wheel, or a C compiler and Python's headers and say "
+        "`pip install -e .` where its setup.py is"
+    )
 
 _HOME = {
     "EnvelopeMonitor": "monitor.envelope_monitor",

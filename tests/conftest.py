@@ -42,7 +42,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # What another numpy can change: values, layouts, conversions and their refusals.
 _NUMPY = """
-    bag cdr_arrays compiled fuzz interchange event_log live mcap_batches model monitor operating_point reading sampler
+    bag cdr_arrays kernel node_stream fuzz
+    interchange event_log live mcap_batches model monitor operating_point reading sampler
     sampler_arrays signals transient
 """.split()
 

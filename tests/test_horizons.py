@@ -21,11 +21,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
-from uncertain_lti.base import compiled
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.bounds import lower_of, normalised, upper_of
+from uncertain_lti.kernel.arithmetic import edges
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Horizon, Run
+from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.monitor.foreseen import Foreseen
@@ -140,9 +140,8 @@ def test_format_1_has_no_horizons() -> None:
         UncertainLTI.from_dict(data)
 
 
-# --- the same bits live and offline, compiled or not --------------------------------------------------------------
+# --- the same bits live and offline -------------------------------------------------------------------------------
 
-PURE = compiled.uncompiled("model.bounds")
 TICK = 10_000_000  # ns
 GEAR = Axis("gear", modes=(1.0, 2.0))
 SCHEDULES = [None, SPEED, Schedule((GEAR,)), Schedule((SPEED.axes[0], GEAR))]
@@ -186,13 +185,6 @@ def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
     return model, transient, pushed
 
 
-def pure() -> pytest.MonkeyPatch:
-    patch = pytest.MonkeyPatch()
-    for name in ("Judge", "Runs"):
-        patch.setattr(f"uncertain_lti.model.uncertain_lti.{name}", getattr(PURE, name))
-    return patch
-
-
 @settings(max_examples=60, deadline=None)
 @given(streams())
 def test_a_stream_has_the_utilisations_of_its_transient(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
@@ -201,12 +193,6 @@ def test_a_stream_has_the_utilisations_of_its_transient(case: tuple[UncertainLTI
     whole = EnvelopeMonitor(model).check(transient).horizon_utilisation
     again = live(model, steps)
     assert again.tobytes() == whole.tobytes()
-    patch = pure()
-    try:
-        assert live(model, steps).tobytes() == whole.tobytes()
-        assert EnvelopeMonitor(model).check(transient).horizon_utilisation.tobytes() == whole.tobytes()
-    finally:
-        patch.undo()
 
 
 def live(model: UncertainLTI, steps: list[Step]) -> Any:
@@ -300,20 +286,12 @@ def test_what_is_foreseen_is_judged_when_the_longest_horizon_ends() -> None:
 @settings(max_examples=30, deadline=None)
 @given(streams())
 def test_what_is_foreseen_is_the_envelope_if_nothing_changes(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
-    """By the bits of the arrays, compiled or not; and what is judged does not depend on what was foreseen."""
+    """By the bits of the arrays; and what is judged does not depend on what was foreseen."""
     model, transient, steps = case
     whole = EnvelopeMonitor(model).check(transient).horizon_utilisation
     ahead = [expected_ahead(model, step) for step in steps[:20]]
     found = foreseen(model, steps, whole)
     assert [None if one is None else (one.lower.tobytes(), one.upper.tobytes()) for one in found] == ahead
-    patch = pure()
-    try:
-        other = foreseen(model, steps, whole)
-    finally:
-        patch.undo()
-    for one, two in zip(found, other, strict=True):
-        assert (one is None) == (two is None)
-        assert one is None or two is None or one.packed() == two.packed()
 
 
 def foreseen(model: UncertainLTI, steps: list[Step], whole: Any) -> list[Foreseen | None]:
@@ -335,7 +313,7 @@ def expected_ahead(model: UncertainLTI, step: Step) -> tuple[bytes, bytes] | Non
     if not np.isfinite(z).all() or not model.regime(z)[0].all():
         return None
     *_, (_, centre, half) = model.envelopes(np.arange(count), z, np.full(count, 0.01))
-    lower, upper = (point.recorded_x(of(centre[:, 0], half[:, 0], 1.5)) for of in (lower_of, upper_of))
+    lower, upper = (point.recorded_x(bound) for bound in edges(centre[:, 0], half[:, 0], 1.5))
     return (lower.tobytes(), upper.tobytes()) if np.isfinite([lower, upper]).all() else None
 
 
@@ -365,9 +343,4 @@ def test_on_the_edge_of_an_envelope_the_comparison_decides_not_the_quotient(sche
             for k, (status, t_ns) in enumerate(zip(there.statuses(), there.t_ns, strict=True))
         ]
         assert live(model, steps)[last, 1].tobytes() == found.tobytes()
-        patch = pure()
-        try:
-            assert live(model, steps)[last, 1].tobytes() == found.tobytes()
-        finally:
-            patch.undo()
     assert off, "no quotient is off here, so this shows nothing"

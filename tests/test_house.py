@@ -18,8 +18,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = (
-    "base", "signals", "recordings", "sampling", "model", "monitor", "identification", "validation", "proposal",
-    "reports", "plants", "cli",
+    "base", "kernel", "signals", "recordings", "sampling", "model", "monitor", "identification", "validation",
+    "proposal", "reports", "plants", "cli",
 )  # fmt: skip
 """In order: a room imports from itself and from those before it."""
 

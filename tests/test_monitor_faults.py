@@ -41,7 +41,7 @@ from uncertain_lti.sampling.status import Status
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-import test_compiled as compiled_cases
+import test_node_stream as stream_cases
 from geometry_msgs.msg import Vector3Stamped
 from processes import own_domain
 from rclpy.duration import Duration
@@ -52,7 +52,6 @@ from ros_processes import Diagnostics, World, open_world, until
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt8
 from std_srvs.srv import Trigger
-from test_compiled import ros as ros
 from test_live import (
     CONTROL,
     EPOCH_NS,
@@ -75,6 +74,7 @@ from test_live import (
     stamp_of,
     vector,
 )  # fmt: skip
+from test_node_stream import ros as ros
 
 NODE = "/envelope_monitor"
 
@@ -346,16 +346,16 @@ def test_errors_that_nobody_foresaw_are_counted_told_and_outlived(world: World, 
     """The judging and the reporting are made to fail now and then, and a timer fails past every guard."""
     model = by_hand()
     code = """
-import os, sys
-os.environ["UNCERTAIN_LTI_PURE_PYTHON"] = "1"  # compiled code would judge most of the samples
-from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
+import sys
+from uncertain_lti.monitor import live_rule
 from uncertain_lti_ros import envelope_monitor
-judge, report, count = EnvelopeMonitor.judge, envelope_monitor.EnvelopeMonitorNode.report, [0, 0]
-def judging(*args, **named):
-    count[0] += 1
-    if count[0] % 10 == 0:
-        raise ZeroDivisionError("every tenth")
-    return judge(*args, **named)
+report, count = envelope_monitor.EnvelopeMonitorNode.report, [0, 0]
+class Judging(live_rule.EnvelopeMonitor):
+    def judge(self, *args, **named):
+        count[0] += 1
+        if count[0] % 10 == 0:
+            raise ZeroDivisionError("every tenth")
+        return super().judge(*args, **named)
 def reporting(node):
     count[1] += 1
     if count[1] == 5:
@@ -363,7 +363,7 @@ def reporting(node):
     if count[1] % 7 == 0:
         raise KeyError("every seventh")
     return report(node)
-EnvelopeMonitor.judge = judging
+live_rule.EnvelopeMonitor = Judging
 envelope_monitor.EnvelopeMonitorNode.report = reporting
 sys.exit(envelope_monitor.main())
 """
@@ -495,8 +495,8 @@ class Sends:
         its_module = sys.modules[Sender.__module__]
         clock = SimpleNamespace(monotonic=lambda: self.now, thread_time=lambda: self.used)
         monkeypatch.setattr(its_module, "time", clock)
-        self.model = compiled_cases.saved(tmp_path / "m.json", 2, np.random.default_rng(5))
-        self.node = compiled_cases.Node(tmp_path / "m.json")
+        self.model = stream_cases.saved(tmp_path / "m.json", 2, np.random.default_rng(5))
+        self.node = stream_cases.Node(tmp_path / "m.json")
         self.sender = self.node.outputs.sender
         self.sent: Counter[str] = Counter()
         self.alarms = [False]
@@ -515,7 +515,7 @@ class Sends:
 
     def run(self, messages: int, step: float = 5e-4) -> int:
         """Verdicts on so many messages; each change of the alarm is published at once."""
-        for arrival, topic, data in compiled_cases.stream(self.model, np.random.default_rng(6), messages, 0.1):
+        for arrival, topic, data in stream_cases.stream(self.model, np.random.default_rng(6), messages, 0.1):
             self.now += step
             self.node.arrive(arrival, topic, data)
             assert self.alarms[-1] == self.node.session.alarm
@@ -544,7 +544,7 @@ def test_a_subscriber_that_stands_still_costs_outputs_and_no_verdict(
     for output in sends.node.outputs.publishers.values():
         output.listeners = 0
     assert not sends.sender.problems, "nobody listens that could stand still"
-    compiled_cases.end([sends.node])
+    stream_cases.end([sends.node])
 
 
 def test_a_stopped_reader_of_one_output_costs_the_readers_of_others_nothing(
@@ -555,7 +555,7 @@ def test_a_stopped_reader_of_one_output_costs_the_readers_of_others_nothing(
     verdicts = sends.run(4000)
     assert sends.sent["upper"] == verdicts > 1000 > sends.sent["lower"]
     assert sends.sent["flags"] >= verdicts and "~/lower stands still" in sends.sender.problems[0]
-    compiled_cases.end([sends.node])
+    stream_cases.end([sends.node])
 
 
 def test_a_busy_processor_is_no_reader_that_stands_still(
@@ -566,7 +566,7 @@ def test_a_busy_processor_is_no_reader_that_stands_still(
     sends.sending = dict.fromkeys(sends.node.outputs.publishers, (2e-5, 2e-3))
     verdicts = sends.run(2000)
     assert sends.sent["lower"] == verdicts > 500 and sends.sender.held_back == 0 and not sends.sender.problems
-    compiled_cases.end([sends.node])
+    stream_cases.end([sends.node])
 
 
 _LISTENS = """

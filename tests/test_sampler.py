@@ -22,8 +22,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti.base.compiled import uncompiled
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.sampling import sampler as sampler_module
 from uncertain_lti.sampling.instants import median_step_ns, to_ns
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, Sampler, Step
@@ -722,14 +722,13 @@ def test_what_has_been_forgotten_is_missing_and_not_replaced_by_something_older(
 @given(case=cases() | cases(tame=True), room=st.integers(4, 8))
 def test_little_room_makes_values_missing_and_never_wrong(case: tuple[SignalMap, list[Sent]], room: int) -> None:
     signals, messages = case
-    module = uncompiled("sampling.sampler")  # whose limits can be set
-    module.KEPT_OVER_A_JUMP = 0  # else others are kept
-    module.BUFFERED_MESSAGES = room
-    sampler = module.Sampler(signals)
-    cramped = [sampler.push(*message) for message in messages]
-    assert all(len(sampler.kept(topic)) <= room for topic in signals.topics)
-    module.BUFFERED_MESSAGES = 10_000
-    sampler = module.Sampler(signals)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sampler_module, "KEPT_OVER_A_JUMP", 0)  # else others are kept
+        patch.setattr(sampler_module, "BUFFERED_MESSAGES", room)
+        sampler = Sampler(signals)
+        cramped = [sampler.push(*message) for message in messages]
+        assert all(len(sampler.kept(topic)) <= room for topic in signals.topics)
+    sampler = Sampler(signals)
     roomy = [sampler.push(*message) for message in messages]
     for mine, theirs in zip(only(cramped), only(roomy), strict=True):
         assert (mine.t_ns, mine.arrival_ns) == (theirs.t_ns, theirs.arrival_ns)

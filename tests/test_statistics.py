@@ -7,24 +7,21 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Statistics over a window: their formulas, live as offline, compiled as uncompiled."""
+"""Statistics over a window: their formulas, live as offline."""
 
 from array import array
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-from uncertain_lti.base import compiled
 from uncertain_lti.identification import fit
+from uncertain_lti.kernel import arithmetic
+from uncertain_lti.kernel.arithmetic import LIMIT, Statistic, Statistics, some_beyond
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, PER_STATE, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals
-from uncertain_lti.monitor import statistics
-from uncertain_lti.monitor.statistics import LIMIT, Statistic, Statistics
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.reports.model_text import model_text
@@ -117,9 +114,8 @@ def test_several_take_their_parts_of_one_table_and_refuse_one_that_is_too_short(
         every.push(1.0, array("d", [0.0] * 5))
 
 
-@pytest.mark.parametrize("source", [statistics, compiled.uncompiled("monitor.statistics")], ids=["used", "uncompiled"])
-def test_one_number_beyond_a_limit_is_enough_and_none_at_all_is_no_verdict(source: Any) -> None:
-    places, nan, beyond = array("q", [1, 3]), float("nan"), source.some_beyond
+def test_one_number_beyond_a_limit_is_enough_and_none_at_all_is_no_verdict() -> None:
+    places, nan, beyond = array("q", [1, 3]), float("nan"), some_beyond
     assert beyond(array("d", [9.0, -1.0, 9.0, 1.0]), places, 1.0) == 0
     assert beyond(array("d", [0.0, 0.0, 0.0, -1.5]), places, 1.0) == 1
     assert beyond(array("d", [0.0, nan, 0.0, 1.0]), places, 1.0) == 0
@@ -127,26 +123,6 @@ def test_one_number_beyond_a_limit_is_enough_and_none_at_all_is_no_verdict(sourc
     assert beyond(array("d", [0.0, nan, 0.0, nan]), places, 1.0) == -1
     with pytest.raises(ValueError, match="do not fit"):
         beyond(array("d", [0.0, 0.0, 0.0]), places, 1.0)
-
-
-@given(st.sampled_from(KINDS), st.integers(1, 4), st.integers(0, 10_000), st.sampled_from([1e-4, 0.03, 0.5, 1e6]))
-def test_compiled_gives_the_bits_of_uncompiled(kind: str, n: int, seed: int, window: float) -> None:
-    if statistics.Statistic.__module__ != "uncertain_lti.monitor._statistics":
-        pytest.skip("the statistics are not compiled here")
-    rng = np.random.default_rng(seed)
-    n = min(n, 3)
-    dt = rng.choice([0.001, 0.01, 0.0125, 0.3], 300) * rng.choice([1.0, 1 + 1e-7])
-    rows = rng.normal(size=(300, n)) * 10.0 ** rng.integers(-3, 4)
-    rows[rng.random(300) < 0.05] = np.nan
-    found = []
-    for source in (statistics, compiled.uncompiled("monitor.statistics")):
-        made = source.Statistic(
-            KINDS.index(kind), n, window, [0.7] * (1 if kind in JOINT else n), [True] * n,
-            0.1, MEAN[:n], Residuals(MEAN[:n], C[:n, :n]).whitening([True] * n),
-        )  # fmt: skip
-        alarm, values = made.push_all(dt, rows)
-        found.append((alarm.tobytes(), values.tobytes()))
-    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("kind", ["energy", "mean", "chi2"])
@@ -357,7 +333,7 @@ def test_rules_of_a_monitor_take_the_place_of_the_models() -> None:
 
 def test_kinds_are_numbered_in_the_order_of_the_rules() -> None:
     for number, name in enumerate(KINDS):
-        assert getattr(statistics, name.upper()) == number
+        assert getattr(arithmetic, name.upper()) == number
     assert (*PER_STATE, *JOINT) == KINDS
 
 

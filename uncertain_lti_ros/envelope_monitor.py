@@ -28,7 +28,6 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from uncertain_lti.base.compiled import why_not
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.arming import Condition
 from uncertain_lti.monitor.event_log import EventLog
@@ -567,10 +566,7 @@ def _run(args: list[str]) -> int:
     with living(EnvelopeMonitorNode, args) as life:
         node = life.node
         assert isinstance(node, EnvelopeMonitorNode)
-        python = why_not()
-        node.get_logger().info(
-            f"runs on the {life.executor_name}, " + (f"in Python throughout: {python}" if python else "compiled")
-        )
+        node.get_logger().info(f"runs on the {life.executor_name}")
         if node.get_parameter("autostart").value:
             node.start()
             if not node.active and node.settings.value("required"):

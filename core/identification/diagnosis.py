@@ -25,7 +25,7 @@ from uncertain_lti.identification.excitation import quoted as _list
 from uncertain_lti.identification.noise import Memory, memory
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.model.bounds import recorded
+from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 

@@ -24,7 +24,7 @@ from uncertain_lti.identification.cells import Cells, Whole
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.problem import Block, Partition, Problem
 from uncertain_lti.identification.products import gram_of, product
-from uncertain_lti.model.bounds import cell_of, cells_per_unit, pairs_of, utilisation_of
+from uncertain_lti.kernel.arithmetic import occupy, pair_count, utilisations
 
 
 @dataclass
@@ -178,14 +178,9 @@ def occupied(partition: Partition, least: Array, greatest: Array, cells: int, st
     `least` (p,): least z of all data; `greatest` (p,): greatest z of all data; Returns (pairs, cells, cells): true if
     one lies in the cell.
     """
-    first, second = pairs_of(partition.p)
-    found = np.zeros((len(first), cells, cells), dtype=bool)
-    per_unit = cells_per_unit(least, greatest, cells)
-    begin, per_unit = least[:, None], per_unit[:, None]
-    place = np.hstack([cell_of(block.z[:, ::stride], begin, per_unit, cells - 1) for block in partition.blocks()])
-    row = place * cells
-    for cell, i, j in zip(found.reshape(len(first), -1), first, second, strict=True):
-        cell[row[i] + place[j]] = True
+    found = np.zeros((pair_count(partition.p), cells, cells), dtype=bool)
+    for block in partition.blocks():
+        occupy(block.z[:, ::stride], least, greatest, found)
     return found
 
 
@@ -704,7 +699,7 @@ def envelope_sums(part: Partition, model: Envelope, stride: int) -> tuple[Array,
         else:
             centre, half = _centre_and_half(model, block)
             left = block.x_next - centre
-            r = np.asarray(utilisation_of(left, half))
+            r = utilisations(left, half)
         for i, values in enumerate((r, left)):
             total[i] += values.sum(axis=1)
             products[i] += gram_of(values, values)

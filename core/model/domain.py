@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.bounds import outside, pairs_of, visited
+from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Occupancy:
 
     A box holds every level between two that were fitted, and every jump from one level to another; a grid does not.
 
-    `cells`: cells per range; `occupied` (pairs, cells, cells): pairs as in `bounds.pairs_of`; a cell is true if a
+    `cells`: cells per range; `occupied` (pairs, cells, cells): pairs 01, 02, 12, ... of signals; a cell is true if a
     fitted sample lies in it or in one next to it.
     """
 
@@ -105,7 +105,7 @@ class Occupancy:
             raise ModelError(
                 f"field 'domain.measure.cells' is {reprlib.repr(cells)}; it must be a whole number, 2 to 64"
             )
-        shape = (len(pairs_of(size)[0]), cells, cells)
+        shape = (pair_count(size), cells, cells)
         try:
             packed = np.frombuffer(b64decode(text, validate=True), dtype=np.uint8)
         except (TypeError, ValueError):
@@ -155,7 +155,6 @@ class Domain:
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
         lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         z = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (x, u)], axis=-1)
-        left = np.asarray(outside(z, self.least, self.greatest).any(axis=-1))
-        if self.measure is not None:
-            left = left | ~visited(z, self.least, self.greatest, self.measure.occupied)
-        return left
+        occupied = None if self.measure is None else self.measure.occupied
+        left: NDArray[np.bool_] = outside_domain(z.reshape(-1, z.shape[-1]), self.least, self.greatest, occupied)
+        return left.reshape(lead)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, refuse_other
-from uncertain_lti.model.sums import blended
+from uncertain_lti.kernel.arithmetic import blended
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Recalled
 

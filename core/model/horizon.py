@@ -33,18 +33,17 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.bounds import Judge, centre_and_half
+from uncertain_lti.kernel.arithmetic import Judge, centre_and_half
 from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Schedule
-from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, blocks_of, checked, regressors, tables
+from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, blocks_of, checked, tables
 
 Widths = Literal["growing", "constant"]
 """Half-widths that grow with |x| and |u|, or are the same everywhere."""
 MOST_STEPS = 10_000
 """Steps of a horizon at most: so many runs are under way at a time."""
 _OF_RUN = ("A", "B", "c")
-_PRODUCTS = 65536  # per block: they stay in the cache
 
 
 @dataclass(frozen=True)
@@ -244,15 +243,10 @@ class Horizon:
         """
         n, columns = self.tables[0].shape[-2:]
         m = columns - n - 1
-        size = max(1, _PRODUCTS // (n * columns))
-        for first in range(0, len(time), size):
-            part = slice(first, first + size)
-            phi = regressors(z[:n, part], z[n : n + m, part])
-            places, weights = (None, None) if schedule is None else schedule.corners(z[n + m :, part])
-            with np.errstate(over="ignore", invalid="ignore"):  # an unstable model runs away
-                centre[:, part], half[:, part] = centre_and_half(
-                    *self.tables, phi, time[part], places, weights, base[:, part]
-                )
+        if schedule is None:
+            centre_and_half(self.tables, z[: n + m], time, centre, half, base=base)
+        else:
+            centre_and_half(self.tables, z[: n + m], time, centre, half, schedule.table, z[n + m :], base)
 
     def to_dict(self) -> dict[str, Any]:
         """As it is in a model file."""

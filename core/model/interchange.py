@@ -24,7 +24,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.model.bounds import normalised
+from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.signals.signal_map import Signal, SignalMap

@@ -13,14 +13,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import TransientError
-from uncertain_lti.model.bounds import normalised, recorded
 from uncertain_lti.signals.signal_map import Signal
+
+
+def normalised(value: Any, steady: Any, scale: Any) -> Any:
+    """Deviation from the steady state, without dimension."""
+    return (value - steady) / scale
+
+
+def recorded(value: Any, steady: Any, scale: Any) -> Any:
+    """Deviation in recorded units: the inverse of `normalised`."""
+    return steady + scale * value
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
-from uncertain_lti.model.bounds import lower_of, upper_of
+from uncertain_lti.kernel.arithmetic import edges
 from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.terms import checked
 
@@ -249,7 +249,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
         z = model.normalised_columns(some)
         centre, half = np.empty((model.n, len(rows))), np.empty((model.n, len(rows)))
         model.columns_centre_and_half(z, some.dt, centre, half)
-        lower, upper = (point.recorded_x(np.asarray(of(centre, half, 1.0)).T) for of in (lower_of, upper_of))
+        lower, upper = (point.recorded_x(bound.T) for bound in edges(centre, half, 1.0))
     values = (some.dt, some.x, some.x_next, lower, upper, model.own_rates(z).T)
     follow, last = Repeating(model.n), -2
     for k, t_ns, *each in zip(

@@ -34,8 +34,9 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
-from uncertain_lti.model.bounds import recorded, weight_between
+from uncertain_lti.kernel.arithmetic import Blocks
 from uncertain_lti.model.objects import object_of
+from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.signals.signal_map import Signal
 
 MOST_AXES = 2
@@ -94,37 +95,6 @@ class Axis:
     def __len__(self) -> int:
         return len(self.values)
 
-    def corners(self, s: Array) -> tuple[NDArray[np.intp], Array]:
-        """The knots or modes that hold at s, and their weights.
-
-        Parameters
-        ----------
-        s : array (K,)
-            Values of the signal, normalised.
-
-        Returns
-        -------
-        array of int (C, K)
-            Positions among `values`, C = 2 for knots and 1 for modes; -1 for a mode that is not listed, and for NaN.
-        array (C, K)
-            Weights, 0 to 1; NaN where the position is -1. Beyond the end knots those of the end.
-        """
-        s = np.asarray(s, dtype=np.float64)
-        if self.modes:
-            place = np.full(len(s), -1, dtype=np.intp)
-            for r, mode in enumerate(self.modes):
-                place[s == mode] = r
-            return place[None], np.where(place < 0, np.nan, 1.0)[None]
-        knots = np.array(self.knots)
-        low = np.clip(np.searchsorted(knots, s, side="right") - 1, 0, len(knots) - 2)
-        with np.errstate(over="ignore"):
-            high = np.asarray(weight_between(s, knots[low], knots[low + 1]))
-        places, weights = np.stack([low, low + 1]), np.stack([1.0 - high, high])
-        unknown = np.isnan(s)
-        if unknown.any():
-            places[:, unknown], weights[:, unknown] = -1, np.nan
-        return places, weights
-
 
 @dataclass(frozen=True)
 class BlockData:
@@ -175,6 +145,11 @@ class Schedule:
         return math.prod(len(axis) for axis in self.axes)
 
     @cached_property
+    def table(self) -> Blocks:
+        """For the kernel."""
+        return Blocks(self.axes)
+
+    @cached_property
     def indices(self) -> tuple[tuple[int, ...], ...]:
         """Of each block the position of its knot or mode on each axis."""
         return tuple(product(*(range(len(axis)) for axis in self.axes)))
@@ -219,17 +194,8 @@ class Schedule:
         array (C, K)
             Their weights, which sum to 1; NaN where the block is -1.
         """
-        s = np.asarray(s, dtype=np.float64)
-        places, weights = self.axes[0].corners(s[0])
-        for axis, values in zip(self.axes[1:], s[1:], strict=True):
-            more, their = axis.corners(values)
-            unknown = (places[0] < 0) | (more[0] < 0)
-            shape = len(places) * len(more), s.shape[1]
-            places = (places[:, None] * len(axis) + more[None]).reshape(shape)
-            weights = (weights[:, None] * their[None]).reshape(shape)
-            if unknown.any():
-                places[:, unknown], weights[:, unknown] = -1, np.nan
-        return places, weights
+        found: tuple[NDArray[np.intp], Array] = self.table.at(s)
+        return found
 
     def weights(self, s: ArrayLike) -> Array:
         """Weights of every block, w(s).
@@ -273,8 +239,6 @@ class Schedule:
         self, s: ArrayLike, places: NDArray[np.intp], weights: Array, known: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Whether the regime is unknown: s lies beyond its end knots, or no recording visited a block that holds.
-
-        Compiled code has the same in `Judge._blend`.
 
         Parameters
         ----------

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
+from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended, centre_and_half, edges
 from uncertain_lti.model.alarm_rule import (
     JOINT,
     AlarmRule,
@@ -33,31 +34,17 @@ from uncertain_lti.model.alarm_rule import (
     containment,
     with_containment,
 )
-from uncertain_lti.model.bounds import (
-    Judge,
-    Runs,
-    centre_and_half,
-    contained,
-    lower_of,
-    normalised,
-    settled,
-    upper_of,
-    utilisation_of,
-)
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import arguments, read, structure, write
 from uncertain_lti.model.horizon import Horizon, Run, Windows, checked_horizons, unbroken_over, windows_of
-from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.operating_point import OperatingPoint, normalised
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature, checked_signatures
-from uncertain_lti.model.sums import blended
-from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, regressors, tables
+from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, tables
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-
-_BLOCK = 65536  # products per block of the vectorised path: they stay in the cache
 
 
 class UncertainLTI:
@@ -215,7 +202,6 @@ class UncertainLTI:
         self.fit_summary = dict(fit_summary or {})
         self.validation = dict(validation or {})
         self.tables = tables({name: getattr(self, name) for name in ARRAYS})
-        self._block = max(1, _BLOCK // (n * (n + m + 1)))
 
     def _alarm(self, alarm: Sequence[Rule] | None, alarm_rule: AlarmRule | None) -> tuple[Rule, ...]:
         rules = (alarm_rule or AlarmRule(),) if alarm is None else checked_rules(alarm)
@@ -479,14 +465,12 @@ class UncertainLTI:
         base : array (n, K), optional
             What the rates are added to; default the states.
         """
-        n, m = self.n, self.m
-        for start in range(0, len(dt), self._block):
-            part = slice(start, start + self._block)
-            phi = regressors(z[:n, part], z[n : n + m, part])
-            places, weights = (None, None) if self.schedule is None else self.schedule.corners(z[self._positions, part])
-            own = None if base is None else base[:, part]
-            with np.errstate(over="ignore", invalid="ignore"):  # values that the arithmetic cannot carry give NaN
-                centre[:, part], half[:, part] = centre_and_half(*self.tables, phi, dt[part], places, weights, own)
+        z, rows = np.asarray(z, dtype=np.float64), self.n + self.m
+        if self.schedule is None:
+            centre_and_half(self.tables, z[:rows], dt, centre, half, base=base)
+        else:
+            blocks, s = self.schedule.table, z[self._positions]
+            centre_and_half(self.tables, z[:rows], dt, centre, half, blocks, s, base)
 
     def normalised_columns(self, steps: Transitions) -> Array:
         """[x; u; s] of transitions.
@@ -739,11 +723,8 @@ class UncertainLTI:
         found = np.full((2, len(dt), len(self.horizons), self.n), np.nan)
         utilisation, residual = found
         for j, (windows, centre, half) in enumerate(self.envelopes(k, z, dt)):
-            with np.errstate(over="ignore", invalid="ignore"):
-                x = x_next[windows.last].T
-                left, inside = x - centre, contained(lower_of(centre, half, 1.0), x, upper_of(centre, half, 1.0))
-                residual[windows.last, j] = left.T
-                utilisation[windows.last, j] = np.asarray(settled(utilisation_of(left, half), inside)).T
+            left, there = arrivals(x_next[windows.last].T, centre, half)
+            residual[windows.last, j], utilisation[windows.last, j] = left.T, there.T
         return utilisation, residual
 
     def envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:
@@ -801,9 +782,7 @@ class UncertainLTI:
         ModelError
             Shapes do not fit.
         """
-        centre, half = self.centre_and_half(x, u, dt, s)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(lower_of(centre, half, margin)), np.asarray(upper_of(centre, half, margin))
+        return edges(*self.centre_and_half(x, u, dt, s), margin)
 
     # --- the nominal model on its own ---
 

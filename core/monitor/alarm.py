@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.kernel.arithmetic import Statistic, Statistics, some_beyond
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, StatisticRule, labels
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.statistics import Statistic, Statistics, some_beyond
 
 EVERY_STATE = "joint"
 """What stands for the state in the name of a statistic of all of them."""

@@ -16,32 +16,17 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-try:
-    import cython
-except ImportError:  # Cython is not needed to run
-    from uncertain_lti.base import uncompiled as cython
-
+import cython
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.kernel.arithmetic import LOWER, RESIDUAL, UPPER, UTILISATION, Judgement, judged
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
-from uncertain_lti.model.bounds import (
-    LOWER,
-    RESIDUAL,
-    UPPER,
-    UTILISATION,
-    Judgement,
-    contained,
-    lower_of,
-    normalised,
-    upper_of,
-    utilisation_of,
-)
+from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, residual_row
 from uncertain_lti.monitor.arming import Armed
@@ -320,7 +305,7 @@ class EnvelopeMonitor:
         withheld: tuple[int, ...] = ()
         judgement, status, looked = None, step.status, None
         if status is _OK:
-            if not contained(self._shortest, step.dt, self._longest):
+            if not self._shortest <= step.dt <= self._longest:
                 status = Status.STEP
             elif _beyond(step.before, LARGEST):  # the bounds would be no numbers
                 status = Status.MISSING
@@ -397,7 +382,7 @@ class EnvelopeMonitor:
             transient = transient.replace(step=model.sampling.step or "recorded")
         steps = transient.transitions()
         count, n = len(transient), model.n
-        fitted = np.asarray(contained(self._shortest, steps.dt, self._longest))
+        fitted = (self._shortest <= steps.dt) & (steps.dt <= self._longest)
         unfitted_step, unlisted_mode = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         if not fitted.all():
             unfitted_step[steps.k[~fitted] + 1] = True
@@ -499,12 +484,5 @@ class EnvelopeMonitor:
         """flags, lower, upper, utilisation, residual of transitions [x; u; s] (n + m + q, K), (K,), (K, n)."""
         columns = np.empty((self.model.n, len(dt))), np.empty((self.model.n, len(dt)))
         self.model.columns_centre_and_half(z, dt, *columns)
-        centre, half = (a.T for a in columns)
-        lower, upper = lower_of(centre, half, self.rule.margin), upper_of(centre, half, self.rule.margin)
-        flags = np.where(contained(lower, x_next, upper), 0.0, 1.0)
-        residual = x_next - centre
-        return flags, np.asarray(lower), np.asarray(upper), np.asarray(utilisation_of(residual, half)), residual
-
-
-if not cython.compiled:
-    use_twin(globals(), ("EnvelopeMonitor",))
+        lower, upper, residual, flags, utilisation = judged(x_next.T, *columns, self.rule.margin).transpose(0, 2, 1)
+        return flags, lower, upper, utilisation, residual

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.limits import LARGEST
-from uncertain_lti.model.bounds import FLAGS, UTILISATION
+from uncertain_lti.kernel.arithmetic import FLAGS, UTILISATION
 from uncertain_lti.model.repeats import Moved, Repeating, Repeats
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 

@@ -15,12 +15,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-try:
-    import cython
-except ImportError:  # Cython is not needed to run
-    from uncertain_lti.base import uncompiled as cython
+import cython
 
-from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.monitor.catch_up import Waiting
 from uncertain_lti.monitor.sender import Sender
 from uncertain_lti.monitor.snapshot import Entry
@@ -110,7 +106,3 @@ class Intake:
             self._memory.alarm_over(now)
         if opened or verdicts or turned:
             self._sender.publish(session, verdicts, opened, now, turned)
-
-
-if not cython.compiled:
-    use_twin(globals(), ("Intake",))

@@ -16,12 +16,8 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
-try:
-    import cython
-except ImportError:  # Cython is not needed to run
-    from uncertain_lti.base import uncompiled as cython
+import cython
 
-from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.monitor.outputs import FLAGS, REASON, VIOLATION
 from uncertain_lti.monitor.stream import Stream
 from uncertain_lti.monitor.verdict import Verdict
@@ -241,7 +237,3 @@ class Sender:
         if text != self._reason_sent:
             self._reason_sent = text
             self._reason.send(text_message(text))
-
-
-if not cython.compiled:
-    use_twin(globals(), ("Sender",))

@@ -16,12 +16,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-try:
-    import cython
-except ImportError:  # Cython is not needed to run
-    from uncertain_lti.base import uncompiled as cython
+import cython
 
-from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.jumps import jumps_in_words
 from uncertain_lti.model.repeats import Moved
@@ -537,7 +533,3 @@ class Stream:
         self.period.future = self.future.total()
         self.period.counters = Counter(self.sampler.counters)
         return period
-
-
-if not cython.compiled:
-    use_twin(globals(), ("Period", "Stream"))

@@ -17,17 +17,12 @@ from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
-try:
-    import cython
-except ImportError:  # Cython is not needed to run
-    from uncertain_lti.base import uncompiled as cython
-
+import cython
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.english import plural
-from uncertain_lti.model.bounds import FLAGS, LOWER, UPPER, UTILISATION
+from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, UPPER, UTILISATION
 from uncertain_lti.monitor.alarm import Alarm, Raised
 from uncertain_lti.monitor.frozen import Looked
 from uncertain_lti.sampling.sampler import Step
@@ -233,11 +228,8 @@ class Verdict:
         state = _packer(n)(*self._after)
         if self._judgement is None:
             numbers = _nothing(n)
-        elif cython.compiled:
-            numbers = self._judgement.packed()
         else:
-            judgement, blank = self._judgement, bytes(8 * n)
-            numbers = b"".join([judgement.numbers(i).tobytes() if i in wanted else blank for i in range(_KINDS - 1)])
+            numbers = self._judgement.packed()
         return state + numbers if self._longer is None else state + numbers + bytes(self._longer.tobytes())
 
     def packed_statistics(self) -> bytes:
@@ -296,7 +288,3 @@ def _packer(n: int) -> Callable[..., bytes]:
 @cache
 def _nothing(n: int) -> bytes:
     return struct.pack("<d", math.nan) * (n * (_KINDS - 1))
-
-
-if not cython.compiled:
-    use_twin(globals(), ("Verdict",))

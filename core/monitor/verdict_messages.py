@@ -19,12 +19,8 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
-try:
-    import cython
-except ImportError:  # Cython is not needed to run
-    from uncertain_lti.base import uncompiled as cython
+import cython
 
-from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.monitor.outputs import OUTPUTS, Output, names_of
 from uncertain_lti.monitor.verdict import kinds, place
@@ -204,7 +200,3 @@ def _numbers(body: bytearray, count: int) -> int:
     start = len(body) + _ENCAPSULATION
     body += b"\x00" * (8 * count)
     return start
-
-
-if not cython.compiled:
-    use_twin(globals(), ("Encoder", "NamedVector"))

@@ -23,12 +23,8 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
-try:
-    import cython
-except ImportError:  # Cython is not needed to run
-    from uncertain_lti.base import uncompiled as cython
+import cython
 
-from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.recordings.cdr_layout import SIZES, STAMP, CutError, Role, UnfitError, Walk, Wanted, wanted
 from uncertain_lti.recordings.stamps import header_stamp_ns
@@ -233,7 +229,3 @@ def _shape(data: bytes, places: list[tuple[int, int, int]]) -> list[tuple[int, i
         number = int.from_bytes(mask, "little")
         found.append((begin, end, number, int.from_bytes(data[begin:end], "little") & number))
     return found
-
-
-if not cython.compiled:
-    use_twin(globals(), ("MessageReader", "UnreadableError"))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural, shortlist
-from uncertain_lti.model.bounds import recorded
+from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.plain_data import list_of, numbers_of

@@ -16,15 +16,10 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-try:
-    import cython
-except ImportError:  # Cython is not needed to run
-    from uncertain_lti.base import uncompiled as cython
-
+import cython
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.compiled import use_twin
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling.angles import nearest_branch
@@ -530,7 +525,3 @@ class Sampler:
 def all_finite(values: Sequence[float]) -> bool:
     """Whether all are finite."""
     return math.isfinite(sum(values)) or all(map(math.isfinite, values))  # a sum of finite numbers may overflow
-
-
-if not cython.compiled:
-    use_twin(globals(), ("Sampler", "Step", "all_finite"))

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
+from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.bounds import settled
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient, Transitions

@@ -1,0 +1,117 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Types of the kernel."""
+
+from array import array
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+
+LOWER: int
+UPPER: int
+RESIDUAL: int
+FLAGS: int
+UTILISATION: int
+ENERGY: int
+MEAN: int
+EWMA: int
+CUSUM: int
+CHI2: int
+MEWMA: int
+LIMIT: float
+
+class Blocks:
+    def __init__(self, axes: Sequence[Any] = (), known: Any = None) -> None: ...
+    def at(self, s: Any) -> tuple[NDArray[np.intp], Array]: ...
+
+class Judgement:
+    contained: bool
+    violation: bool
+    outside_domain: bool
+    unknown_regime: bool
+    def numbers(self, which: int) -> array[float]: ...
+    def packed(self) -> bytes: ...
+
+class Judge:
+    def __init__(
+        self,
+        theta: Any,
+        delta: Any,
+        v: Any,
+        steady: Any,
+        scale: Any,
+        least: Any,
+        greatest: Any,
+        margin: float,
+        counted: Any,
+        occupied: Any = None,
+        schedule: Any = None,
+        positions: Sequence[int] = (),
+        known: Any = None,
+    ) -> None: ...
+    def judge(self, before: Sequence[float], after: Sequence[float], dt: float) -> Judgement | None: ...
+    def advance(
+        self, x: Array, time: Array, control: Array, z: Array, dt: Array, begin: Any, a: int, b: int
+    ) -> None: ...
+
+class Runs:
+    count: int
+    residuals: array[float]
+    def __init__(self, judge: Judge, horizons: Sequence[Any], runner: Judge | None = None) -> None: ...
+    def reset(self) -> None: ...
+    def push(self, before: Sequence[float], after: Sequence[float], dt: float) -> array[float]: ...
+    def foresee(self, before: Sequence[float], dt: float) -> array[float] | None: ...
+
+class Statistic:
+    alarm: bool
+    def __init__(
+        self,
+        kind: int,
+        n: int,
+        window_s: float,
+        thresholds: Any,
+        counted: Any,
+        allowance: float = 0.0,
+        mean: Any = None,
+        whitening: Any = None,
+    ) -> None: ...
+    def reset(self) -> None: ...
+    def values(self) -> array[float]: ...
+    def push_all(self, dt: Any, rows: Any) -> tuple[NDArray[np.bool_], Array]: ...
+
+class Statistics:
+    def __init__(self, parts: Sequence[Statistic], begins: Sequence[int]) -> None: ...
+    def push(self, dt: float, table: Any) -> bool: ...
+    def values(self) -> array[float]: ...
+
+def some_beyond(table: Any, places: Any, limit: float) -> int: ...
+def blended(blocks: Any, places: Any, weights: Any) -> Array: ...
+def centre_and_half(
+    tables: tuple[Array, Array, Array],
+    z: Array,
+    dt: Array,
+    centre: Array,
+    half: Array,
+    blocks: Blocks | None = None,
+    s: Array | None = None,
+    base: Array | None = None,
+) -> None: ...
+def edges(centre: Array, half: Array, margin: float) -> tuple[Array, Array]: ...
+def utilisations(difference: Array, half: Array) -> Array: ...
+def settled(utilisation: Array, inside: NDArray[np.bool_]) -> Array: ...
+def arrivals(x: Array, centre: Array, half: Array) -> tuple[Array, Array]: ...
+def judged(x: Array, centre: Array, half: Array, margin: float) -> Array: ...
+def pair_count(size: int) -> int: ...
+def outside_domain(z: Array, least: Any, greatest: Any, occupied: Any = None) -> NDArray[np.bool_]: ...
+def occupy(z: Array, least: Array, greatest: Array, occupied: NDArray[np.bool_]) -> None: ...

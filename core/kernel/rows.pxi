@@ -1,0 +1,246 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Many samples at once: loops of the equations over arrays, without the interpreter's lock."""
+
+
+def centre_and_half(tables, z, dt, centre, half, Blocks blocks=None, s=None, base=None):
+    """Centre and half-width of the bounds of K samples in columns, into given arrays.
+
+    `tables`: theta, delta (n, p) and v (n,), with a leading axis of the blocks of a schedule; `z` (n + m, K):
+    regressors, the states first, 1 beyond them; `dt` (K,): s; `centre, half` (n, K): take the result, NaN for a mode
+    that is not listed; `s` (axes, K): scheduling vectors; `base` (n, K): what the rates are added to, default the
+    states.
+    """
+    cdef Elements elements = Elements(*tables)
+    cdef const double[:, :] phi = z
+    cdef const double[:] step = dt
+    cdef double[:, :] middle = centre
+    cdef double[:, :] width = half
+    cdef const double[:, :] start = z[: elements.n] if base is None else base
+    cdef const double[:, :] vectors = z[:0] if s is None else s
+    cdef Py_ssize_t n = elements.n, p = elements.p, size = phi.shape[0], count = step.shape[0]
+    cdef Py_ssize_t i, j, k, q, axis, many
+    cdef Py_ssize_t places[_CORNERS]
+    cdef double weights[_CORNERS]
+    cdef double here[2]
+    cdef bint scheduled = blocks is not None and blocks.corners > 0
+    fits = size <= p and phi.shape[1] == start.shape[1] == middle.shape[1] == width.shape[1] == count
+    if not (fits and start.shape[0] == middle.shape[0] == width.shape[0] == n):
+        raise ValueError("the samples do not fit the terms")
+    if scheduled and (vectors.shape[0] != blocks.axes or vectors.shape[1] != count):
+        raise ValueError("the scheduling vectors do not fit the samples")
+    cdef double* room = <double*>malloc((2 * p + 2) * _TOGETHER * sizeof(double))
+    if room == NULL:
+        raise MemoryError
+    cdef double* psi = room + p * _TOGETHER
+    cdef double* rate = psi + p * _TOGETHER
+    cdef double* spread = rate + _TOGETHER
+    with nogil:
+        if scheduled:
+            for j in range(size, p):
+                room[j] = 1.0
+            for k in range(count):
+                for axis in range(blocks.axes):
+                    here[axis] = vectors[axis, k]
+                for j in range(size):
+                    room[j] = phi[j, k]
+                if blocks.find(here, places, weights) < 0:
+                    for i in range(n):
+                        middle[i, k] = width[i, k] = NAN
+                    continue
+                elements.sum(room, places, weights, blocks.corners)
+                for i in range(n):
+                    middle[i, k] = centre_of(start[i, k], step[k], elements.rate[i])
+                    width[i, k] = half_of(step[k], elements.spread[i], elements.still[i])
+        else:
+            for j in range(size * _TOGETHER, p * _TOGETHER):
+                room[j] = psi[j] = 1.0
+            k = 0
+            while k < count:
+                many = count - k if count - k < _TOGETHER else _TOGETHER
+                for j in range(size):
+                    for q in range(many):
+                        room[j * _TOGETHER + q] = phi[j, k + q]
+                        psi[j * _TOGETHER + q] = fabs(room[j * _TOGETHER + q])
+                for i in range(n):
+                    add_columns_of_many(elements.theta + i, room, n, p, many, rate)
+                    add_columns_of_many(elements.delta + i, psi, n, p, many, spread)
+                    for q in range(many):
+                        middle[i, k + q] = centre_of(start[i, k + q], step[k + q], rate[q])
+                        width[i, k + q] = half_of(step[k + q], spread[q], elements.v[i])
+                k += many
+    free(room)
+
+
+def edges(centre, half, double margin):
+    """Lower and upper bounds, eqs. (6)(7) with a margin, of arrays of one shape."""
+    cdef const double[::1] middle = np.ascontiguousarray(centre).reshape(-1)
+    cdef const double[::1] width = np.ascontiguousarray(half).reshape(-1)
+    found = np.empty((2, *np.shape(centre)))
+    cdef double[:, ::1] both = found.reshape(2, -1)
+    cdef Py_ssize_t k
+    with nogil:
+        for k in range(width.shape[0]):
+            both[0, k], both[1, k] = lower_of(middle[k], width[k], margin), upper_of(middle[k], width[k], margin)
+    return found[0], found[1]
+
+
+def utilisations(difference, half):
+    """`utilisation_of` of arrays of one shape."""
+    cdef const double[::1] one = np.ascontiguousarray(difference).reshape(-1)
+    cdef const double[::1] other = np.ascontiguousarray(half).reshape(-1)
+    found = np.empty(np.shape(difference))
+    cdef double[::1] values = found.reshape(-1)
+    cdef Py_ssize_t k
+    with nogil:
+        for k in range(other.shape[0]):
+            values[k] = utilisation_of(one[k], other[k])
+    return found
+
+
+def settled(utilisation, inside):
+    """`settled_of` of arrays of one shape."""
+    cdef const double[::1] one = np.ascontiguousarray(utilisation, dtype=np.float64).reshape(-1)
+    cdef const unsigned char[::1] within = np.ascontiguousarray(inside).view(np.uint8).reshape(-1)
+    found = np.empty(np.shape(utilisation))
+    cdef double[::1] values = found.reshape(-1)
+    cdef Py_ssize_t k
+    with nogil:
+        for k in range(within.shape[0]):
+            values[k] = settled_of(one[k], within[k])
+    return found
+
+
+def arrivals(x, centre, half):
+    """x - centre and where in the bounds that is, of a size of at most 1 exactly where contained; one shape (n, K)."""
+    cdef const double[:, :] there = x
+    cdef const double[:, :] middle = centre
+    cdef const double[:, :] width = half
+    found = np.empty((2, *x.shape))
+    cdef double[:, :, ::1] both = found
+    cdef Py_ssize_t i, k
+    cdef double left
+    cdef bint inside
+    if not x.shape == centre.shape == half.shape:
+        raise ValueError("the samples do not fit the bounds")
+    with nogil:
+        for i in range(there.shape[0]):
+            for k in range(there.shape[1]):
+                left = there[i, k] - middle[i, k]
+                inside = is_contained(
+                    lower_of(middle[i, k], width[i, k], 1.0), there[i, k], upper_of(middle[i, k], width[i, k], 1.0)
+                )
+                both[0, i, k], both[1, i, k] = left, settled_of(utilisation_of(left, width[i, k]), inside)
+    return found[0], found[1]
+
+
+def pair_count(Py_ssize_t size):
+    """Pairs of signals whose combinations a domain knows, in the order 01, 02, 12, ...; of one signal alone, itself."""
+    return size * (size - 1) // 2 if size > 1 else 1
+
+
+def cells_per_unit(least, greatest, Py_ssize_t cells):
+    """Cells per normalised unit of each signal, what `cell_of` takes; 0 where it does not move."""
+    span = np.subtract(greatest, least)
+    return np.divide(cells, span, out=np.zeros_like(span), where=(span > 0) & np.isfinite(span))
+
+
+cdef inline bint pairs_visited(
+    const double* z,
+    const double* least,
+    const double* per_unit,
+    const unsigned char* occupied,
+    Py_ssize_t size,
+    Py_ssize_t cells,
+    int* place,
+) noexcept nogil:
+    """Whether every pair of signals lies in an occupied cell (`domain.Occupancy`)."""
+    cdef Py_ssize_t i, j
+    for i in range(size):
+        place[i] = cell_of(z[i], least[i], per_unit[i], <int>cells - 1)
+    if size == 1:
+        return occupied[place[0] * cells + place[0]]
+    for i in range(size):
+        for j in range(i + 1, size):
+            if not occupied[place[i] * cells + place[j]]:
+                return False
+            occupied += cells * cells
+    return True
+
+
+def outside_domain(z, least, greatest, occupied=None):
+    """Whether z (K, n + m) leaves the box in some element, or is a combination that was not fitted."""
+    cdef const double[:, ::1] rows = np.ascontiguousarray(z)
+    cdef arrays.array low = doubles(least), high = doubles(greatest)
+    cdef Py_ssize_t i, k, size = rows.shape[1], cells = 0 if occupied is None else occupied.shape[1]
+    cdef arrays.array per_unit = doubles(cells_per_unit(np.asarray(least), np.asarray(greatest), cells))
+    cdef const unsigned char[::1] flags = np.ascontiguousarray(
+        np.zeros(1, np.uint8) if occupied is None else occupied
+    ).view(np.uint8).reshape(-1)
+    cdef arrays.array place = array("i", bytes(4 * (size or 1)))
+    found = np.zeros(len(rows), dtype=bool)
+    cdef unsigned char[::1] left = found.view(np.uint8)
+    if len(least) != size or len(greatest) != size:
+        raise ValueError("the domain does not fit the samples")
+    with nogil:
+        for k in range(rows.shape[0]):
+            for i in range(size):
+                left[k] |= is_outside(rows[k, i], low.data.as_doubles[i], high.data.as_doubles[i])
+            if cells and size and not left[k]:
+                left[k] = not pairs_visited(
+                    &rows[k, 0], low.data.as_doubles, per_unit.data.as_doubles, &flags[0], size, cells,
+                    place.data.as_ints,
+                )
+    return found
+
+
+def occupy(z, least, greatest, occupied):
+    """Mark in `occupied` (pairs, cells, cells) the cells of every pair of signals that z (n + m, K) lies in."""
+    cdef const double[:, :] columns = z
+    cdef unsigned char[:, :, ::1] flags = occupied.view(np.uint8)
+    cdef Py_ssize_t i, j, k, pair, size = columns.shape[0]
+    cdef int last = occupied.shape[1] - 1
+    cdef arrays.array low = doubles(least), per_unit = doubles(cells_per_unit(least, greatest, occupied.shape[1]))
+    cdef arrays.array place = array("i", bytes(4 * size))
+    cdef int* at = place.data.as_ints
+    with nogil:
+        for k in range(columns.shape[1]):
+            for i in range(size):
+                at[i] = cell_of(columns[i, k], low.data.as_doubles[i], per_unit.data.as_doubles[i], last)
+            if size == 1:
+                flags[0, at[0], at[0]] = 1
+            pair = 0
+            for i in range(size):
+                for j in range(i + 1, size):
+                    flags[pair, at[i], at[j]] = 1
+                    pair += 1
+
+
+def judged(x, centre, half, double margin):
+    """What a `Judgement` holds (5, n, K), with normalised bounds, of K samples by their centre and half-width (n, K)."""
+    cdef const double[:, :] there = x
+    cdef const double[:, :] middle = centre
+    cdef const double[:, :] width = half
+    found = np.empty((5, *x.shape))
+    cdef double[:, :, ::1] numbers = found
+    cdef Py_ssize_t i, k
+    cdef double lower, upper
+    if not x.shape == centre.shape == half.shape:
+        raise ValueError("the samples do not fit the bounds")
+    with nogil:
+        for i in range(there.shape[0]):
+            for k in range(there.shape[1]):
+                lower = lower_of(middle[i, k], width[i, k], margin)
+                upper = upper_of(middle[i, k], width[i, k], margin)
+                numbers[0, i, k], numbers[1, i, k] = lower, upper
+                numbers[2, i, k] = there[i, k] - middle[i, k]
+                numbers[3, i, k] = not is_contained(lower, there[i, k], upper)
+                numbers[4, i, k] = utilisation_of(numbers[2, i, k], width[i, k])
+    return found

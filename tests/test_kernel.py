@@ -1,0 +1,200 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""The kernel against the equations written naively: one number after another, for one sample, many, and runs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from uncertain_lti import SignalMap, UncertainLTI
+from uncertain_lti.kernel import arithmetic
+from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION
+from uncertain_lti.model.domain import Domain
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.signals.signal_map import Signal
+
+KNOTS, OF_FURTHER = Axis("x0", knots=(-1.0, -0.1, 0.0, 0.2, 1.0)), Axis("w", knots=(-0.1, 0.1))
+MODES = Axis("gear", modes=(1.0, 2.0, 5.0))
+SCHEDULES = {
+    "one block": None,
+    "knots": Schedule((KNOTS,)),
+    "modes": Schedule((MODES,)),
+    "two": Schedule((KNOTS, OF_FURTHER)),
+    "knots and modes": Schedule((MODES, OF_FURTHER)),
+}
+ODD = [0.0, -0.0, math.nan, math.inf, -math.inf, 1e308, 5e-324]
+
+
+def some_model(n: int, m: int, schedule: Schedule | None, rng: np.random.Generator) -> UncertainLTI:
+    """Elements of which many are 0, and a domain and blocks that samples leave."""
+    further = [axis.signal for axis in schedule.axes if axis.signal != "x0"] if schedule else []
+    lead, total = ((schedule.blocks,) if schedule else ()), n + m + len(further)
+    theta, delta = (rng.normal(size=(*lead, n, n + m + 1)) for _ in range(2))
+    delta[rng.random(delta.shape) < 0.3] = 0.0
+    steady, scale = rng.normal(size=total), rng.uniform(0.1, 2.0, total)
+    if "gear" in further:
+        steady[n + m + further.index("gear")], scale[n + m + further.index("gear")] = 0.0, 1.0
+    names = [f"x{i}" for i in range(n)], [f"u{j}" for j in range(m)], further
+    every = [
+        Signal(name, "", "a", steady=float(steady[k]), scale=float(scale[k])) for k, name in enumerate(sum(names, []))
+    ]
+    return UncertainLTI(
+        theta[..., :n], theta[..., n : n + m], np.abs(delta[..., :n]), np.abs(delta[..., n : n + m]),
+        theta[..., n + m], np.abs(delta[..., n + m]), rng.uniform(0, 6, (*lead, n)),
+        schedule=schedule, block_data=schedule and [BlockData(int(r != 1)) for r in range(schedule.blocks)],
+        signals=SignalMap(tuple(every[:n]), tuple(every[n : n + m]), tuple(every[n + m :])),
+        domain=Domain(np.full(n, -9.0), np.full(n, 9.0), np.full(m, -9.0), np.full(m, 9.0)),
+    )  # fmt: skip
+
+
+def naive_blocks(schedule: Schedule | None, s: list[float]) -> tuple[list[tuple[int, float]], bool]:
+    """Blocks with their weights, and whether s lies beyond a knot; no block where a mode is not listed."""
+    if schedule is None:
+        return [(0, 1.0)], False
+    found, beyond = [(0, 1.0)], False
+    for axis, value in zip(schedule.axes, s, strict=True):
+        if math.isnan(value) or (axis.modes and value not in axis.modes):
+            return [], False
+        if axis.modes:
+            own = [(axis.modes.index(value), 1.0)]
+        else:
+            knots = axis.knots
+            beyond |= not knots[0] <= value <= knots[-1]
+            low = max((j for j in range(len(knots) - 1) if knots[j] <= value), default=0)
+            high = min(max((value - knots[low]) / (knots[low + 1] - knots[low]), 0.0), 1.0)
+            own = [(low, 1.0 - high), (low + 1, high)]
+        found = [(r * len(axis) + j, w * weight) for r, w in found for j, weight in own]
+    return found, beyond
+
+
+def naive(model: UncertainLTI, before: list[float], after: list[float], dt: float, margin: float) -> Any:
+    """Eqs. (6)(7) in floats: what a `Judgement` holds, and whether the regime is unknown; None without a block."""
+    point, n = model.operating_point, model.n
+    steady, scale = point.steady.tolist(), point.scale.tolist()
+    z = [(v - a) / b for v, a, b in zip(before, steady, scale, strict=True)]
+    phi = [*z[: n + model.m], 1.0]
+    blocks, unknown = naive_blocks(model.schedule, [z[i] for i in model.scheduling_positions])
+    if not blocks:
+        return None
+    unknown |= model.schedule is not None and any(w > 0 and r == 1 for r, w in blocks)
+    theta, delta, v = (a if model.schedule else a[None] for a in model.tables)
+
+    def of(table: Any, *at: int) -> float:
+        if model.schedule is None:
+            return float(table[(0, *at)])
+        return sum_of(float(table[(r, *at)]) * w for r, w in blocks)
+
+    rows = []
+    for i in range(n):
+        rate = sum_of(of(theta, i, j) * phi[j] for j in range(len(phi)))
+        spread = sum_of(of(delta, i, j) * abs(phi[j]) for j in range(len(phi)))
+        centre, half = rate * dt + z[i], spread * dt + of(v, i)
+        lower, upper = centre - half * margin, centre + half * margin
+        x = (after[i] - steady[i]) / scale[i]
+        left = x - centre
+        with np.errstate(all="ignore"):
+            share = 0.0 if left == 0.0 else float(np.float64(left) / np.float64(half))
+        inside = lower <= x <= upper
+        rows.append((steady[i] + scale[i] * lower, steady[i] + scale[i] * upper, left, float(not inside), share))
+    return np.array(rows).T, unknown
+
+
+def sum_of(terms: Any) -> float:
+    """From the first to the last, beginning with the first."""
+    first, *others = terms
+    for term in others:
+        first += term
+    return first
+
+
+def same(one: Any, other: Any) -> bool:
+    one, other = np.asarray(one, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    there = ~np.isnan(one)
+    return bool((there == ~np.isnan(other)).all()) and one[there].tobytes() == other[there].tobytes()
+
+
+@pytest.mark.parametrize("n, m", [(1, 0), (1, 9), (5, 4), (20, 6)])
+@pytest.mark.parametrize("margin", [1.0, 0.3])
+@pytest.mark.parametrize("schedule", SCHEDULES.values(), ids=SCHEDULES)
+def test_a_transition_and_many_are_judged_as_the_equations_say_to_the_last_bit(
+    n: int, m: int, margin: float, schedule: Schedule | None
+) -> None:
+    rng = np.random.default_rng([n, m])
+    model = some_model(n, m, schedule, rng)
+    counted = rng.random(n) < 0.7
+    judge, point, total = model.judge_of(margin, counted), model.operating_point, len(model.operating_point.steady)
+    gear = [i for i, name in enumerate(axis.signal for axis in (schedule.axes if schedule else ())) if name == "gear"]
+    flags, unlisted, unknown = set[float](), 0, 0
+    for k in range(300):
+        before, after = rng.normal(size=total) * 2, rng.normal(size=n) * 2
+        if gear:
+            before[model.scheduling_positions[gear[0]]] = rng.integers(1, 7)
+        if k % 4 == 0:
+            before[rng.integers(total)] = rng.choice(ODD)
+        if k % 5 == 0:
+            after[rng.integers(n)] = rng.choice(ODD)
+        dt = float(rng.choice([1e-3, 0.1, 0.0]))
+        found = judge.judge(before.tolist(), tuple(after.tolist()), dt)
+        expected = naive(model, before.tolist(), after.tolist(), dt, margin)
+        with np.errstate(all="ignore"):
+            z = (before - point.steady) / point.scale
+            lower, upper = (point.recorded_x(a) for a in model.bounds(z[:n], z[n : n + m], dt, margin, z[n + m :]))
+        if expected is None:
+            assert found is None and np.isnan(lower).all()
+            unlisted += 1
+            continue
+        numbers, strange = expected
+        assert found is not None
+        for which in (LOWER, UPPER, RESIDUAL, FLAGS, UTILISATION):
+            assert same(found.numbers(which), numbers[which]), which
+        assert same(lower, numbers[LOWER]) and same(upper, numbers[UPPER])
+        assert found.contained == (not numbers[FLAGS].any()) and found.unknown_regime == strange
+        assert found.violation == bool((numbers[FLAGS] * counted).any())
+        flags |= set(numbers[FLAGS])
+        unknown += strange
+    assert flags == {0.0, 1.0}
+    assert (unlisted > 0 or not gear) and (unknown > 0) == (schedule is not None)
+
+
+def test_a_million_have_the_bits_of_one() -> None:
+    """Blocks of samples begin and end anywhere."""
+    rng = np.random.default_rng(4)
+    model = some_model(5, 4, None, rng)
+    x, u, dt = rng.normal(size=(1025, 5)), rng.normal(size=(1025, 4)), rng.uniform(0.01, 0.1, 1025)
+    whole = model.centre_and_half(x, u, dt)
+    for k in (0, 1, 255, 256, 257, 511, 512, 1024):
+        for one, all_of_them in zip(model.centre_and_half(x[k], u[k], dt[k]), whole, strict=True):
+            assert one.tobytes() == all_of_them[k].tobytes()
+        for one, all_of_them in zip(model.centre_and_half(x[:k], u[:k], dt[:k]), whole, strict=True):
+            assert one.tobytes() == all_of_them[:k].tobytes()
+
+
+def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
+    one, two = np.ones((2, 4)), np.ones(2)
+    point = np.zeros(3), np.ones(3), np.zeros(3), np.ones(3)
+    for bad in ((one[:1], one, two), (one, one[:, :2], two), (one, one, two[:1])):
+        with pytest.raises(ValueError, match="fit"):
+            arithmetic.Judge(*bad, *point, 1.0, np.array([True, True]))
+    with pytest.raises(ValueError, match="fit"):
+        arithmetic.Judge(one, one, two, point[0][:1], *point[1:], 1.0, np.array([True, True]))
+    judge = arithmetic.Judge(one, one, two, *point, 1.0, np.array([True, True]))
+    for before, after in (([0.0], [0.0, 0.0]), ([0.0] * 3, [0.0]), ([], [])):
+        with pytest.raises(ValueError, match="values for"):
+            judge.judge(before, after, 0.1)
+    with pytest.raises((TypeError, ValueError)):
+        judge.judge(["a", "b", "c"], [0.0, 0.0], 0.1)  # type: ignore[list-item]
+    with pytest.raises(ValueError, match="fit"):
+        arithmetic.centre_and_half((one, one, two), np.zeros((3, 5)), np.zeros(4), np.zeros((2, 5)), np.zeros((2, 5)))
+    with pytest.raises(ValueError, match="fit"):
+        arithmetic.judged(np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)), 1.0)
