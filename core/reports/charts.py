@@ -139,14 +139,20 @@ class Columns:
 
     def extremes(self, values: Array) -> tuple[Array, Array]:
         """Least and greatest of each column (P, k) of the finite ones of some values (samples, k)."""
+        return self.reduced(values, np.fmin), self.reduced(values, np.fmax)
+
+    def reduced(self, values: Array, which: np.ufunc) -> Array:
+        """`np.fmin` or `np.fmax` of each column (P, k) of some values (samples, k)."""
         if not self.binned:
-            return values[self.starts], values[self.starts]
-        low, high = (np.empty((len(self.starts), values.shape[1])) for _ in range(2))
+            return values[self.starts]
+        found = np.empty((len(self.starts), values.shape[1]))
         for c, (a, b) in enumerate(zip(self.starts.tolist(), [*self.starts[1:].tolist(), self.stop], strict=True)):
-            part = np.ascontiguousarray(values[a:b].T)  # several times as fast as along the rows
-            np.fmin.reduce(part, axis=1, out=low[c])
-            np.fmax.reduce(part, axis=1, out=high[c])
-        return low, high
+            which.reduce(np.ascontiguousarray(values[a:b].T), axis=1, out=found[c])  # faster than along the rows
+        return found
+
+    def some(self, which: Mask) -> Mask:
+        """Whether any sample of each column (P,) is marked."""
+        return np.logical_or.reduceat(which[: self.stop], self.starts) if len(self.starts) else which[:0]
 
     def worst(self, bad: Mask, utilisation: Array, values: Array) -> Array:
         """Of each column (P,) the value at its violated sample that lies farthest out; NaN where none is."""
@@ -248,6 +254,18 @@ def columns_of(
 
 def alarm_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, most: int = 6) -> Chart:
     """What happened and when: the alarm's score over its threshold, then the states that did it."""
+    panel, states = score_panel(model, verdicts, columns)
+    chosen = [model.state_names[i] for i in np.argsort(-states, kind="stable")[:most]]
+    below = utilisation_chart(model, verdicts, columns, chosen)
+    name = "What happened, and when: the alarm's score over its threshold, then where between its bounds each state lay"
+    if model.n > most:
+        name += f" ({most} of {model.n} states, those that did most)"
+    keys = (("score", "score, utilisation"), ("bounds", "inside the bounds"), ("violated", "violated"), *ALARMED)
+    return Chart(name, below.heading, columns, (panel, *below.panels), keys)
+
+
+def score_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[Panel, Array]:
+    """The alarm's score over its threshold, and what each state had to do with it (n,)."""
     score, states = scores(model, verdicts, columns)
     greatest = float(np.nanmax(score, initial=0.0))
     top = float(np.clip(1.1 * greatest, 1.5, 6.0))
@@ -261,13 +279,7 @@ def alarm_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, most:
         "alarm score, 1 is the threshold", (Series("score", np.where(np.isnan(capped), np.nan, 0.0), capped),),
         limits=(0.0, top), levels=(1.0,), rank=math.inf, note=note,
     )  # fmt: skip
-    chosen = [model.state_names[i] for i in np.argsort(-states, kind="stable")[:most]]
-    below = utilisation_chart(model, verdicts, columns, chosen)
-    name = "What happened, and when: the alarm's score over its threshold, then where between its bounds each state lay"
-    if model.n > most:
-        name += f" ({most} of {model.n} states, those that did most)"
-    keys = (("score", "score, utilisation"), ("bounds", "inside the bounds"), ("violated", "violated"), *ALARMED)
-    return Chart(name, below.heading, columns, (panel, *below.panels), keys)
+    return panel, states
 
 
 def scores(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[Array, Array]:
@@ -284,7 +296,7 @@ def scores(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[A
         if not isinstance(rule, AlarmRule):
             continue
         table = verdicts.horizon_utilisation[:, 1 + model.steps.index(rule.horizon)] if rule.horizon > 1 else None
-        raised = columns.extremes(verdicts.rule_alarms[:, r : r + 1].astype(np.float64))[1][:, 0] > 0
+        raised = columns.some(verdicts.rule_alarms[:, r])
         if rule.violations == 1:
             size = reached[0] if table is None else _size(*columns.extremes(table))
             value = _fmax(size) / rule.margin
@@ -334,7 +346,7 @@ def envelope_chart(
     chosen = chosen_states(model, verdicts, states)
     x = verdicts.transient.x
     low, high = columns.extremes(x)
-    lower, upper = columns.extremes(verdicts.lower)[0], columns.extremes(verdicts.upper)[1]
+    lower, upper = columns.reduced(verdicts.lower, np.fmin), columns.reduced(verdicts.upper, np.fmax)
     panels = []
     for i in chosen:
         bad = verdicts.flags[:, i] == 1.0
@@ -375,7 +387,7 @@ def utilisation_map(
     """Greatest |utilisation| of many states over time, a row each."""
     chosen = chosen_states(model, verdicts, states)
     size = _size(*columns.extremes(verdicts.utilisation))[:, chosen].T
-    bad = (columns.extremes(verdicts.flags)[1][:, chosen] == 1.0).T
+    bad = (columns.reduced(verdicts.flags, np.fmax)[:, chosen] == 1.0).T
     values = np.where(bad, 2.0, np.minimum(size, 1.0))
     rows = tuple(model.state_names[i] for i in chosen)
     drawn = Map("|utilisation|", rows, values, count=int(verdicts.violated.sum()))

@@ -70,8 +70,7 @@ def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) 
     ]
     run = verdicts.transient
     placed[1] += _panels(columns, run.u, [(s.name, s.unit) for s in model.signals.controls], "control")
-    top = charts.alarm_chart(model, verdicts, columns, 0).panels[0]
-    assert isinstance(top, Panel)
+    top, _ = charts.score_panel(model, verdicts, columns)
     note = f"{charts.heading(verdicts)}. {top.title}: {top.note}{_how(columns)}."
     return Plotted(
         charts.base_name(run.name), note, list(zip(words, placed, strict=True)), [(columns, top)], columns.alarms,
