@@ -30,7 +30,8 @@ from pathlib import Path
 import numpy as np
 from recorded import JAZZY, Topic, message, write
 
-from uncertain_lti import fit, read_transients
+from uncertain_lti import read_transients
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.signals.signal_map import Signal, SignalMap

@@ -47,7 +47,7 @@ from uncertain_lti.plants.turbofan_runs import DT, LARGE, Run, lever_moves, make
 
 Recording = Sequence[Transient]
 """One recording, in one piece or several."""
-SHOWN = 2
+SHOWN = 3
 """Of the others, as many lines for each kind of threshold."""
 
 

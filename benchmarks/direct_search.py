@@ -14,7 +14,7 @@
 
 import time
 
-from uncertain_lti import fit
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.plants import leibov
 from uncertain_lti.plants.turbofan_runs import make_run, simulate

@@ -35,8 +35,8 @@ from pathlib import Path
 import numpy as np
 from measure import best, peak_memory, table
 
-from uncertain_lti import EnvelopeMonitor, fit
-from uncertain_lti.identification import formulation
+from uncertain_lti import EnvelopeMonitor
+from uncertain_lti.identification import fit, formulation
 from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet

@@ -31,8 +31,9 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti import OperatingPoint, Transient, fit
+from uncertain_lti import OperatingPoint, Transient
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Regimes
 from uncertain_lti.identification.problem import Problem

@@ -19,7 +19,8 @@ import sys
 
 import numpy as np
 
-from uncertain_lti import EnvelopeMonitor, fit
+from uncertain_lti import EnvelopeMonitor
+from uncertain_lti.identification import fit
 from uncertain_lti.plants.turbofan_faults import KINDS, Fault
 from uncertain_lti.plants.turbofan_runs import DT, make_run, simulate
 

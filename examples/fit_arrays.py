@@ -53,12 +53,12 @@ def recorded(seed: int, friction_from: float = np.inf) -> Transient:
 
 def main() -> None:
     """Fit three healthy runs; check a healthy and a changed one."""
-    model = fit([recorded(seed) for seed in (1, 2, 3)], criterion="lp", additive="noise")
+    model = fit([recorded(seed) for seed in (1, 2, 3)])
     facts = model.fit_summary
     print(f"{facts['transitions']} transitions fitted, {facts['violations']} outside")
     print(f"half-width of the noise: {', '.join(f'{v:.2f}' for v in model.v)} rad/s")
 
-    monitor = EnvelopeMonitor(model, violations=3, window=10)
+    monitor = EnvelopeMonitor(model)
     for name, run in (("healthy", recorded(4)), ("friction from 12 s", recorded(4, friction_from=12.0))):
         verdicts = monitor.check(run)
         alarms = run.t[verdicts.alarm]

@@ -29,12 +29,12 @@ def main(figure: str = "envelope.png") -> None:
     """
     healthy = sorted((ROOT / "bags").glob("turbofan_*_noise.mcap"))
     runs = read_transients(healthy, ROOT / "config" / "signals" / "turbofan.yaml")
-    model = fit(runs, criterion="lp", additive="noise")
+    model = fit(runs)
     print(f"{len(runs)} recordings fitted, {model.fit_summary['violations']} transitions outside")
 
     # signals with everything resolved: the same clock, steady states and scales as in the fit
     (damaged,) = read_transients(ROOT / "bags" / "turbofan_fan_damage.mcap", model.signals)
-    verdicts = EnvelopeMonitor(model, violations=2, window=5).check(damaged)
+    verdicts = EnvelopeMonitor(model).check(damaged)
     first = damaged.t[verdicts.alarm][0]
     print(f"fan damaged at {ONSET:g} s, first alarm at {first:.3f} s")
 

@@ -58,7 +58,7 @@ def session_for(model: UncertainLTI, bag: Bag, rule: Rule, now: float) -> Sessio
 def main() -> None:
     """Fit, run a session over a bag with a fault at 24 s, and compare it with a check."""
     healthy = sorted((ROOT / "bags").glob("turbofan_*_noise.mcap"))
-    model = fit(read_transients(healthy, ROOT / "config" / "signals" / "turbofan.yaml"), "lp", additive="noise")
+    model = fit(read_transients(healthy, ROOT / "config" / "signals" / "turbofan.yaml"))
     bag = Bag(ROOT / "bags" / "turbofan_fan_damage.mcap")
     messages = list(bag.raw_messages(model.signals.topics))
     began = messages[0].log_time_ns

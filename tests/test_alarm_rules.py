@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uncertain_lti import Transient, UncertainLTI, fit
+from uncertain_lti import Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals

@@ -31,9 +31,10 @@ from rosbags.highlevel import AnyReader
 from test_sampler import cases, loops
 from test_sampler_arrays import columns
 
-from uncertain_lti import EnvelopeMonitor, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, read_transients
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.outputs import NODE, RECORDED

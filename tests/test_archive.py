@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import OperatingPoint, Transient, fit, read_transients
+from uncertain_lti import OperatingPoint, Transient, read_transients
 from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.cache import CacheWriter

@@ -21,7 +21,8 @@ from engine_bag import SIGNALS, engine_bag
 from perturbed import Arriving as Message
 from perturbed import held_up, run
 
-from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
+from uncertain_lti.identification import fit
 from uncertain_lti.monitor.catch_up import MOST, STALL, WINDOW, CatchUp
 from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC

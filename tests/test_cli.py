@@ -23,9 +23,10 @@ import pytest
 from bag_writer import Topic, ramp, write
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, UncertainLTI
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.plants.leibov import STATE_TOPIC
 
 

@@ -14,7 +14,8 @@ import pytest
 from coil import STEP_NS, C, L, R, coil_runs, inductance
 from scipy.linalg import expm
 
-from uncertain_lti import EnvelopeMonitor, fit
+from uncertain_lti import EnvelopeMonitor
+from uncertain_lti.identification import fit
 
 
 def test_the_coil_saturates_in_both_directions():

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from uncertain_lti import Transient, fit
+from uncertain_lti import Transient
+from uncertain_lti.identification import fit
 
 
 def drawn(seed, n, m, noise, jitter, count=150):

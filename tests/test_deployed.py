@@ -16,8 +16,9 @@ import pytest
 from bag_writer import JAZZY, Message, Topic, cdr, header, write
 from engine_bag import joint_state
 
-from uncertain_lti import EnvelopeMonitor, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, read_transients
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor.arming import Arming, Condition
 from uncertain_lti.monitor.session import Rule, Session, topic_types

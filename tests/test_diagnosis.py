@@ -12,8 +12,8 @@
 import numpy as np
 import pytest
 
-from uncertain_lti import OperatingPoint, SignalMap, Transient, fit
-from uncertain_lti.identification import discard
+from uncertain_lti import OperatingPoint, SignalMap, Transient
+from uncertain_lti.identification import discard, fit
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.signals.signal_map import Signal
 

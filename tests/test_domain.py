@@ -21,8 +21,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.identification import fit
 from uncertain_lti.kernel.arithmetic import Judge
 from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy
 

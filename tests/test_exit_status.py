@@ -20,10 +20,11 @@ import pytest
 from bag_writer import Message, Topic, cdr, header, write
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import BagError, ModelError, SignalError, TransientError
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.recordings.bag import Bag

@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uncertain_lti import SignalMap, fit, read_transients
+from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.recordings import formats
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import Format, group_recordings, open_recording

@@ -20,9 +20,10 @@ import pytest
 from test_event_log import Rig
 from test_live import CONTROL, STATE, joint_state, vector
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.identification import fit
 from uncertain_lti.model import repeats
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling

@@ -16,14 +16,15 @@ from typing import Any
 import numpy as np
 import pytest
 from test_horizon_fit import runs
+from uncertain_lti.validation.armed import Family, values_of
 
-from uncertain_lti import EnvelopeMonitor, SignalMap, fit
+from uncertain_lti import EnvelopeMonitor, SignalMap
 from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.proposal.horizons import MOST, choose_horizons, lengths_of
 from uncertain_lti.reports.fit_text import horizons_text
 from uncertain_lti.signals.horizon_rule import HorizonRule
-from uncertain_lti.validation.armed import Family, values_of
 from uncertain_lti.validation.left_out import validate
 
 RUNS = runs(count=4, length=200, noise=1e-2, bend=0.0)

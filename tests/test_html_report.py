@@ -22,8 +22,9 @@ from engine_bag import SIGNALS, engine_bag
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.reports.findings import APART, MOST_EPISODES, findings
 from uncertain_lti.reports.html import MOST_DRAWN, html_report
 from uncertain_lti.reports.reliance import CARE, NO, UNKNOWN, YES

@@ -17,9 +17,10 @@ from coil import coil_runs
 from engine_bag import SIGNALS, engine_bag
 from tanks import DT, Tanks
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.leibov import leibov2006, transient
 from uncertain_lti.reports.detectable_text import detectable_data, detectable_text, detectable_words

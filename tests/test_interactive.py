@@ -22,8 +22,9 @@ from engine_bag import SIGNALS, engine_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.reports import interactive
 from uncertain_lti.reports.interactive import interactive_page, plotted_check, plotted_transient

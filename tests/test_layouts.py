@@ -17,8 +17,9 @@ from xml.etree import ElementTree
 import pytest
 from rosbags.highlevel import AnyReader
 
-from uncertain_lti import fit, read_transients
+from uncertain_lti import read_transients
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.monitor.outputs import OUTPUTS
 from uncertain_lti.reports.layouts import foxglove_layout, foxglove_text, plotjuggler_layout
 from uncertain_lti.signals.signal_map import Signal, SignalMap

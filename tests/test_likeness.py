@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 from test_event_log import Rig
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.identification import fit
 from uncertain_lti.model.signature import Signature, closeness
 from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Likeness, Part
 from uncertain_lti.monitor.session import OK

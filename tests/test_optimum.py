@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uncertain_lti import OperatingPoint, Transient, fit, read_transients
+from uncertain_lti import OperatingPoint, Transient, read_transients
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import working_set
+from uncertain_lti.identification import fit, working_set
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.structure import Structure
 

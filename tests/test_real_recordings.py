@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.sampling.reading import read_as_fitted
 
 RECORDINGS = [  # recordings, signals file, additive term that its noise asks for, are pure intervals infeasible

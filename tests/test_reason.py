@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import Axis, Schedule

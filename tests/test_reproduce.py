@@ -21,9 +21,10 @@ import pytest
 pytest.importorskip("scipy", reason="scipy, which the experiment needs, is not installed")
 pytest.importorskip("matplotlib", reason="matplotlib, which draws the figures, is not installed")
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.plants.leibov import leibov2006, transient
 

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti import OperatingPoint, Transient, UncertainLTI, fit
+from uncertain_lti import OperatingPoint, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import formulation, passes
+from uncertain_lti.identification import fit, formulation, passes
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet

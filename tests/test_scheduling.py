@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import EnvelopeMonitor, OperatingPoint, Transient, UncertainLTI, fit, validate
+from uncertain_lti import EnvelopeMonitor, OperatingPoint, Transient, UncertainLTI, validate
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.fit import _schedule
 from uncertain_lti.cli.main import main
-from uncertain_lti.identification import fitting
+from uncertain_lti.identification import fit, fitting
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.free_run import free_run
 from uncertain_lti.proposal.scheduling import (

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uncertain_lti import SignalMap, Transient, fit
+from uncertain_lti import SignalMap, Transient
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.identification import fit
 from uncertain_lti.sampling.recall import with_memories
 from uncertain_lti.signals.memory import Memory
 from uncertain_lti.signals.templates import members_of

@@ -11,7 +11,6 @@
 
 import json
 import time
-from dataclasses import replace
 from fractions import Fraction
 from math import comb
 
@@ -23,20 +22,19 @@ from scipy import stats
 from tanks import DT, Tanks
 
 import uncertain_lti
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.reports.validation_text import validation_text
-from uncertain_lti.validation import calibration
-from uncertain_lti.validation.armed import Armed, Family, families, kinds_of, quiet, steady, values_of
 from uncertain_lti.validation.blocks import cut, remaining_spans
-from uncertain_lti.validation.calibration import calibrate
-from uncertain_lti.validation.detectable import COMPARED, detectable
-from uncertain_lti.validation.fitted_model import leave_out_with_fit, validate_model
+from uncertain_lti.validation.false_alarms import raised_on
+from uncertain_lti.validation.fitted_model import validate_model
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.validation.left_out import validate
-from uncertain_lti.validation.part import judge
+from uncertain_lti.validation.panel import learn
+from uncertain_lti.validation.part import judge, rising
 
 # --- intervals ---
 
@@ -146,7 +144,8 @@ def test_it_is_leaving_out_by_hand(runs, validation):
         assert part.name == runs[g].name and part.judged == verdicts.judged.sum()
         assert part.violated == verdicts.violated.sum()
         assert np.array_equal(part.violations, (verdicts.flags == 1).sum(axis=0))
-        assert part.alarms(AlarmRule(2, 3)) == np.count_nonzero(np.diff(verdicts.alarm.astype(int)) == 1)
+        edges = np.count_nonzero(np.diff(verdicts.alarm.astype(int)) == 1)
+        assert rising(raised_on([AlarmRule(2, 3)], part), part.starts) == edges
         width = (verdicts.upper - verdicts.lower)[verdicts.judged]
         assert part.mean_width == pytest.approx(width.mean(axis=0))
         assert part.max_width == pytest.approx(width.max(axis=0))
@@ -163,8 +162,8 @@ def test_the_summary_adds_up(validation, runs):
         i = int(name[1]) - 1
         assert state["mean_width_full"] == pytest.approx(validation.model.fit_summary["mean_width_recorded"][i])
         assert state["inside"] >= data["inside"] and 0.8 < state["left_out_to_full"] <= 1.01
-    rules = [(a["violations"], a["window"]) for a in data["false_alarms"]]
-    assert rules == [(2, 3), (1, 1), (3, 5)]  # the model's own first, none twice
+    rules = [a["rule"] for a in data["false_alarms"]]
+    assert rules == ["at least 2 of 3 verdicts violated", "at least 1 of 1 verdicts violated"]  # the model's own first
 
 
 @pytest.mark.parametrize(("m", "n"), [(1, 1), (2, 3), (5, 10)])
@@ -181,7 +180,7 @@ def test_alarms_are_those_of_the_monitor_at_any_margin(validation, runs, m, n):
         verdicts = EnvelopeMonitor(validation.model, m, n, margin).check(looped)
         alarm, reset = verdicts.alarm, np.concatenate([[False], np.diff(looped.t_ns) < 0])
         edges = alarm & ~np.concatenate([[False], alarm[:-1]]) | alarm & reset
-        assert part.alarms(AlarmRule(m, n, margin)) == np.count_nonzero(edges)
+        assert rising(raised_on([AlarmRule(m, n, margin)], part), part.starts) == np.count_nonzero(edges)
 
 
 def test_a_recording_that_leaves_the_others_envelope_changes_it():
@@ -315,7 +314,7 @@ def test_groups_of_one_recording_are_single_recordings(runs, validation):
     one, other = alone.to_dict(), validation.to_dict()
     for key in ("inside_interval", "false_alarms"):
         assert one[key] == other[key]
-    assert calibrate(alone, 600.0).alarm_rule == calibrate(validation, 600.0).alarm_rule
+    assert learn(alone).rules == learn(validation).rules
 
 
 def test_the_condition_stands_beside_every_interval(days):
@@ -325,13 +324,12 @@ def test_the_condition_stands_beside_every_interval(days):
     for groups, what in ((None, "recordings"), (names, "groups")):
         validation = validate(runs, groups=groups, additive="noise")
         data = validation.to_dict()
-        data["calibration"] = calibrate(validation, 2000.0).to_dict()
         text = validation_text(data)
         beside = f"if the {what} are independent"
         for line in text.splitlines():
             assert "90% interval" not in line or beside in line
         assert text.count("90% interval") == 3 and "holds if they are independent of one another" in text
-        assert beside in left_out_text(data) and beside in data["calibration"]["words"]
+        assert beside in left_out_text(data)
         missed = f"{1 - 0.1 ** (1 / validation.units):.0%}"  # of such runs, one in ten samples of so many has none
         assert f"in less than {missed} of the {what} may be in none of them" in text and "show all that happens" in text
 
@@ -380,199 +378,7 @@ def test_groups_that_are_likely_are_named_if_none_were_given(runs, hours, words)
 # --- calibration ---
 
 
-def test_calibration_keeps_to_the_target_and_says_what_it_costs(validation, runs):
-    hours = 120 / 3600
-    strict, loose = calibrate(validation, 5 / hours), calibrate(validation, 40 / hours)
-    assert strict.alarm_rule is not None and loose.alarm_rule is not None
-    for found in (strict, loose):
-        for c in found.candidates:
-            if c.margin is not None:
-                assert c.upper <= found.target
-                assert sum(p.alarms(AlarmRule(c.violations, c.window, c.margin)) for p in validation.parts) == c.alarms
-        assert "confidence" in found.words and "it sees in 90% of the cases a bias of" in found.words
-        json.dumps(found.to_dict(), allow_nan=False)
-    for a, b in zip(strict.candidates, loose.candidates, strict=True):
-        if a.margin is not None and b.margin is not None:
-            assert a.margin >= b.margin
-
-
-def test_few_groups_are_enough_for_fewer_rules(validation):
-    """The error is not shared with rules that the groups could not carry even without an alarm."""
-    by_day = replace(validation, parts=tuple(replace(p, group=f"day {i // 4}") for i, p in enumerate(validation.parts)))
-    hours = sum(p.hours for p in by_day.parts)
-    one = rate_interval(np.zeros(by_day.units), 1.0, validation.confidence, one_sided=True)[1] / hours
-    some, none = calibrate(by_day, 1.01 * one), calibrate(by_day, 0.99 * one)
-    assert [(c.violations, c.window) for c in some.candidates] == [(1, 1)] and some.needed_hours < hours
-    assert len(none.candidates) > 1 and none.alarm_rule is None and none.needed_hours > hours
-
-
-def test_calibration_refuses_what_so_little_cannot_show(validation):
-    found = calibrate(validation, 0.1)
-    assert found.alarm_rule is None and found.hours < found.needed_hours
-    assert "without a single alarm" in found.words
-    with pytest.raises(FitError, match="positive"):
-        calibrate(validation, 0.0)
-    with pytest.raises(FitError, match="alarm rule 3 of 2"):
-        calibrate(validation, 1.0, rules=[(3, 2)])
-
-
 # --- calibration of statistics ---
-
-
-@pytest.fixture(scope="module")
-def with_statistics(validation):
-    return calibrate(validation, 20 * 3600 / 120, statistics="mean,chi2")
-
-
-def test_statistics_are_armed_beside_containment(validation, with_statistics):
-    found = with_statistics
-    assert found.rules and found.rules[0] == found.alarm_rule and found.alarm_rule.margin >= 1.0
-    tried = {(c.family.kinds, c.window) for c in found.candidates if c.family.kinds}
-    sets = [("mean",), ("chi2",), ("mean", "chi2")]
-    assert tried == {(kinds, n) for kinds in sets for n in (6, 25)}, "four of the longest are a recording"
-    assert all(c.upper <= found.target for c in found.candidates if c.margin is not None)
-    together = next(c for c in found.candidates if len(c.family.kinds) == 2)
-    containment, mean, chi2 = together.rules
-    assert [rule.kind for rule in together.rules] == ["containment", "mean", "chi2"] and containment.margin >= 1.0
-    assert len(mean.threshold) == 3 and mean.window_s == chi2.window_s == pytest.approx(6 * DT)
-    data = found.to_dict()
-    json.dumps(data, allow_nan=False)
-    assert {"bias", "drift", "noise", "offset"} == set(data["faults"])
-    armed = validation.model.replace(alarm=together.rules)
-    assert UncertainLTI.from_dict(armed.to_dict()).alarm == together.rules
-
-
-def test_what_sees_the_smallest_faults_is_chosen(validation, with_statistics):
-    """Its sizes are those of `detectable` for the same rules, and no other candidate's are smaller."""
-    found = with_statistics
-    (chosen,) = [c for c in found.candidates if c.rules == found.rules]
-    known = [c.size for c in found.candidates if c.margin is not None]
-    assert chosen.size <= 1.02 * min(known) and max(known) > 1.1 * min(known)
-    again = detectable(
-        validation.model.replace(alarm=found.rules), validation.parts, found.within, kinds=COMPARED, cases=40
-    )
-    assert [f.size for f in again.faults] == [f.size for f in chosen.faults.faults]
-    sizes = [min(f.size, 2 * f.largest) / f.largest for f in again.faults]
-    assert chosen.size == pytest.approx(np.exp(np.mean(np.log(sizes))))
-    assert found.within == pytest.approx(again.within)
-    longer = calibrate(validation, found.target, rules=[(1, 1)], within=3.0)
-    assert longer.within == 3.0 and "within 3 s" in longer.words
-
-
-def test_a_level_is_above_the_factor_exactly_where_the_monitor_alarms(validation, runs):
-    armed = Armed(Family(("energy", "cusum", "chi2"), 5, 1, DT).rules(validation.model), validation.parts)
-    for g in (0, 7):
-        model = fit(runs[:g] + runs[g + 1 :], additive="noise")
-        for factor in (0.5, 0.8, 1.0, 1.3):
-            verdicts = EnvelopeMonitor(model, rules=armed.at(factor)).check(runs[g])
-            assert np.array_equal(verdicts.alarm[verdicts.judged], armed.levels[g] > factor)
-
-
-def test_thresholds_are_no_higher_than_what_was_left_out_needs(validation):
-    """With one recording far more restless than the few others, too: it counts once."""
-    parts = [
-        replace(p, utilisation=(1.0, 1.1, 3.0)[i] * p.utilisation, residual=(1.0, 1.1, 3.0)[i] * p.residual)
-        for i, p in enumerate(validation.parts[:3])
-    ]
-    for kind in ("energy", "chi2"):
-        rules, counts = quiet(Family((kind,), 10, 1, DT), validation.model, parts, 0)
-        assert not counts.any() and rules[1].kind == kind
-        levels = [values_of(rules, part) for part in parts]  # statistics are over their thresholds already
-        margin = max(float(level[0].max()) for level in levels) / rules[0].margin
-        assert 1 / 1.021 <= max(margin, *(float(level[1].max()) for level in levels)) <= 1.0
-
-
-def test_containment_of_several_verdicts_is_that_of_the_monitor(validation, runs):
-    armed = Armed([AlarmRule(2, 4)], validation.parts)
-    for g in (0, 7):
-        model = fit(runs[:g] + runs[g + 1 :], additive="noise")
-        for factor in (1.0, 1.2):
-            verdicts = EnvelopeMonitor(model, rules=armed.at(factor)).check(runs[g])
-            assert np.array_equal(verdicts.alarm[verdicts.judged], armed.levels[g] > factor)
-    assert armed.at(0.3) == (AlarmRule(2, 4, 1.0),)
-
-
-def test_quiet_rules_raise_as_many_alarms_as_are_allowed(validation):
-    """One search for `calibrate` and `tune`: the smallest factor, and its alarms are those counted."""
-    parts, factors = validation.parts, []
-    for family in (Family((), 1, 1, DT), Family(("energy",), 10, 1, DT)):
-        for allowed in (0, 3):
-            rules, counts = quiet(family, validation.model, parts, allowed)
-            assert counts.sum() <= allowed and rules[0].margin >= 1.0
-            factors.append(rules[-1].margin if not family.kinds else rules[-1].threshold[0])
-            if not family.kinds:
-                assert [p.alarms(rules[0]) for p in parts] == counts.tolist()
-                if rules[0].margin > 1.0:
-                    assert sum(p.alarms(AlarmRule(1, 1, rules[0].margin / 1.021)) for p in parts) > allowed
-    assert factors[1] <= factors[0] and factors[3] <= factors[2]
-
-
-def test_thresholds_are_those_that_halves_need_too(validation, runs):
-    """Never below those of `quiet`, the median of the halves where that is higher; and alarms are counted with them."""
-    options = {"criterion": "qp", "additive": "noise", "full": validation.model}
-    halves = [validate(runs, groups=[k // 3**j % 2 for k in range(12)], **options).parts for j in range(3)]
-    for family in (Family((), 1, 1, DT), Family(("energy",), 10, 1, DT)):
-        alone, counts = quiet(family, validation.model, validation.parts, 0)
-        same, again = steady(family, validation.model, validation.parts, [], 0)
-        assert same == alone and again.tolist() == counts.tolist()
-        rules, counts = steady(family, validation.model, validation.parts, halves, 3)
-        each = [quiet(family, validation.model, half, 3)[0] for half in halves]
-        own, _ = quiet(family, validation.model, validation.parts, 3)
-        assert rules[0].margin == max(own[0].margin, float(np.median([found[0].margin for found in each])))
-        raised = [p.alarms(rules[0]) for p in validation.parts]
-        if not family.kinds:
-            assert raised == counts.tolist() and rules[0].margin > own[0].margin  # half of them bound them worse
-        else:
-            limits = np.median([found[1].threshold for found in each], axis=0)
-            assert rules[1].threshold == tuple(np.maximum(own[1].threshold, limits).tolist())
-
-
-def test_statistics_see_small_faults_that_containment_misses(monkeypatch):
-    """A command that is off by a little for long, in white noise, at the same target."""
-    monkeypatch.setattr(calibration, "COMPARED", ("offset",))
-    rng = np.random.default_rng(0)
-    runs = []
-    for seed in range(6):
-        u = np.repeat(rng.normal(size=20), 10)[:, None]
-        x = np.zeros((200, 1))
-        for k in range(199):
-            x[k + 1] = 0.9 * x[k] + 0.1 * u[k] + 0.01 * rng.normal()
-        runs.append(Transient(np.arange(200) * 100_000_000, x, u, name=f"run{seed}"))
-    validation = validate(runs, criterion="lp", additive="disturbance")
-    found = calibrate(validation, 500.0, rules=[(1, 1)], statistics="mean", within=5.0)
-    plain, *averaged = found.candidates
-    assert [rule.kind for rule in found.rules] == ["containment", "mean"]
-    assert plain.margin is not None and min(c.size for c in averaged if c.margin) < 0.7 * plain.size
-
-
-def test_no_margin_lies_inside_the_envelope(validation):
-    """Below 1, samples like those that were fitted would count as violations."""
-    assert {c.margin for c in calibrate(validation, 5000.0).candidates} == {1.0}
-    assert calibrate(validation, 5000.0, statistics="energy").alarm_rule.margin == 1.0
-
-
-def test_windows_go_as_far_as_the_recordings_support(validation):
-    def tried(parts):
-        return [f.window for f in families(parts, DT)], sorted({f.window for f in families(parts, DT, [("mean",)])[1:]})
-
-    assert tried(validation.parts)[0] == [1, 5, 10], "100 steps"
-    long = [replace(p, dt=np.tile(p.dt, 10)) for p in validation.parts]
-    assert tried(long)[0] == [1, 5, 10, 50, 200], "1000 steps"
-    assert [f.window for f in families(long, DT, [("mean",)]) if f.kinds] == [15, 62, 250], "a quarter, and so on"
-    grouped = [replace(p, group=f"day {i // 4}") for i, p in enumerate(validation.parts)]
-    assert [f.window for f in families(grouped, DT, [("mean",)]) if f.kinds][-1] == 50, "half of a recording"
-
-
-@pytest.mark.parametrize("statistics", ["median", "", ","])
-def test_statistics_that_are_none_are_refused(validation, statistics):
-    with pytest.raises(FitError, match="choose from energy, mean, ewma, cusum, chi2, mewma, or all"):
-        kinds_of(statistics)
-
-
-def test_statistics_need_recordings_that_are_long_enough(validation):
-    short = [replace(p, dt=p.dt[:16], utilisation=p.utilisation[:16]) for p in validation.parts]
-    with pytest.raises(FitError, match="windows of at least 5 steps"):
-        calibrate(replace(validation, parts=tuple(short)), 500.0, statistics="all")
 
 
 # --- what is promised holds: fresh plants, fresh recordings, many times ---
@@ -645,73 +451,7 @@ def test_fit_prints_and_stores_what_leaving_out_gives(folder, capsys):
     printed = capsys.readouterr().out
     assert "left out one recording of 6 at a time" in printed and "false alarms per hour" in printed
     stored = UncertainLTI.load(folder / "m.json").validation
-    assert stored["kind"] == "transients" and stored["parts"] == 6 and len(stored["false_alarms"]) == 3
-
-
-def test_validate_then_watch_with_the_rule_found(folder, capsys):
-    capsys.readouterr()
-    model, better = str(folder / "m.json"), str(folder / "better.json")
-    assert main(["validate", model]) == 0
-    printed = capsys.readouterr().out
-    assert "left out one recording at a time (6 recordings)" in printed
-    assert "not enough transients" in printed or "holds if" in printed
-    assert main(["validate", model, "--false-alarms", "2000", "--output", better]) == 0
-    assert "at most 2000 false alarms per hour" in capsys.readouterr().out
-    found, before = UncertainLTI.load(better), UncertainLTI.load(model)
-    chosen = [(c["violations"], c["window"], c["margin"]) for c in found.validation["calibration"]["candidates"]]
-    assert (found.alarm_rule.violations, found.alarm_rule.window, found.alarm_rule.margin) in chosen
-    assert np.array_equal(found.A, before.A) and before.alarm_rule == AlarmRule()
-    assert main(["validate", model, "--blocks", "3", "--gap", "0.1", "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)["validation"]
-    assert data["kind"] == "blocks" and data["parts"] == 18 and data["gap"] == 0.1
-
-
-def test_statistics_on_the_command_line(folder, capsys):
-    capsys.readouterr()
-    model, better = str(folder / "m.json"), str(folder / "better.json")
-    assert main(["validate", model, "--statistics", "chi2"]) == 2
-    assert "--statistics goes with --false-alarms" in capsys.readouterr().err
-    assert main(["validate", model, "--statistics", "sum", "--false-alarms", "2000"]) == 2
-    assert "'sum' is none" in capsys.readouterr().err
-    assert main(["validate", model, "--statistics", "energy,chi2", "--false-alarms", "2000", "--output", better]) == 0
-    assert "alarm at" in capsys.readouterr().out
-    found = UncertainLTI.load(better)
-    tried = UncertainLTI.load(better).validation["calibration"]["candidates"]
-    assert ["energy", "chi2"] in [c["statistics"] for c in tried] and found.residuals is not None
-    assert main(["check", better, str(folder / "run0.mcap")]) in (0, 1)
-
-
-def test_without_a_rule_nothing_is_written(folder, capsys):
-    """Whoever asks for a rule and gets none must not go on with a file that looks as if it had one."""
-    model, target = str(folder / "m.json"), folder / "none.json"
-    capsys.readouterr()
-    assert main(["validate", model, "--false-alarms", "0.001", "--output", str(target)]) == 2
-    said = capsys.readouterr()
-    assert not target.exists() and "model written" not in said.out and "inside all bounds" in said.out
-    assert said.err.count("\n") == 1 and f"{target}: not written: no alarm rule" in said.err
-    before = (folder / "m.json").read_bytes()
-    assert main(["validate", model, "--false-alarms", "0.001", "--output", model, "--json"]) == 2
-    data = json.loads(capsys.readouterr().out)
-    assert data["model"] == model and not data["validation"]["calibration"]["reached"]
-    assert (folder / "m.json").read_bytes() == before
-    assert main(["validate", model, "--false-alarms", "0.001"]) == 0  # only told, nothing was to be written
-    capsys.readouterr()
-    assert main(["validate", model, "--output", str(target)]) == 0
-    assert "its alarm rule, unchanged: 1 of 1, margin 1" in capsys.readouterr().out
-
-
-def test_a_rule_that_sees_little_is_warned_of(folder, capsys, monkeypatch):
-    """The warning stands on its own line exactly when some state's biases and drifts are mostly missed."""
-    model, target = str(folder / "m.json"), str(folder / "found.json")
-    for share, warned in ((1e-9, True), (1e9, False)):
-        monkeypatch.setattr("uncertain_lti.validation.calibration.BLIND", share)
-        capsys.readouterr()
-        assert main(["validate", model, "--false-alarms", "2000", "--output", target, "--force"]) == 0
-        lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning:")]
-        found = UncertainLTI.load(target).validation["calibration"]
-        assert len(lines) == warned == bool(found["warning"])
-        if warned:
-            assert "fan, core is not seen within" in lines[0]
+    assert stored["kind"] == "transients" and stored["parts"] == 6 and len(stored["false_alarms"]) == 2
 
 
 def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
@@ -767,19 +507,6 @@ def test_what_a_fit_says_of_itself_does_not_depend_on_the_load(folder, capsys, m
     assert UncertainLTI.load(folder / "m.json").validation == before and before["parts"] == 6
 
 
-def test_what_was_not_left_out_is_unknown_and_said_so(folder, capsys, monkeypatch):
-    monkeypatch.setattr("uncertain_lti.validation.fitted_model.leave_out_with_fit.__defaults__", (None, None, 100.0))
-    capsys.readouterr()
-    assert fitted(folder) == 0
-    assert "not validated, so how it does on other recordings is unknown: it takes 6 fits" in capsys.readouterr().out
-    engine_bag(folder / "fresh.mcap", seed=9)
-    main(["report", str(folder / "m.json"), str(folder / "fresh.mcap"), "--json"])
-    rely = json.loads(capsys.readouterr().out)["rely"]
-    assert rely["answer"] in ("unknown", "no")
-    (reason,) = [r for r in rely["reasons"] if r["about"] == "validation"]
-    assert reason["weight"] == "unknown" and "it takes 6 fits" in reason["text"]
-
-
 def test_validate_refuses_what_it_cannot_vouch_for(folder, capsys):
     model = str(folder / "m.json")
     capsys.readouterr()
@@ -793,7 +520,6 @@ def test_validate_refuses_what_it_cannot_vouch_for(folder, capsys):
     weighted = weighted.replace(fit_summary={**weighted.fit_summary, "weights": "per state"})
     with pytest.raises(FitError, match="fitted with weights"):
         validate_model(weighted, [])
-    assert "weights" in leave_out_with_fit([Transient([0.0, 1.0], [[0.0]] * 2, [[0.0]] * 2)] * 2, weighted)["not_done"]
 
 
 # --- real recordings ---
@@ -831,7 +557,7 @@ def test_a_model_is_validated_with_its_own_settings(runs):
     by_hand = validate(
         runs[:6], full=model, criterion="lp", additive="noise", count="transient", confidence=0.8
     ).to_dict()
-    assert mine == by_hand and mine["false_alarms"][0]["violations"] == 2
+    assert mine == by_hand and "2 of 3" in mine["false_alarms"][0]["rule"]
     other = validate(runs[:6], criterion="qp", additive="noise").to_dict()
     assert mine["states"] != other["states"]
     assert (

@@ -30,12 +30,11 @@ from sensor_msgs.msg import JointState
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
 from uncertain_lti.cli.command import print_json
-from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.reports.figures import alarm_figure, envelope_figure, matrices_figure, save
-from uncertain_lti.reports.fit_text import fit_text
+from uncertain_lti.reports.fit_text import alarm_text, fit_text, headline_text
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti_ros.process import Life, living
 from uncertain_lti_ros.terminal import say, speed
@@ -74,9 +73,11 @@ def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     print("1. Fitting a healthy turbofan (a nonlinear model with noisy sensors): pulses of every control both ways,")
     print(f"   and a run under control: {', '.join(FIT)}")
     transients = read_transients([bags / name for name in FIT], turbofan_signals())
-    model = fit(transients, "lp", additive="noise", alarm_rule=AlarmRule(violations=2, window=5))
+    model = fit(transients, additive="noise")
     model.save(model_file)
+    print(headline_text(model))
     print(fit_text(model, transients))
+    print(alarm_text(model))
     print(f"   model: {model_file}")
 
     print(f"\n2. Playing {CHECK} at {args.rate:g} times real time to a live envelope_monitor node")

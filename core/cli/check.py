@@ -20,6 +20,7 @@ from uncertain_lti.cli.command import (
     BAD_INPUT,
     DONE,
     SILENT,
+    UNKNOWN,
     Command,
     add_model,
     add_recordings,
@@ -81,7 +82,8 @@ def run(options: argparse.Namespace) -> int:
                 options,
                 f"{plural(made.messages, 'message')} and the verdicts below {made.topics} written to {made.path}",
             )
-    status = ALARM if any(r["alarm"] for r in results) else BAD_INPUT if refused else DONE
+    strange = any(r["outcome"] == "unknown" for r in results)
+    status = ALARM if any(r["alarm"] for r in results) else BAD_INPUT if refused else UNKNOWN if strange else DONE
     if options.json:
         of_all = "unknown" if refused and status != ALARM else outcome(results)
         ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}

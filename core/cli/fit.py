@@ -40,11 +40,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser, "; parts of a split bag are one recording")
     add_signals(parser)
     add_output(parser, required=True)
-    parser.add_argument("--criterion", choices=("qp", "lp"), default="qp", help="(10) squared or (11) largest width")
+    parser.add_argument(
+        "--criterion",
+        choices=("qp", "lp"),
+        help="(10) squared or (11) largest width (default: what sees smaller jumps on left-out data)",
+    )
     parser.add_argument(
         "--additive",
         choices=CHOICES,
-        help="further terms: drift with its half-width, measurement noise (default: the signals file's, else none)",
+        help="further terms: drift with its half-width, measurement noise (default: the signals file's, else noise, "
+        "and the drift where it narrows the envelope clearly)",
+    )
+    parser.add_argument(
+        "--alarm",
+        choices=("panel", "containment"),
+        default="panel",
+        help="a small fixed panel of rules learnt on left-out data (default), or a sample outside its bounds",
+    )
+    parser.add_argument(
+        "--false-alarms",
+        type=float,
+        metavar="PER_HOUR",
+        help="false alarms per hour at most, with 90%% confidence (default: what the recordings can show)",
     )
     parser.add_argument(
         "--schedule",
@@ -96,10 +113,16 @@ def run(options: argparse.Namespace) -> int:
     """Fit a model and write it."""
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
-    from uncertain_lti.proposal.fitting import asked_for, horizons_asked_for, is_auto
-    from uncertain_lti.reports.fit_text import fit_text, horizons_text, next_text, recording_text, schedule_text
+    from uncertain_lti.reports.fit_text import (
+        alarm_text,
+        fit_text,
+        headline_text,
+        horizons_text,
+        next_text,
+        recording_text,
+        schedule_text,
+    )
     from uncertain_lti.reports.validation_text import left_out_text
-    from uncertain_lti.validation.fitted_model import leave_out_with_fit
     from uncertain_lti.validation.groups import resolve_groups
 
     output = model_target(options.output, options.force)
@@ -114,10 +137,6 @@ def run(options: argparse.Namespace) -> int:
             print_notes(options, transient.notes)
         print_summary(options, recording_text(transient))
     resolve_groups(transients, options.group)  # what is wrong with the key is found before the fit
-    suggest = not options.no_suggest
-    asked = asked_for(transients, schedule)
-    rule = horizons_asked_for(transients, options.horizons, options.widths)
-    leaves_out = (is_auto(asked) if asked else suggest) or (rule is not None and rule.leaves_out)
     with options.progress.stage("fitting") as step:
         model = fit(
             transients,
@@ -126,8 +145,10 @@ def run(options: argparse.Namespace) -> int:
             schedule=schedule,
             horizons=options.horizons,
             widths=options.widths,
-            groups=options.group if leaves_out else None,
-            suggest=suggest,
+            alarm=options.alarm,
+            false_alarms=options.false_alarms,
+            groups=options.group,
+            suggest=not options.no_suggest,
             discard=options.discard,
             count=options.count,
             seek_carriers=True,
@@ -138,22 +159,22 @@ def run(options: argparse.Namespace) -> int:
     model = model.replace(fit_summary={**model.fit_summary, "sources": sources})
     if options.group is not None:
         model = model.replace(fit_summary={**model.fit_summary, "group": options.group})
-    with options.progress.stage("validating") as step:
-        left_out = leave_out_with_fit(transients, model, options.group, step)
-    model = model.replace(validation=left_out)
     model.save(output)
     if options.json:
         data = model.to_dict()
         print_json({"model": str(output), "fit": data["fit"], "validation": data["validation"]})
     else:
+        print_summary(options, headline_text(model))
         for choice in model.fit_summary.get("schedule", []):
             print_summary(options, schedule_text(choice))
         if choice := model.fit_summary.get("horizon_choice"):
             print_summary(options, horizons_text(choice))
         print_summary(options, fit_text(model, transients))
-        print_summary(options, left_out_text(left_out))
+        print_summary(options, alarm_text(model))
+        if model.validation:
+            print_summary(options, left_out_text(model.validation))
         print_summary(options, f"model written to {output}")
-        print_summary(options, next_text(model, shlex.quote(str(output)), left_out))
+        print_summary(options, next_text(model, shlex.quote(str(output))))
     return DONE
 
 
@@ -191,7 +212,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
             model = fit_archive(
                 options.bags,
                 options.signals,
-                options.criterion,
+                options.criterion or "qp",
                 options.additive,
                 schedule=schedule,
                 cache=options.cache,
@@ -206,7 +227,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
     else:
         print_summary(options, archive_text(model))
         print_summary(options, f"model written to {output}")
-        print_summary(options, next_text(model, shlex.quote(str(output)), None))
+        print_summary(options, next_text(model, shlex.quote(str(output))))
     return DONE
 
 

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Command `uncertain-lti tune`: choose how to fit, and what raises the alarm, by the faults that are seen."""
+"""Command `uncertain-lti tune`: what fit does not try by itself."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from uncertain_lti.cli.command import (
     add_output,
     add_recordings,
     add_signals,
-    add_within,
     model_target,
     print_json,
     print_notes,
@@ -39,33 +38,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser, " of the healthy machine; LABEL=BAG is one of a machine with the fault LABEL")
     add_signals(parser)
     parser.add_argument(
-        "--false-alarms", required=True, type=float, metavar="PER_HOUR", help="false alarms per hour at most"
+        "--false-alarms", type=float, metavar="PER_HOUR", help="as in fit (default: what the recordings can show)"
     )
-    add_within(parser)
     parser.add_argument(
-        "--budget", type=_time, default=math.inf, metavar="TIME", help="begin nothing new after 90s, 10m or 1h"
+        "--budget", type=_time, default=math.inf, metavar="TIME", help="stop after 90s, 10m or 1h with the best so far"
     )
     parser.add_argument("--group", metavar="KEY", help=GROUP)
-    parser.add_argument("--cache", metavar="FOLDER", help="keep what every way came to, and go on from there")
     add_output(parser, required=False)
-    parser.add_argument("--figure", metavar="FILE", help="draw detectable size against false alarms (PNG, SVG, PDF)")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(options: argparse.Namespace) -> int:
     """Try the ways, print them, and write the model that was chosen."""
     from uncertain_lti import Transient, read_transients, tune
-    from uncertain_lti.base.files import sha256, target
+    from uncertain_lti.base.files import sha256
+    from uncertain_lti.reports.fit_text import alarm_text, headline_text
     from uncertain_lti.reports.tune_text import tune_text
     from uncertain_lti.validation.groups import resolve_groups
 
     output = None if options.output is None else model_target(options.output, options.force)
-    figure = None
-    if options.figure is not None:
-        suffix = os.path.splitext(options.figure)[1].lower()
-        if suffix not in _FIGURES:
-            raise FitError(f"{options.figure}: is no figure that can be drawn; name it *{', *'.join(_FIGURES)}")
-        figure = target(options.figure, holds=_FIGURES[suffix], kind="figure", example="tune.png")
     healthy = [bag for bag in options.bags if _label(bag) is None]
     if not healthy:
         raise FitError("no recording of the healthy machine is named; give at least one without a label")
@@ -83,23 +74,18 @@ def run(options: argparse.Namespace) -> int:
         tuned = tune(
             transients,
             options.false_alarms,
-            within=options.within,
             budget=options.budget,
             groups=options.group,
             faulty=faulty,
-            cache=options.cache,
             progress=step,
         )
     data = tuned.to_dict()
     if options.json:
         print_json({"model": options.output, "tune": data})
     else:
+        print_summary(options, headline_text(tuned.model))
         print_summary(options, tune_text(data))
-    if figure is not None:
-        from uncertain_lti.reports.tune_figure import tune_figure
-
-        tune_figure(data, figure)
-        print_summary(options, f"figure written to {figure}")
+        print_summary(options, alarm_text(tuned.model))
     if output is not None:
         files = dict.fromkeys(name for t in transients for name in t.sources)
         sources = [{"file": name, "sha256": sha256(name)} for name in files]
@@ -108,10 +94,6 @@ def run(options: argparse.Namespace) -> int:
         tuned.model.replace(fit_summary=facts).save(output)
         print_summary(options, f"model written to {output}")
     return DONE
-
-
-_FIGURES = {".png": b"PNG", ".svg": b"svg", ".pdf": b"%PDF"}
-"""Kinds of figures, with what each file of the kind begins with."""
 
 
 def _label(text: str) -> str | None:
@@ -134,7 +116,7 @@ def _time(text: str) -> float:
 
 COMMAND = Command(
     "tune",
-    "choose how to fit, and what raises the alarm, by the faults that are seen on left-out data",
+    "try delays, schedules, lags and horizons, and take what sees clearly smaller jumps than fit",
     add_arguments,
     run,
     quiet=SILENT,

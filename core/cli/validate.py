@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import argparse
 import os
+from dataclasses import replace
 
-from uncertain_lti.base.errors import BagError, FitError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.command import (
     DONE,
     GROUP,
@@ -42,20 +43,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gap", type=float, help="s before and after a left-out block that are not fitted either")
     parser.add_argument("--confidence", type=float, default=0.9, help="of every interval (default: 0.9)")
     parser.add_argument(
-        "--false-alarms", type=float, metavar="PER_HOUR", help="find the alarm rule that stays below this rate per hour"
+        "--false-alarms",
+        type=float,
+        metavar="PER_HOUR",
+        help="learn the panel again, for at most so many false alarms per hour with 90%% confidence",
     )
     add_within(parser)
     parser.add_argument(
-        "--statistics",
-        metavar="LIST",
-        help="with --false-alarms: arm these statistics over a window, too: energy, mean, ewma, cusum, chi2, "
-        "mewma, with commas between them, or all",
-    )
-    parser.add_argument(
         "--output",
         metavar="MODEL",
-        help="write the model with this validation, and the alarm rule found, to this file; where --false-alarms "
-        "finds none, nothing is written and the exit status is 2",
+        help="write the model with this validation, and the panel that was learnt, to this file",
     )
     add_force(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -64,13 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Validate the model and write it with the result, if an output is named."""
     from uncertain_lti import UncertainLTI
-    from uncertain_lti.model.alarm_rule import AlarmRule
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.validation_text import validation_text
     from uncertain_lti.sampling.reading import read_as_fitted
-    from uncertain_lti.validation.calibration import calibrate
     from uncertain_lti.validation.detectable import check_within, detectable
     from uncertain_lti.validation.fitted_model import validate_model
+    from uncertain_lti.validation.panel import learn, promises
 
     check_within(options.within)
     model = UncertainLTI.load(options.model)
@@ -78,8 +74,6 @@ def run(options: argparse.Namespace) -> int:
     bags = options.bags or list(dict.fromkeys(s["file"] for s in sources))
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
-    if options.statistics is not None and options.false_alarms is None:
-        raise FitError("--statistics goes with --false-alarms: their thresholds follow from the rate; give both")
     if options.output is not None:
         own = os.path.exists(options.output) and os.path.samefile(options.output, options.model)
         model_target(options.output, options.force or own)
@@ -99,23 +93,18 @@ def run(options: argparse.Namespace) -> int:
             confidence=options.confidence,
             progress=step,
         )
-    data = validation.to_dict()
-    refusal = ""
+    said: list[str] = []
     if options.false_alarms is not None:
-        calibration = calibrate(
-            validation, options.false_alarms, within=options.within, statistics=options.statistics or ()
-        )
-        data["calibration"] = calibration.to_dict()
-        if calibration.alarm_rule is not None:
-            model = model.with_residuals_of(validation.model).replace(alarm=calibration.rules)
-        elif options.output is not None:
-            refusal = f"{options.output}: not written: {calibration.words}"
+        panel = learn(validation, options.false_alarms)
+        model = model.with_residuals_of(validation.model).replace(alarm=panel.rules)
+        said = promises(model, panel)
+    data = replace(validation, model=model).to_dict() | ({"promises": said} if said else {})
     with options.progress.stage("injecting faults") as step:
         data["detectable"] = detectable(
             model, validation.parts, options.within, confidence=options.confidence, progress=step
         ).to_dict()
     model = model.replace(validation=data)
-    output = None if refusal else options.output
+    output = options.output
     if output is not None:
         model.save(output)
     if options.json:
@@ -123,16 +112,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         print_summary(options, validation_text(data))
         if output is not None:
-            rule = "; ".join(
-                f"{r.violations} of {r.window}, margin {r.margin:.3g}" + f" over {r.horizon} steps" * (r.horizon > 1)
-                if isinstance(r, AlarmRule)
-                else r.words
-                for r in model.alarm
-            )
-            kept = ", unchanged" if options.false_alarms is None else ""
-            print_summary(options, f"model written to {output}; its alarm rule{kept}: {rule}")
-    if refusal:  # whoever asked for a rule and deploys the file would deploy one without it
-        raise FitError(refusal)
+            print_summary(options, f"model written to {output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
     return DONE
 
 

@@ -7,10 +7,11 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""fit() as users call it: that of the identification, with the schedule that the recordings carry."""
+"""fit() as users call it: a monitor, with the terms, the schedule and the horizons that the recordings carry."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -23,7 +24,7 @@ from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Knots, asked_by, check_names, signals_of, unused
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import Rule
 from uncertain_lti.model.horizon import Widths
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
@@ -36,11 +37,15 @@ from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.horizon_rule import HorizonRule, WidthChoice
 from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.validation.monitor_fit import fit_monitored
+
+NARROWER = 0.75
+"""A drift that nobody asks for is fitted if the mean width shrinks to this share, the geometric mean over states."""
 
 
 def fit(
     transients: Sequence[Transient] | Transient,
-    criterion: Literal["qp", "lp"] = "qp",
+    criterion: Literal["qp", "lp"] | None = None,
     weights: ArrayLike | Sequence[ArrayLike] | None = None,
     additive: Additive | None = None,
     operating_point: OperatingPoint | None = None,
@@ -55,12 +60,18 @@ def fit(
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
     seek_carriers: bool = False,
-    alarm_rule: AlarmRule | None = None,
+    alarm: Literal["panel", "containment"] | Sequence[Rule] = "panel",
+    false_alarms: float | None = None,
     progress: Callable[[str], None] | None = None,
     groups: Sequence[Any] | str | None = None,
     suggest: bool = False,
 ) -> UncertainLTI:
-    """Fit dx/dt = (A ± ΔA) x + (B ± ΔB) u so that the one-step bounds contain every recorded sample.
+    """Fit dx/dt = (A ± ΔA) x + (B ± ΔB) u so that the one-step bounds contain every recorded sample, and arm it.
+
+    Without options it gives a monitor: criterion and additive term are chosen, and the thresholds of a small fixed
+    panel of alarm rules are learnt, by what is left out of the fit (`validation.panel`): recordings or groups, or
+    blocks of a single recording. What is given by hand is kept: `fit(transients, "qp", additive="none",
+    alarm="containment")` is the paper's form.
 
     Leibov (2006), eq. (10), the least sum of squared widths weighted by W, or eq. (11), the least largest width
     per row. Ties: for (11) the least sum of squared widths among its optima; then, for both, the least sum of
@@ -70,14 +81,14 @@ def fit(
     ----------
     transients : Transient or sequence of Transient
         Recordings, of any lengths, of the same states and controls; never joined to one another.
-    criterion : {"qp", "lp"}
-        Eq. (10) or eq. (11).
+    criterion : {"qp", "lp"}, optional
+        Eq. (10) or eq. (11). Default: the one whose panel sees the smaller jumps on what was left out.
     weights : array (n,), (N, n), (N, n, n), or a list with one of the latter two per transient, optional
         W(t_{k+1}) for step k of N; positive; full matrices symmetric positive definite. Off-diagonal elements
         couple the rows in (10); (11) uses the diagonal. Default ones.
     additive : {"none", "disturbance", "noise", "both"}, optional
         Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise). Default:
-        that of the signals file, else none.
+        that of the signals file, else noise, and the drift where it narrows the envelope clearly.
     operating_point : OperatingPoint, optional
         Steady state and scales; default: those of the transients' signals, or values used as they are.
     transient_weights : sequence of float, optional
@@ -111,12 +122,16 @@ def fit(
     seek_carriers : bool
         Say there as well which few transitions make a state's envelope much wider than the others need. Takes several
         times as long as the fit; beyond 200 000 transitions it is not sought.
-    alarm_rule : AlarmRule, optional
-        Goes to the model file.
+    alarm : {"panel", "containment"} or sequence of AlarmRule or StatisticRule, default "panel"
+        What raises the alarm: the panel, with what it promises in `model.fit_summary["alarm"]`; a sample outside its
+        bounds; or these rules.
+    false_alarms : float, optional
+        False alarms per hour at most, the upper limit with 90 % confidence, that the panel is learnt for. Default: what
+        the recordings can show. If they cannot show the rate, the nearest is taken, and the summary says so.
     progress : callable, optional
         Called with one line of text per pass over the data, and per discard.
     groups : sequence or str, optional
-        What is left out together, for what is chosen and `suggest`: one name per recording, or a key, as in `validate`.
+        What is left out together: one name per recording, or a key, as in `validate`.
     suggest : bool, default False
         Try, where no schedule is asked for, whether one would pay, or a lag, rate or difference of a signal, on a part
         of the recordings (`suggest_schedule`, `suggest_memories`). The answer is among the messages, its tables in
@@ -136,10 +151,18 @@ def fit(
         are given and nothing is left out.
     """
     transients = listed_transients(transients)
+    if criterion not in (None, "qp", "lp"):
+        raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
+    if isinstance(alarm, str) and alarm not in ("panel", "containment"):
+        raise FitError(f"alarm is {alarm!r}; it must be panel, containment, or a list of rules")
+    if false_alarms is not None and alarm != "panel":
+        raise FitError("false_alarms is what the panel is learnt for; leave alarm or false_alarms out")
+    if additive is None and transients and transients[0].signals is not None:
+        additive = transients[0].signals.additive
     options: dict[str, Any] = {
-        "criterion": criterion,
+        "criterion": criterion or "lp",
         "weights": weights,
-        "additive": additive,
+        "additive": additive or "noise",
         "operating_point": operating_point,
         "count": count,
         "structure": structure,
@@ -151,8 +174,9 @@ def fit(
     chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
     automatic = [name for name, knots in chosen.items() if _is_auto(knots)]
     suggest = suggest and not asked
-    if groups is not None and not (automatic or suggest or (rule is not None and rule.leaves_out)):
-        raise FitError("groups are given, and the fit leaves nothing out; leave them out, or choose knots auto")
+    leaves_out = alarm == "panel" or automatic or suggest or (rule is not None and rule.leaves_out)
+    if groups is not None and not leaves_out:
+        raise FitError("groups are given, and the fit leaves nothing out; leave them out, or take the panel as alarm")
     if automatic and transient_weights is not None:
         raise FitError(
             f"the knots of '{automatic[0]}' are auto, which leaves recordings out, and transient_weights are for all "
@@ -203,18 +227,21 @@ def fit(
             lengths, choice_of_horizons = chosen_horizons.chosen, chosen_horizons.facts()
             listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
             messages.append(f"{listed}: {chosen_horizons.reason}")
-    model = fitting.fit(
-        transients,
-        **options,
-        transient_weights=transient_weights,
-        schedule=asked,
-        horizons=list(lengths),
-        widths=lengths,
-        describe_data=describe_data,
-        seek_carriers=seek_carriers,
-        alarm_rule=alarm_rule,
-        progress=progress,
-    )
+    options |= {"schedule": asked, "horizons": list(lengths), "widths": lengths}
+    options["transient_weights"] = transient_weights
+    said: dict[str, Any] = {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
+    if alarm == "panel" and method == "working-set":
+        if additive is None and not asked:
+            options["additive"] = _terms(transients, options)
+        tried = [
+            fit_monitored(transients, groups=groups, false_alarms=false_alarms, **{**options, "criterion": one}, **said)
+            for one in ((criterion,) if criterion else ("lp", "qp"))
+        ]
+        model = min(tried, key=lambda way: math.inf if way.panel is None else way.panel.figure).finished()
+    else:
+        model = fitting.fit(transients, **options, **said)
+        if not isinstance(alarm, str):
+            model = model.replace(alarm=alarm)
     added: dict[str, Any] = {"schedule": facts} if facts else {}
     if choice_of_horizons:
         added["horizon_choice"] = choice_of_horizons
@@ -230,6 +257,18 @@ def fit(
         there = model.fit_summary.get("messages", [])
         model = model.replace(fit_summary={**model.fit_summary, **added, "messages": [*there, *messages]})
     return model
+
+
+def _terms(transients: Sequence[Transient], options: Mapping[str, Any]) -> Additive:
+    """Noise; or both, where a drift narrows the envelope clearly."""
+    widths = []
+    for additive in ("noise", "both"):
+        try:
+            model = fitting.fit(transients, **{**options, "additive": additive}, describe_data=False)
+        except FitError:
+            return "noise"  # what is wrong with the recordings is said of the fit itself
+        widths.append(np.log(np.maximum(model.fit_summary["mean_width"], 1e-300)).mean())
+    return "both" if widths[1] < widths[0] + math.log(NARROWER) else "noise"
 
 
 def asked_for(

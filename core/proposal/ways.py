@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Ways to fit that `tune` tries: additive terms, criteria, widths, delays, schedules, lags and rates, horizons."""
+"""Ways to fit that `tune` tries beside the one of `fit`: delays, schedules, lags and rates, horizons."""
 
 from __future__ import annotations
 
@@ -21,28 +21,17 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.sensors import late_controls
-from uncertain_lti.identification.structure import Structure
 from uncertain_lti.proposal.memories import Remembered, memory_candidates, operating_point, remember
 from uncertain_lti.proposal.suggestion import TRANSITIONS, promise, thinned
 from uncertain_lti.sampling.recall import with_delays
 from uncertain_lti.sampling.transient import Transient
 
-PLAIN = "plain fit: "
-"""What the words of the plain fit begin with."""
 KNOTS = (2, 3, 5)
 """Numbers of knots tried on a promising signal."""
 PROMISING, SIGNALS = 0.9, 2
 """Largest least-squares residual with three knots, relative to one, up to which a signal is tried; and how many are."""
 LONGEST = 64
 """Steps of the longest horizon tried."""
-_ADDITIVE = {
-    "none": "no additive term",
-    "noise": "noise",
-    "disturbance": "drift",
-    "both": "drift and noise",
-}
-
-
 @dataclass(frozen=True)
 class Setting:
     """One way to fit.
@@ -56,7 +45,6 @@ class Setting:
     options: Mapping[str, Any]
     memories: tuple[Remembered, ...] = ()
     delays: tuple[tuple[str, int], ...] = ()
-    constant: bool = False
 
     def prepared(self, transients: Sequence[Transient]) -> list[Transient]:
         """The recordings with the delays and memories of this setting."""
@@ -66,32 +54,7 @@ class Setting:
 
     def beside(self, what: str, **changes: Any) -> Setting:
         """This one with something more."""
-        return replace(self, words=f"{self.words.removeprefix(PLAIN)}, {what}", **changes)
-
-    def arguments(self, transients: Sequence[Transient]) -> dict[str, Any]:
-        """Arguments of `fit` for recordings that were prepared."""
-        options: dict[str, Any] = {"schedule": {}, **self.options}  # not that of the signals file, which may be auto
-        if self.constant:
-            n, m = transients[0].x.shape[1], transients[0].u.shape[1]
-            options["structure"] = Structure(n, m, fixed={"dA": np.zeros((n, n)), "dB": np.zeros((n, m))})
-        return options
-
-
-def plain(transients: Sequence[Transient]) -> Setting:
-    """The fit without options: (10) with the additive term of the signals file."""
-    asked = transients[0].signals.additive if transients[0].signals is not None else None
-    additive = asked or "none"
-    return Setting(f"{PLAIN}(10), {_ADDITIVE[additive]}", {"criterion": "qp", "additive": additive})
-
-
-def fits(transients: Sequence[Transient]) -> Iterator[Setting]:
-    """Additive terms, criteria and half-widths."""
-    for additive in ("none", "noise", "disturbance", "both"):
-        for criterion, name in (("qp", "(10)"), ("lp", "(11)")):
-            yield Setting(f"{name}, {_ADDITIVE[additive]}", {"criterion": criterion, "additive": additive})
-        if additive != "none" and transients[0].u.shape[1] + transients[0].x.shape[1]:
-            words = f"(11), {_ADDITIVE[additive]}, constant widths"
-            yield Setting(words, {"criterion": "lp", "additive": additive}, constant=True)
+        return replace(self, words=f"{self.words}, {what}", **changes)
 
 
 def delays(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:

@@ -29,8 +29,10 @@ from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 
-UNVOUCHED = 0.2
-"""Share of the verdicts outside the fitted domain from which on their quiet says nothing."""
+UNVOUCHED, STRANGE = 0.2, 0.5
+"""Share of the verdicts outside the fitted domain from which on their quiet says nothing, or the machine is another."""
+JUDGED = 0.5
+"""Share of the steps that must have a verdict for their quiet to say something."""
 MOST_EXPLAINED = 100
 """Patterns of alarms that are explained."""
 OUTCOMES = ("alarm", "unknown", "violations", "quiet")
@@ -106,17 +108,11 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     }
     data["explained"] = _explained(model, verdicts)
     share = data["outside_domain"] / judged if judged else 1.0
-    unknown = share > UNVOUCHED
+    reason = _why_unknown(model, verdicts, data)
+    unknown = bool(reason)
     data["outside_domain_share"] = share if judged else None
     data["outcome"] = OUTCOMES[0 if alarms else 1 if unknown else 2 if data["violated"] else 3]
-    data["reason"] = (
-        ""
-        if not unknown
-        else f"{share:.2%} of the verdicts are outside the fitted domain, where nothing vouches for the bounds; fit "
-        f"recordings that reach as far" + f" ({'; '.join(data['unknown'])})" * bool(data["unknown"])
-        if judged
-        else "; ".join(["no verdict was possible, so nothing is known", *data["unknown"]])
-    )
+    data["reason"] = reason
     if samples:
         block, table = sample_blocks(model, verdicts), verdicts.horizon_utilisation
         data["verdict_per_sample"] = [
@@ -142,6 +138,32 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
             for k, status in enumerate(verdicts.statuses())
         ]
     return data
+
+
+def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) -> str:
+    """Why a check says nothing of the machine; empty if it does."""
+    judged, steps = data["verdicts"], max(data["samples"] - 1, 1)
+    if verdicts.asked is not None:
+        steps = max(int(verdicts.asked.sum()) - 1, 1)
+    if not judged:
+        return "; ".join(["no verdict was possible, so nothing is known", *data["unknown"]])
+    if judged < JUDGED * steps:
+        why = f" ({', '.join(data['no_verdict'])})" if data["no_verdict"] else ""
+        return f"only {judged} of {steps} steps could be judged{why}"
+    share = data["outside_domain"] / judged
+    if share > UNVOUCHED:
+        ask = "is this the same machine, in the same units? " if share > STRANGE else ""
+        return (
+            f"{share:.2%} of the verdicts are outside the fitted domain, where nothing vouches for the bounds; {ask}"
+            f"fit recordings that reach as far" + f" ({'; '.join(data['unknown'])})" * bool(data["unknown"])
+        )
+    alarm = model.fit_summary.get("alarm")
+    if isinstance(alarm, dict) and alarm.get("worth") == "none":
+        return f"the model is {alarm['headline']}"
+    x, span = verdicts.transient.x[verdicts.judged], model.domain.x_max - model.domain.x_min
+    if (span > 0).any() and not np.ptp(x, axis=0).any():
+        return "nothing that is judged moves in it"
+    return ""
 
 
 def _explained(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:

@@ -42,7 +42,13 @@ def check_text(data: dict[str, Any]) -> str:
         )
     inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} inside all bounds"
     head = f"{data['recording']}: {plural(data['samples'], 'sample')}, {plural(data['verdicts'], 'verdict')}, {inside}"
+    first = []
+    if data["outcome"] == "unknown":
+        first = [f"UNKNOWN: {data['reason']}"]
+    elif data["alarm"] and data["reason"]:
+        first = [f"ALARM, and beware: {data['reason']}"]
     lines = [
+        *first,
         head + (f"; no verdict or not used: {', '.join(data['no_verdict'])}" if data["no_verdict"] else ""),
         table(("state", "violations", "inside", "mean width", "largest", "first", "longest"), rows),
     ]
@@ -70,10 +76,8 @@ def check_text(data: dict[str, Any]) -> str:
         by = [r["words"] for r in first.get("raised", ()) if r["rule"] != "containment"]
         if by:
             lines.append(f"  raised by {', '.join(by[:MOST_REPEATS])}")
-    elif data["outcome"] == "unknown" and data["verdicts"]:
-        lines.append(f"no alarm, but UNKNOWN: {data['reason']}")
-    else:
-        lines.append("no alarm" if data["verdicts"] else data["reason"])
+    elif data["verdicts"]:
+        lines.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
     return "\n".join(lines)
 
 

@@ -20,7 +20,6 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.reports.model_text import dynamics_text, horizon_widths_text
-from uncertain_lti.reports.reliance import TOO_FEW_INSIDE
 from uncertain_lti.reports.tables import number, table
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
@@ -141,47 +140,37 @@ def archive_text(model: UncertainLTI) -> str:
     )
 
 
-WIDE = 0.3
-"""Mean width, as a share of the state's range, from which on an envelope says little."""
+def headline_text(model: UncertainLTI) -> str:
+    """Whether the model is worth having, in one line."""
+    alarm = model.fit_summary.get("alarm", {})
+    if headline := alarm.get("headline"):
+        return str(headline)
+    why = alarm.get("not_learnt") or "the alarm was given"
+    return f"alarm not learnt on left-out data, so nothing says what it is worth: {why}"
 
 
-def next_text(model: UncertainLTI, file: str, left_out: dict[str, Any] | None) -> str:
-    """What to look at after a fit: the worry that weighs most, and the commands that tell more."""
+def alarm_text(model: UncertainLTI) -> str:
+    """What raises the alarm, and what it promises."""
+    lines = ["alarm: " + "; or ".join(rule.words for rule in model.alarm)]
+    alarm = model.fit_summary.get("alarm", {})
+    lines += [f"  {text}" for text in alarm.get("promises", [])]
+    return "\n".join([*lines, *(f"  {alarm[key]}" for key in ("note",) if key in alarm)])
+
+
+def next_text(model: UncertainLTI, file: str) -> str:
+    """What to look at after a fit: the first thing that a person can mend, and the commands that tell more."""
     facts = model.fit_summary
-    span = model.domain.x_max - model.domain.x_min
-    share = np.asarray(facts["mean_width"]) / np.where(span > 0, span, np.inf)
-    widest = int(np.argmax(share))
-    inside = None if left_out is None else left_out.get("inside")
-    outside = (
-        ""
-        if inside is None or inside >= 0.99
-        else f"{1 - inside:.1%} of what was left out falls outside, so expect false alarms; record more of what the "
-        f"machine will do, or let validate --false-alarms find an alarm rule that stays quiet"
-    )
-    if inside is not None and inside < TOO_FEW_INSIDE:
-        worry = outside
-    elif share[widest] > WIDE:
-        worry = (
-            f"the bounds of '{model.state_names[widest]}' are {share[widest]:.0%} as wide as its range, so only gross "
-            f"faults would be seen: "
-        )
-        worry += (
-            remedies(facts.get("messages", []), facts["additive"], model.state_names[widest])
-            or "what moves it may be missing among the controls"
-        )
-    elif outside:
-        worry = outside
-    elif minded := [text for text in facts.get("messages", []) if "schedules nothing" not in text]:
-        worry = minded[0]
-    elif facts["transients"] == 1:
+    minded = [text for text in facts.get("messages", []) if "schedules nothing" not in text]
+    blind = facts.get("alarm", {}).get("worth") in ("none", "some")
+    remedy = remedies(facts.get("messages", []), facts["additive"], model.state_names[0]) if blind else ""
+    worry = remedy or (minded[0] if minded else "")
+    if not worry and facts["transients"] == 1:
         worry = "one recording says nothing of another day; check the model on one that was not fitted"
-    else:
-        worry = ""
     lines = [f"look first at: {worry}"] if worry else []
     rows = [
-        (f"uncertain-lti check {file} BAG", "is a recording that was not fitted inside?"),
-        (f"uncertain-lti validate {file}", "how far to trust it; an alarm rule for a rate of false alarms"),
+        (f"uncertain-lti check {file} BAG", "is there an alarm on a recording that was not fitted?"),
         (f"uncertain-lti report {file} BAG", "may I rely on it, and what happened? a page with figures"),
+        (f"envelope_monitor --ros-args -p model:={file}", "the same live"),
     ]
     width = max(len(command) for command, _ in rows)
     return "\n".join([*lines, "next:", *(f"  {command.ljust(width)}  {text}" for command, text in rows)])

@@ -110,6 +110,14 @@ def _regime_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]
 
 
 def _validation_reasons(validation: Mapping[str, Any] | None, model: UncertainLTI) -> list[dict[str, str]]:
+    alarm = model.fit_summary.get("alarm")
+    if isinstance(alarm, Mapping) and alarm.get("headline"):
+        weight = {"good": YES, "some": CARE}.get(str(alarm.get("worth")), NO)
+        promised = "; ".join(map(str, list_of(alarm.get("promises"))))
+        found = [_reason(weight, "alarm", f"{alarm['headline']}; {promised}")]
+        if validation is not None and validation.get("hint"):
+            found.append(_reason(CARE, "validation", validation["hint"]))
+        return found
     if validation is None or validation["inside"] is None:
         how = "run `uncertain-lti validate MODEL --output MODEL` where its recordings are"
         why = f" ({why})" if (why := model.validation.get("not_done")) else ""
@@ -158,7 +166,8 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
         listed = ", ".join(f"{shortened(name)} ({wide[name]:.0%})" for name in useless[:6])
         listed += " ..." if len(useless) > 6 else ""
         text = f"bounds over {TOO_WIDE:.0%} as wide as the state's own range {where} say next to nothing: {listed}"
-        return [_reason(NO if 2 * len(useless) >= model.n else CARE, "tightness", text)]
+        armed = isinstance(model.fit_summary.get("alarm"), Mapping)  # a window sees less than what a width says
+        return [_reason(NO if 2 * len(useless) >= model.n and not armed else CARE, "tightness", text)]
     worst = max(wide, key=lambda name: wide[name])
     text = f"one-step bounds are at most {wide[worst]:.3g} times as wide as the state's own range {where} "
     return [_reason(CARE if names else YES, "tightness", f"{text}({shortened(worst)})")]

@@ -11,44 +11,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
-from uncertain_lti.base.english import plural
 from uncertain_lti.reports.tables import number, table
 
-_NAMED = 3  # ways that the budget left out; the model file has all
 
-
-def tune_text(data: Mapping[str, Any]) -> str:
-    """Summary of `Tuned.to_dict()` for a person."""
-    trials = data["trials"]
-    judged = sorted(
-        (t for t in trials if "refused" not in t), key=lambda t: t["size"] if t["size"] is not None else 1.0
-    )
-    labels = list(dict.fromkeys(label for t in judged for label in t["seen"]))
-    chosen = trials[data["chosen"]]
+def tune_text(data: dict[str, Any]) -> str:
+    """Every way that was tried, and what was chosen, for a person."""
     rows = [
         [
-            ("> " if t is chosen else "") + t["fit"],
-            t["alarm"],
-            "-" if t["size"] is None else f"x {t['size']:.3g}",
-            str(t["alarms"]),
-            "unknown" if t["upper_per_hour"] is None else number(t["upper_per_hour"]),
-            f"{t['inside']:.2%}",
-            *("/".join(map(str, t["seen"][label])) for label in labels),
+            trial["way"],
+            number(trial["size"]),
+            "-" if trial["width_over_range"] is None else f"{trial['width_over_range']:.2%}",
+            "-" if trial["limit_per_hour"] is None else number(trial["limit_per_hour"]),
         ]
-        for t in judged
+        for trial in data["trials"]
+        if "refused" not in trial
     ]
-    header = ("fit", "alarm", "smallest fault", "false alarms", "at most per hour", "inside", *labels)
-    lines = [table(header, rows)]
-    refused = [t for t in trials if "refused" in t]
-    lines += [f"not judged: {t['fit']}: {t['refused']}" for t in refused]
-    if data["not_tried"]:
-        ways = data["not_tried"]
-        more = f"; and {len(ways) - _NAMED} more" if len(ways) > _NAMED else ""
-        lines.append(f"the budget left no time for {plural(len(ways), 'way')}: {'; '.join(ways[:_NAMED])}{more}")
-    lines.append(f"chosen: {chosen['fit']}; alarm {chosen['alarm']}")
-    lines.append(f"because {data['reason']}")
-    lines += [f"record next: {text}" for text in data["record"]]
-    return "\n".join(lines)
+    header = ("way", "jumps seen, over those of fit", "width/range", "false alarms per hour at most")
+    refused = [f"  {t['way']}: {t['refused']}" for t in data["trials"] if "refused" in t]
+    return "\n".join([table(header, rows), *refused, f"chosen: {data['reason']}"])

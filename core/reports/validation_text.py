@@ -66,7 +66,7 @@ def validation_text(data: dict[str, Any]) -> str:
                 ("alarm rule", "alarms", "per hour", f"{percent} interval{under}", "time in alarm"),
                 [
                     [
-                        f"{a['violations']} of {a['window']}, margin {number(a['margin'])}",
+                        _rule(a),
                         str(a["alarms"]),
                         number(a["per_hour"]),
                         _interval(*a["interval"]),
@@ -82,11 +82,15 @@ def validation_text(data: dict[str, Any]) -> str:
     lines.append(data["scenario"]["words"])
     if (faults := detectable_data(data)) is not None:
         lines += detectable_text(faults)
-    if "calibration" in data:
-        lines.append(data["calibration"]["words"])
-        if warning := data["calibration"].get("warning"):  # files written before it was stored have none
-            lines.append(f"warning: {warning}")
+    lines += data.get("promises", [])
     return "\n".join(lines + [f"note: {note}" for note in data["notes"]])
+
+
+def _rule(alarm: dict[str, Any]) -> str:
+    """An alarm in a table, of files of before this version as well."""
+    if "rule" not in alarm:
+        return f"{alarm['violations']} of {alarm['window']}, margin {number(alarm['margin'])}"
+    return "the model's" if "; or " in alarm["rule"] else str(alarm["rule"])
 
 
 def _each(data: dict[str, Any], what: str) -> list[str]:
@@ -126,7 +130,7 @@ def left_out_text(data: dict[str, Any]) -> str:
         f"left out one {_unit(data)} of {of}: {inside}, "
         f"{plural(data['parts_inside'], f'whole {what}')}, widths at most {ratio:.3g} times those above; "
         f"{number(alarm['per_hour'])} false alarms per hour ({_interval(*alarm['interval'])} "
-        f"{data['condition_short']}) at {alarm['violations']} of {alarm['window']}; more: uncertain-lti validate"
+        f"{data['condition_short']}); more: uncertain-lti validate"
     )
     return f"{line}\nnote: {data['hint']}" if data["hint"] else line
 

@@ -22,12 +22,7 @@ from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.validation import left_out
-from uncertain_lti.validation.blocks import BLOCKS
-from uncertain_lti.validation.groups import resolve_groups
 from uncertain_lti.validation.result import Validation
-
-LIMIT = 1e9
-"""Elements of all left-out problems together up to which a fit leaves out as well: some minutes."""
 
 
 def validate(
@@ -114,42 +109,6 @@ def validate_model(
         progress=progress,
         **_options(model),
     )
-
-
-def leave_out_with_fit(
-    transients: Sequence[Transient],
-    model: UncertainLTI,
-    groups: Sequence[Any] | str | None = None,
-    progress: Callable[[str], None] | None = None,
-    limit: float = LIMIT,
-) -> dict[str, Any]:
-    """The summary of `validate` for a model that was just fitted, or `{"not_done": why}`.
-
-    Whether it is done depends on the recordings and the model alone, never on how long anything took: it is done
-    if the elements of all left-out problems together (fits, transitions, states, signals) are at most `limit`.
-    """
-    names, _ = resolve_groups(transients, groups)
-    fits = len(set(names)) if names else len(transients) if len(transients) > 1 else BLOCKS
-    size = float(model.fit_summary["transitions"]) * model.n * (model.n + model.m)
-    if fits * size > limit:
-        return {
-            "not_done": f"it takes {fits} fits of a problem as large as this one ({size:.2g} elements each); run "
-            f"uncertain-lti validate"
-        }
-    if model.fit_summary.get("weights", "ones") != "ones":
-        return {"not_done": "the weights belong to the samples; use validate() from Python"}
-    try:
-        return left_out.validate(
-            transients,
-            operating_point=model.operating_point,
-            alarm_rule=model.alarm_rule,
-            groups=groups,
-            full=model,
-            progress=progress,
-            **_options(model),
-        ).to_dict()
-    except FitError as error:  # too little is left when a part is left out: the fit itself is valid
-        return {"not_done": str(error)}
 
 
 def _options(model: UncertainLTI) -> Mapping[str, Any]:

@@ -27,6 +27,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.validation.blocks import BLOCKS, block_spans, cut, guard_interval, remaining_spans
+from uncertain_lti.validation.extrapolation import Reach
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.part import Part, judge
 from uncertain_lti.validation.result import Validation
@@ -41,6 +42,7 @@ def validate(
     blocks: int | None = None,
     gap: float | None = None,
     groups: Sequence[Any] | str | None = None,
+    folds: int | None = None,
     confidence: float = 0.9,
     full: UncertainLTI | None = None,
     progress: Callable[[str], None] | None = None,
@@ -82,13 +84,19 @@ def validate(
     units: dict[Any, list[int]] = {}
     for i in range(len(cuts)):
         units.setdefault(names[i] if grouping else i, []).append(i)
-    for number, (unit, together) in enumerate(units.items()):
-        left, start, stop = cuts[together[0]]
-        name = left.name if blocks is None else f"{left.name} from {left.t[start]:.6g} to {left.t[stop - 1]:.6g} s"
-        name = f"group {unit}" if grouping else name
+    together = list(units.values())
+    if folds is not None and blocks is not None:
+        together = [list(range(k, len(cuts), blocks)) for k in range(blocks)]
+    elif folds is not None and folds < len(together):
+        together = [[i for unit in together[k::folds] for i in unit] for k in range(folds)]
+    for number, out in enumerate(together):
+        left, start, stop = cuts[out[0]]
+        name = left.name if blocks is None else _block_name(left, start, stop)
+        name = f"group {names[out[0]]}" if grouping else name
+        name += f" and {len(out) - 1} more" if len(out) > 1 and not grouping else ""
         if progress is not None:
-            progress(CountedStep(f"fit {number + 1} of {len(units)}: without {name}", number + 1, len(units)))
-        absent = {id(cuts[i][0]): cuts[i][1:] for i in together}
+            progress(CountedStep(f"fit {number + 1} of {len(together)}: without {name}", number + 1, len(together)))
+        absent = {id(cuts[i][0]): cuts[i][1:] for i in out}
         pieces, kept = [], []
         for transient, weight in zip(transients, own, strict=True):
             whole = (0, len(transient))
@@ -102,14 +110,19 @@ def validate(
             model = fit(pieces, weights=chosen, operating_point=full.operating_point, describe_data=False, **options)  # type: ignore[arg-type]
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
-        model = model.with_residuals_of(full)
-        for i in together:
+        model, reach = model.with_residuals_of(full), Reach(model, pieces)
+        for i in out:
             left, start, stop = cuts[i]
             tested = left if (start, stop) == (0, len(left)) else cut(left, start, stop)
-            parts[i] = judge(model, full, tested, left.name if grouping else name, names[i] if grouping else "")
+            shown = left.name if grouping or blocks is None else _block_name(left, start, stop)
+            parts[i] = judge(model, full, tested, shown, names[i] if grouping else "", reach)
     kind = "transients" if blocks is None else "blocks"
     hint = "" if grouping or blocks is not None else likely_groups(transients)
     return Validation(full, tuple(parts[i] for i in sorted(parts)), kind, float(gap), confidence, grouping, hint)
+
+
+def _block_name(transient: Transient, start: int, stop: int) -> str:
+    return f"{transient.name} from {transient.t[start]:.6g} to {transient.t[stop - 1]:.6g} s"
 
 
 def _split_weights(

@@ -12,7 +12,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,10 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.kernel.arithmetic import settled
-from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient, Transitions
+from uncertain_lti.validation.extrapolation import Reach
+
+USUAL = 0.9
+"""Share of the verdicts whose width a state's usual width is not below."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,7 +46,8 @@ class Part:
     or the left-out model has none; `longer_width` (H, n): mean width of the left-out model's envelopes over each
     horizon on this part, recorded units; NaN likewise; `residual` (K, n): x_next - centre of every judged transition,
     normalised; `longer_residual` (K, H, n): the same of each horizon; NaN as in `longer`; `judged_by`: the full model
-    with the residuals of the left-out one: what a statistic on this part takes.
+    with the residuals of the left-out one: what a statistic on this part takes; `extrapolated` (K,): `Reach.level` of
+    each judged transition; `usual_width` (n,): width that USUAL of them have at most, recorded units.
     """
 
     name: str
@@ -65,9 +70,23 @@ class Part:
     residual: Array = field(default_factory=lambda: np.zeros((0, 0)))
     longer_residual: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     judged_by: UncertainLTI | None = None
+    extrapolated: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    usual_width: Array = field(default_factory=lambda: np.zeros(0))
 
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
+
+    def without(self, left: NDArray[np.bool_]) -> Part:
+        """The part without some of its verdicts, (K,), as if there had been none."""
+        if not left.any():
+            return self
+        kept = ~left
+        starts = sorted({int(np.count_nonzero(kept[:s])) for s in self.starts})
+        count = int(np.count_nonzero(kept))
+        names = ("dt", "utilisation", "block", "longer", "residual", "longer_residual", "extrapolated")
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in names}
+        changes = {name: a[kept] if len(a) == len(kept) else a for name, a in arrays.items()}
+        return replace(self, starts=tuple(s for s in starts if s < count) or (0,), **changes)
 
     @property
     def judged(self) -> int:
@@ -84,22 +103,6 @@ class Part:
         """(K,): the largest |utilisation| of the states; a verdict is violated where it exceeds the margin."""
         return np.asarray(np.abs(self.utilisation).max(axis=1))
 
-    def level(self, violations: int, window: int, severity: Array | None = None) -> Array:
-        """The margin below which the alarm is raised: the m-th largest severity of the last n verdicts.
-
-        `severity` (K,): default that of the part; Returns (K,): -inf until there are m verdicts.
-        """
-        severity = self.severity if severity is None else severity
-        level = np.empty(len(severity))
-        for start, stop in self.spans:
-            padded = np.concatenate([np.full(window - 1, -np.inf), severity[start:stop]])
-            most = max(1, _NUMBERS // window)
-            for first in range(0, stop - start, most):  # a piece at a time, as each number is there `window` times
-                windows = np.lib.stride_tricks.sliding_window_view(padded[first : first + most + window - 1], window)
-                part = np.partition(windows, window - violations, axis=1)[:, window - violations]
-                level[start + first : start + first + len(part)] = part
-        return level
-
     @property
     def spans(self) -> list[tuple[int, int]]:
         """[start, stop) of the verdicts over which the alarm goes on from a cleared one."""
@@ -111,15 +114,14 @@ class Part:
         rows = [self.utilisation[:, None], self.longer, self.residual[:, None], self.longer_residual]
         return np.concatenate([row for row in rows if row.size or not self.judged], axis=1)
 
-    def alarms(self, rule: AlarmRule) -> int:
-        """How often the alarm is raised (rising edges)."""
-        return rising(self.level(rule.violations, rule.window) > rule.margin, self.starts)
-
-
-_NUMBERS = 2**22  # of one piece of `Part.level`
-
-
-def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: str, group: str = "") -> Part:
+def judge(
+    model: UncertainLTI,
+    full: UncertainLTI,
+    transient: Transient,
+    name: str,
+    group: str = "",
+    reach: Reach | None = None,
+) -> Part:
     """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1."""
     verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
     judged = verdicts.judged & ~verdicts.withheld.any(axis=1)
@@ -159,6 +161,8 @@ def judge(model: UncertainLTI, full: UncertainLTI, transient: Transient, name: s
         residual=_residual(model, steps),
         longer_residual=longer_residual,
         judged_by=full.with_residuals_of(model, instead=True),
+        extrapolated=np.zeros(len(steps.dt), dtype=np.intp) if reach is None else reach.level(steps),
+        usual_width=np.full(n, np.nan) if empty else np.quantile(width, USUAL, axis=0),
     )
 
 

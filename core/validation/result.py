@@ -23,13 +23,10 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.validation.false_alarms import false_alarms
+from uncertain_lti.validation.false_alarms import false_alarms, raised_on
 from uncertain_lti.validation.intervals import rate_interval, share_interval
-from uncertain_lti.validation.part import Part, by_unit, unit_numbers
+from uncertain_lti.validation.part import Part, by_unit, rising, unit_numbers
 from uncertain_lti.validation.scenario import scenario
-
-REFERENCE_RULES = ((1, 1), (2, 3), (3, 5))
-"""Alarm rules whose false alarms are counted in addition to the model's own."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -100,8 +97,7 @@ class Validation:
                 f"({data['confidence']:.0%} interval {low:.3%} to {high:.3%})"
             )
         for rule in data["false_alarms"][:1]:
-            of = f"{rule['violations']} of {rule['window']}"
-            below.append(f"false alarms per hour at {of}: {number_text(rule['per_hour'])}")
+            below.append(f"false alarms per hour at {rule['rule']}: {number_text(rule['per_hour'])}")
         below += [data["scenario"]["words"], *(f"note: {note}" for note in data["notes"])]
         return html_table(repr(self), ("left out", "inside", "whole parts", "mean width", "fitted"), rows, below)
 
@@ -140,8 +136,8 @@ def summary(validation: Validation) -> dict[str, Any]:
         }
     units = by_unit(parts, violated)
     low, high = rate_interval(units, judged, v.confidence) if judged else (0.0, math.inf)
-    rules = [model.alarm_rule, *(AlarmRule(m, n, model.alarm_rule.margin) for m, n in REFERENCE_RULES)]
-    alarms = [false_alarms(parts, rule, v.confidence) for rule in dict.fromkeys(rules)]
+    outside = (AlarmRule(margin=model.alarm_rule.margin),)
+    alarms = [false_alarms(parts, rules, v.confidence) for rules in dict.fromkeys((model.alarm, outside))]
     return {
         "kind": v.kind,
         "parts": len(parts),
@@ -177,7 +173,7 @@ def summary(validation: Validation) -> dict[str, Any]:
 
 def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
     """What was found on one part: counts, alarms of the model's rule, and the state that went farthest."""
-    rule = model.alarm_rule
+    raised = raised_on(model.alarm, part)
     farthest: dict[str, Any] = {"farthest": None, "farthest_state": None}
     if part.judged:
         k, i = np.unravel_index(int(np.argmax(np.abs(part.utilisation))), part.utilisation.shape)
@@ -188,10 +184,8 @@ def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
         "verdicts": part.judged,
         "violated": part.violated,
         "outside_domain": part.outside_domain,
-        "alarms": part.alarms(rule),
-        "alarm_share": float(part.dt[part.level(rule.violations, rule.window) > rule.margin].sum() / part.dt.sum())
-        if part.judged
-        else None,
+        "alarms": rising(raised, part.starts),
+        "alarm_share": float(part.dt[raised].sum() / part.dt.sum()) if part.judged else None,
         **farthest,
     }
 

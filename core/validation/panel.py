@@ -1,0 +1,287 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""The panel: a small fixed set of alarm rules, whose thresholds are learnt on what was left out of the fit.
+
+The size of a rule is |utilisation| of one verdict, the root of the mean square over a window, the size of the mean over
+a window, or the root of the joint chi-square. Its threshold for a state is the largest size on healthy data, whether
+left out or fitted, with an allowance for the largest of so few: of N independent windows, sizes of n states and R rules
+reach beyond those of one as the quantiles of a normal distribution do,
+
+    threshold = median + a (largest - median),   a = sqrt(log(N n R) / log N).
+
+Where windows are few, the largest of one state is chance, and the states share what is relative to their typical peak.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.alarm import Alarm
+from uncertain_lti.validation.intervals import rate_interval
+from uncertain_lti.validation.part import Part, by_unit, judge, rising, unit_numbers
+from uncertain_lti.validation.result import Validation
+
+PANEL = (("energy", 1, 1), ("energy", 10, 10), ("mean", 30, 3), ("chi2", 10, 10))
+"""Kind and window of each rule, in verdicts, and how many such windows a typical left-out stretch must hold."""
+FEW = 30
+"""Windows of the left-out data below which the states share how far peaks go."""
+MORE = 0.2
+"""Over the number of recordings, groups or blocks: share by which thresholds are raised for what the next one brings."""
+CONFIDENCE = 0.9
+"""Of the limit of the false-alarm rate, one-sided."""
+UNLIKE = 1 / 3
+"""Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
+BLIND = 0.5
+"""A bias of more than this share of the range of a state is no fault worth an alarm."""
+_LEAST, _FINE = 0.25, 1.02
+"""Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Alarm rules with what they promise.
+
+    `rules`: the panel; `limit`: false alarms per hour at most, with CONFIDENCE; `alarms`: those on what was left out;
+    `hours`: under verdict there; `units`: independent recordings, groups or blocks; `what`: which of them;
+    `biases` (n,): smallest jump of each state that the energy over a window sees, recorded units; `within`: in this
+    time, s; `unlike`: names of left-out stretches that the others do not cover; `asked`: rate that was asked for.
+    """
+
+    rules: tuple[Rule, ...]
+    limit: float
+    alarms: int
+    hours: float
+    units: int
+    what: str
+    biases: Array
+    within: float
+    unlike: tuple[str, ...] = ()
+    asked: float | None = None
+
+    @property
+    def figure(self) -> float:
+        """Geometric mean of the smallest biases: what criteria, additive terms and widths are compared by."""
+        return float(np.exp(np.mean(np.log(np.maximum(self.biases, 1e-300)))))
+
+    @property
+    def needed_hours(self) -> float:
+        """Hours without an alarm that show the rate that was asked for; 0 if none was."""
+        if self.asked is None:
+            return 0.0
+        return float(rate_interval(np.zeros(max(self.units, 2)), 1.0, CONFIDENCE, one_sided=True)[1]) / self.asked
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for the model file."""
+        return {
+            "limit_per_hour": self.limit if math.isfinite(self.limit) else None,
+            "confidence": CONFIDENCE,
+            "alarms": self.alarms,
+            "hours": self.hours,
+            "units": self.units,
+            "what": self.what,
+            "biases": self.biases.tolist(),
+            "within": self.within,
+            "unlike": list(self.unlike),
+            **({} if self.asked is None else {"asked": self.asked, "needed_hours": self.needed_hours}),
+        }
+
+
+def rules_for(model: UncertainLTI, steps: int, dt: float) -> list[StatisticRule]:
+    """The rules of a panel with thresholds of 1, for left-out stretches of so many steps of dt, s.
+
+    The same rules look at the longest horizon of the model.
+    """
+    found = []
+    for h in dict.fromkeys((1, *(horizon.steps for horizon in model.horizons[-1:]))):
+        for kind, window, least in PANEL:
+            window = min(window, steps // least)
+            if window < 1 or (kind in JOINT and (model.n < 2 or model.residuals_at(h) is None)):
+                continue
+            rule = StatisticRule(kind, (window + 0.5) * dt if window > 1 else 0.0, 1.0, h)
+            if rule not in found:
+                found.append(rule)
+    return found
+
+
+def sizes_of(rules: Sequence[Rule], part: Part) -> list[Array]:
+    """Size of each rule over its threshold, (K, n) or (K, 1), on one part by the alarm's own arithmetic."""
+    model = part.judged_by
+    assert model is not None
+    counted, table = np.ones(model.n, dtype=bool), part.table
+    found = []
+    for rule in rules:
+        assert isinstance(rule, StatisticRule)
+        values = np.zeros((part.judged, len(rule.thresholds(model.n))))
+        for start, stop in part.spans:
+            span = slice(start, stop)
+            violated = np.zeros(stop - start, dtype=bool)
+            values[span] = Alarm([rule], model, counted).over(part.dt[span], violated, table[span])[2]
+        size = np.minimum(np.nan_to_num(np.abs(values)), LARGEST)
+        found.append(size if rule.kind == "mean" else np.sqrt(size))
+    return found
+
+
+def learn(validation: Validation, rate: float | None = None) -> Panel:
+    """The panel of a model, from what was left out of the fit and from the fit itself.
+
+    `rate`: false alarms per hour, the upper limit with CONFIDENCE; the thresholds come as near to it as the data can
+    show. Raises FitError if there is nothing to learn from.
+    """
+    if rate is not None and not (math.isfinite(rate) and rate > 0):
+        raise FitError(f"false_alarms is {rate}; give a positive number per hour")
+    model = validation.model
+    parts = [part for part in validation.parts if part.judged]
+    if not parts:
+        raise FitError("no step of what was left out has a verdict, so no alarm can be learnt; record longer")
+    dt = float(np.median(np.concatenate([part.dt for part in parts])))
+    lengths = sorted(part.judged for part in parts)
+    rules = rules_for(model, lengths[len(lengths) // 10], dt)
+    left, unlike = [], []
+    for part in parts:
+        far = part.extrapolated == 2
+        if (part.extrapolated > 0).mean() > UNLIKE:
+            far = part.extrapolated > 0
+            unlike.append(part.name)
+        left.append(part.without(far))
+    fitted = [judge(model, model, part.transient, "") for part in parts if part.transient is not None]
+    units = unit_numbers(parts)
+    thresholds = [
+        _threshold(rule, len(rules), model.n, dt, units, [sizes_of([rule], p)[0] for p in (*left, *fitted)])
+        for rule in rules
+    ]
+    shown = [part for part in left if part.judged]
+    hours = sum(part.hours for part in shown)
+    levels = [
+        np.max([(s / t).max(axis=1) for s, t in zip(sizes_of(rules, part), thresholds, strict=True)], axis=0)
+        for part in shown
+    ]
+    factor, limit, alarms = _factor(shown, levels, hours, rate)
+    thresholds = [factor * t for t in thresholds]
+    half = np.average([p.usual_width for p in parts], axis=0, weights=[p.judged for p in parts]) / 2.0
+    at = next(i for i, rule in enumerate(rules) if rule.kind == "energy" and (rule.window_s or len(rules) < 2 or i))
+    return Panel(
+        tuple(_with_threshold(rule, t) for rule, t in zip(rules, thresholds, strict=True)),
+        limit, alarms, hours, int(units.max()) + 1, validation.what, half * thresholds[at],
+        max(rules[at].window_s, dt), tuple(unlike), rate,
+    )  # fmt: skip
+
+
+def _threshold(
+    rule: StatisticRule, count: int, n: int, dt: float, units: NDArray[np.intp], sizes: Sequence[Array]
+) -> Array:
+    """Threshold (n,) or (1,) of one rule: `sizes` of every left-out part, then of the same parts by the full model."""
+    peaks = np.full((int(units.max()) + 1, sizes[0].shape[1]), 1e-9)
+    for unit, size in zip(np.tile(units, 2).tolist(), sizes, strict=True):
+        peaks[unit] = np.maximum(peaks[unit], size.max(axis=0, initial=0.0))
+    every, top = np.concatenate(sizes), peaks.max(axis=0)
+    median = np.median(every, axis=0)
+    windows = max(3.0, len(every) / 2.0 / max(1, round(rule.window_s / dt)))
+    found = median + math.sqrt(math.log(windows * n * count) / math.log(windows)) * (top - median)
+    if windows < FEW:
+        typical = np.exp(np.log(peaks).mean(axis=0))
+        found = np.maximum(found, typical * (top / typical).max())
+    found *= 1.0 + MORE / len(peaks)
+    return np.asarray(np.clip(found, 1e-6, LARGEST**0.5))
+
+
+def _factor(
+    parts: Sequence[Part], levels: Sequence[Array], hours: float, rate: float | None
+) -> tuple[float, float, int]:
+    """The lowest factor on the thresholds that keeps to a rate, the limit of the rate there, and alarms left out."""
+
+    def limit_at(factor: float) -> tuple[float, int]:
+        counts = [rising(level > factor, part.starts) for level, part in zip(levels, parts, strict=True)]
+        by = by_unit(parts, counts)
+        upper = rate_interval(by, hours, CONFIDENCE, one_sided=True)[1] if hours else math.inf
+        return float(upper), int(sum(counts))
+
+    chosen = (1.0, *limit_at(1.0))
+    factor = 1.0
+    while rate is not None and chosen[1] <= rate and factor > _LEAST:
+        factor /= _FINE
+        upper, alarms = limit_at(factor)
+        if upper > rate:
+            break
+        chosen = factor, upper, alarms
+    return chosen
+
+
+def _with_threshold(rule: StatisticRule, sizes: Array) -> StatisticRule:
+    """The rule with the thresholds of these sizes."""
+    values = tuple((sizes if rule.kind == "mean" else sizes**2).tolist())
+    return replace(rule, threshold=values[0] if rule.kind in JOINT else values)
+
+
+def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
+    """What the model is worth, in a word (`good`, `some` or `none`), and in one line that begins with it."""
+    span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    names = model.state_names
+    still = [name for name, s in zip(names, span.tolist(), strict=True) if not s > 0]
+    share = np.divide(panel.biases, span, out=np.full(model.n, np.inf), where=span > 0)
+    blind = [name for name, s in zip(names, share.tolist(), strict=True) if s > BLIND and name not in still]
+    if len(still) == model.n:
+        return "none", "not worth having: nothing that is judged moves in the recordings; record the machine in use"
+    if len(still) + len(blind) == model.n:
+        least = float(share[share < np.inf].min(initial=np.inf))
+        return "none", (
+            f"not worth having: the smallest jump that it sees is {least:.0%} of the recorded range of a state; what "
+            f"moves the states may be missing among the controls, or record more"
+        )
+    if still or blind:
+        seen = [name for name in names if name not in (*still, *blind)]
+        why = [
+            *([f"{', '.join(still)} never moved"] if still else []),
+            *([f"of {', '.join(blind)} not even a jump of half the recorded range"] if blind else []),
+        ]
+        return "some", f"sees only {', '.join(seen)}: {'; '.join(why)}"
+    if panel.unlike:
+        count = len(panel.unlike)
+        verb = "does" if count == 1 else "do"
+        return "some", (
+            f"worth having within what was recorded: {plural(count, panel.what)} of {panel.units} {verb} not repeat "
+            f"what the others show, so nothing vouches for operation that none of them shows"
+        )
+    return "good", f"worth having: it sees jumps of {share.min():.2g} to {share.max():.2g} of the recorded ranges"
+
+
+def promises(model: UncertainLTI, panel: Panel) -> list[str]:
+    """What the panel promises, a sentence each: false alarms, jumps seen, and what rate was asked for."""
+    signals = model.signals.states
+    each = [
+        f"{s.name} {b:.3g}" + (f" {s.unit}" if s.unit else "")
+        for s, b in zip(signals, panel.biases.tolist(), strict=True)
+    ]
+    if math.isfinite(panel.limit):
+        first = (
+            f"false alarms: at most {panel.limit:.2g} per hour with {CONFIDENCE:.0%} confidence, while the machine is "
+            f"run as in the recordings ({panel.alarms} in {panel.hours:.3g} h left out, "
+            f"{plural(panel.units, panel.what)})"
+        )
+    else:
+        first = "false alarms: one stretch says nothing of their rate; record more"
+    found = [first, f"sees within {panel.within:.3g} s a jump of {', '.join(each)}"]
+    if panel.asked is not None and not panel.limit <= panel.asked:
+        found.append(
+            f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; "
+            f"{max(panel.needed_hours - panel.hours, 0.0):.3g} h more without an alarm would"
+        )
+    return found

@@ -1,0 +1,225 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""The panel: what `fit` arms without being asked keeps to its promise, and what it says of its worth is so."""
+
+import math
+
+import numpy as np
+import pytest
+from tanks import Tanks
+
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
+from uncertain_lti.validation.intervals import rate_interval
+from uncertain_lti.validation.left_out import validate
+from uncertain_lti.validation.panel import learn, promises, rules_for, worth
+
+DT = 0.1
+
+
+def plant(seed: int, steps: int = 600, bias: float = 0.0, width: float = 1.0, excited: bool = True) -> Transient:
+    """Two coupled states with a control and noise; a bias of the first reading from half time on."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1, 1, steps // 20 + 1), 20)[: steps + 1, None] * excited
+    x = np.zeros((steps + 1, 2))
+    A, B = np.array([[-0.8, 0.3], [0.2, -1.1]]), np.array([[1.0], [0.5]])
+    for k in range(steps):
+        x[k + 1] = x[k] + DT * (A @ x[k] + B @ u[k])
+    x += 0.01 * width * rng.standard_normal(x.shape) * excited
+    x[steps // 2 :, 0] += bias
+    return Transient(DT * np.arange(steps + 1), x, u, name=f"run {seed}")
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return [plant(seed) for seed in range(8)]
+
+
+@pytest.fixture(scope="module")
+def model(runs):
+    return fit(runs)
+
+
+def test_fit_alone_gives_a_panel_that_is_quiet_on_what_it_saw_and_sees_what_it_promises(model, runs):
+    kinds = [(rule.kind, rule.window_s) for rule in model.alarm]
+    assert kinds == [("energy", 0.0), ("energy", pytest.approx(1.05)), ("mean", pytest.approx(3.05)),
+                     ("chi2", pytest.approx(1.05))]  # fmt: skip
+    monitor, alarm = EnvelopeMonitor(model), model.fit_summary["alarm"]
+    assert not any(monitor.check(run).alarm.any() for run in runs)
+    assert alarm["worth"] == "good" and alarm["alarms"] == 0 and alarm["units"] == 8
+    assert alarm["limit_per_hour"] == pytest.approx(rate_interval(np.zeros(8), alarm["hours"], 0.9, one_sided=True)[1])
+    bias = 2 * alarm["biases"][0]
+    seen = [monitor.check(plant(100 + seed, bias=bias)) for seed in range(6)]
+    for verdicts in seen:
+        first = verdicts.transient.t[verdicts.alarm]
+        assert len(first) and 0 <= first[0] - 30.0 <= alarm["within"] + DT
+
+
+def test_flags_stay_those_of_the_bounds(model, runs):
+    """The alarm's thresholds are no margin of the flags."""
+    verdicts = EnvelopeMonitor(model).check(runs[0])
+    outside = (runs[0].x < verdicts.lower) | (runs[0].x > verdicts.upper)
+    assert np.array_equal(outside[verdicts.judged], verdicts.flags[verdicts.judged] == 1.0)
+    assert model.alarm_rule == AlarmRule()
+
+
+def test_what_is_given_by_hand_is_what_one_gets(runs):
+    paper = fit(runs, "qp", additive="none", alarm="containment")
+    assert paper.alarm == (AlarmRule(),) and not paper.v.any() and paper.fit_summary["criterion"] == "qp"
+    assert "alarm" not in paper.fit_summary
+    own = (AlarmRule(2, 5), StatisticRule("energy", 1.0, 0.5))
+    assert fit(runs, "lp", additive="noise", alarm=own).alarm == own
+    with pytest.raises(FitError, match="leave alarm or false_alarms out"):
+        fit(runs, alarm="containment", false_alarms=1.0)
+    with pytest.raises(FitError, match="it must be panel, containment"):
+        fit(runs, alarm="loud")
+
+
+def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
+    """By the formulas of the statistics over the whole record, in numpy."""
+    from uncertain_lti.identification import fit as plain
+
+    full = plain(runs, "lp", additive="noise", describe_data=False)
+    panel = learn(validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise"))
+    sample, energy = (rule for rule in panel.rules if rule.kind == "energy")
+    parts = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise").parts
+    inside = [full_utilisation(full, run) for run in runs]
+    for i in range(2):
+        peak = max(np.abs(part.utilisation[:, i]).max() for part in parts)
+        assert math.sqrt(sample.thresholds(2)[i]) >= max(peak, max(np.abs(u[:, i]).max() for u in inside))
+        every = np.concatenate([np.abs(u[:, i]) for u in [*(p.utilisation for p in parts), *inside]])
+        N, top = len(every) / 2, every.max()
+        allowance = math.sqrt(math.log(N * 2 * 4) / math.log(N))
+        expected = (np.median(every) + allowance * (top - np.median(every))) * (1 + 0.2 / 8)
+        assert math.sqrt(sample.thresholds(2)[i]) == pytest.approx(expected, rel=1e-9)
+        window = [np.convolve(p.utilisation[:, i] ** 2, np.ones(10) / 10, "valid").max() for p in parts]
+        assert energy.thresholds(2)[i] > max(window) * (1 - 0.06)  # a window of 10.5 steps
+
+
+def full_utilisation(model: UncertainLTI, run: Transient) -> np.ndarray:
+    verdicts = EnvelopeMonitor(model).check(run)
+    return verdicts.utilisation[verdicts.judged]
+
+
+def test_a_rate_lowers_thresholds_as_far_as_the_recordings_can_show_it(runs):
+    quiet = fit(runs, "lp", additive="noise")
+    rate = 10 * quiet.fit_summary["alarm"]["limit_per_hour"]
+    asked = fit(runs, "lp", additive="noise", false_alarms=rate)
+    assert asked.fit_summary["alarm"]["limit_per_hour"] <= rate
+    assert all(
+        np.all(np.array(a.thresholds(2)) < np.array(b.thresholds(2)))
+        for a, b in zip(asked.alarm, quiet.alarm, strict=True)
+    )
+    little = fit(runs, "lp", additive="noise", false_alarms=1e-3)
+    assert little.alarm == quiet.alarm
+    said = little.fit_summary["alarm"]["promises"][-1]
+    assert "cannot show that" in said and "h more without an alarm would" in said
+    with pytest.raises(FitError, match="positive number per hour"):
+        fit(runs, false_alarms=-1.0)
+
+
+def test_a_single_recording_is_left_out_in_blocks_and_little_is_said_to_be_little():
+    model = fit(plant(1))
+    assert model.validation["kind"] == "blocks" and model.fit_summary["alarm"]["units"] == 5
+    few = fit(plant(1, steps=8))
+    assert "not_learnt" in few.fit_summary["alarm"] and few.alarm == (AlarmRule(),)
+
+
+def test_windows_are_at_most_a_tenth_of_what_was_left_out(runs):
+    from uncertain_lti.identification import fit as plain
+
+    model = plain(runs, "lp", additive="noise", describe_data=False)
+    for steps in (5, 40, 95, 1000):
+        for rule in rules_for(model, steps, DT):
+            window = round(rule.window_s / DT - 0.5) if rule.window_s else 1
+            assert window <= max(steps / (3 if rule.kind == "mean" else 10), 1)
+
+
+def test_a_rare_event_of_one_recording_does_not_silence_the_alarm(runs):
+    """A control that moves in one stretch alone: how a model without it bounds it says nothing of the model of all."""
+
+    def with_switch(run: Transient, on: bool) -> Transient:
+        switch = np.zeros((len(run), 1))
+        x = run.x.copy()
+        if on:
+            switch[200:260] = 1.0
+            x[201:, 0] += np.minimum(np.arange(len(run) - 201), 60) * 0.5 * DT
+        return Transient(run.t, x, np.hstack([run.u, switch]), name=run.name)
+
+    without = fit([with_switch(run, False) for run in runs], "lp", additive="noise")
+    rare = fit([with_switch(run, number == 3) for number, run in enumerate(runs)], "lp", additive="noise")
+    assert rare.fit_summary["alarm"]["biases"][1] < 2 * without.fit_summary["alarm"]["biases"][1]
+
+
+def test_what_is_not_worth_having_is_said_first():
+    still = fit([plant(seed, excited=False) for seed in range(3)], "lp", additive="noise")
+    assert still.fit_summary["alarm"]["worth"] == "none"
+    assert still.fit_summary["alarm"]["headline"].startswith("not worth having: nothing that is judged moves")
+
+
+def test_recordings_that_do_not_repeat_one_another_are_named(runs):
+    apart = [runs[0], runs[1].replace(x=runs[1].x + 5.0), runs[2].replace(x=runs[2].x - 5.0)]
+    alarm = fit(apart, "lp", additive="both").fit_summary["alarm"]
+    assert alarm["worth"] in ("some", "none") and len(alarm["unlike"]) >= 2
+    if alarm["worth"] == "some":
+        assert "do not repeat what the others show" in alarm["headline"]
+
+
+def test_groups_are_left_out_whole(runs):
+    model = fit(runs, "lp", additive="noise", groups=[0, 0, 1, 1, 2, 2, 3, 3])
+    assert model.fit_summary["alarm"]["units"] == 4 and model.fit_summary["alarm"]["what"] == "group"
+
+
+def test_large_problems_are_armed_by_what_was_fitted(runs, monkeypatch):
+    monkeypatch.setattr("uncertain_lti.validation.monitor_fit.LIMIT", 10.0)
+    model = fit(runs, "lp", additive="noise")
+    alarm = model.fit_summary["alarm"]
+    assert "learnt on fitted data" in alarm["note"] and len(model.alarm) == 4
+    assert not any(EnvelopeMonitor(model).check(run).alarm.any() for run in runs)
+
+
+def test_the_file_keeps_the_alarm_and_its_promises(model, tmp_path):
+    model.save(tmp_path / "m.json")
+    again = UncertainLTI.load(tmp_path / "m.json")
+    assert again.alarm == model.alarm and again.fit_summary["alarm"] == model.fit_summary["alarm"]
+
+
+def test_states_that_are_blind_are_named(runs):
+    """Worth and promises follow from the sizes alone."""
+    from uncertain_lti.identification import fit as plain
+
+    full = plain(runs, "lp", additive="noise", describe_data=False)
+    panel = learn(validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise"))
+    from dataclasses import replace
+
+    span = full.domain.x_max - full.domain.x_min
+    blind = replace(panel, biases=np.array([panel.biases[0], 0.51 * span[1]]))
+    assert worth(full, blind)[0] == "some" and worth(full, blind)[1].startswith("sees only x1: of x2")
+    assert worth(full, replace(panel, biases=0.49 * span))[0] == "good"
+    assert worth(full, replace(panel, biases=0.51 * span))[0] == "none"
+    assert "per hour with 90% confidence" in promises(full, panel)[0]
+
+
+@pytest.mark.slow
+def test_fresh_plants_keep_to_the_stated_limit_within_what_was_recorded():
+    """Three tanks whose coefficients are drawn, ten recordings: alarms that begin within the domain, on fresh ones."""
+    kept = []
+    for seed in range(10):
+        tanks, noise = Tanks(seed, spread=0.2), 1e-3 * (seed % 2)
+        model = fit(tanks.transients(10, seed, noise=noise))
+        monitor, count, hours = EnvelopeMonitor(model), 0, 0.0
+        for run in tanks.transients(40, 50_000 + seed, noise=noise):
+            verdicts = monitor.check(run)
+            fresh = ~np.logical_or.accumulate(verdicts.outside_domain)
+            count += int(np.count_nonzero(np.diff((verdicts.alarm & fresh).astype(int), prepend=0) > 0))
+            hours += float(fresh.sum()) * DT / 3600
+        kept.append(count / max(hours, 1e-9) <= model.fit_summary["alarm"]["limit_per_hour"])
+    assert sum(kept) >= 8
