@@ -476,10 +476,16 @@ def of_a_swapped_model(rng: np.random.Generator, folder: Path) -> tuple[list[Row
 
 
 def held_up_on_the_way(rng: np.random.Generator, folder: Path) -> tuple[list[Row], list[Row]]:
-    """Topics come in bursts at the start and after a stop; expected is what a recording without that gives."""
+    """Topics come in bursts at the start and after a stop, with a constant lag; expected is what comes without bursts."""
     while (model := armed_model(rng)).q:  # by time of receipt, a topic that is held up is another one
         pass
-    messages = [m for m in stream(model, rng, 700, Disorder(False, False)) if m.topic in model.signals.topics]
+    lag = (int(rng.integers(0, 5)) + 0.5) * STEP_NS * rng.integers(0, 2)  # of the stamps of the controls
+    messages = [
+        replace(m, log_time=m.log_time + int(lag) * (m.topic == CONTROL))
+        for m in stream(model, rng, 700, Disorder(False, False))
+        if m.topic in model.signals.topics
+    ]
+    messages.sort(key=lambda m: m.log_time)
     late = arriving(messages)
     for topic in model.signals.topics:
         if rng.random() < 0.5:

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import perturbed
 import pytest
+from bag_writer import Message as Message_
+from bag_writer import Topic, write
 from engine_bag import SIGNALS, engine_bag
 from perturbed import Arriving as Message
 from perturbed import held_up, run
@@ -111,6 +113,50 @@ def test_every_verdict_is_that_of_the_offline_check(engine: tuple[UncertainLTI, 
     assert len(live) == len(check.lower) == 600
     for name in ("lower", "upper", "utilisation"):
         assert np.array([v.numbers(name) for v in live]).tobytes() == getattr(check, name).tobytes()
+
+
+def lagging(messages: list[Message], lag: float) -> list[Message]:
+    """Stamps of the controls are so many s older than those of the states that come with them."""
+    late = {CONTROL_TOPIC: lag, STATE_TOPIC: 0.0}
+    shifted = [(at + late[t], t, log + round(late[t] * 1e9), data) for at, t, log, data in messages]
+    return sorted(shifted, key=lambda m: m[0])
+
+
+def paused(messages: list[Message]) -> list[Message]:
+    """Who publishes waits for 0.3 s, with stamps that wait, too: nothing is held up."""
+    return [m for m in messages if not 5.01 <= m[0] < 5.31]
+
+
+WITH_LAG: dict[str, Callable[[list[Message]], list[Message]]] = {
+    "on time": lambda m: m,
+    "a pause": paused,
+    "into the stream": lambda m: [message for message in m if message[0] > 1.234],
+    "controls come 0.6 s later": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 0.6),
+    "stopped, then topic by topic": lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC),
+    "stopped, then in chunks": lambda m: stopped(m, 5.01, 16, STATE_TOPIC),
+    "stopped, then in chunks, controls first": lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC),
+}
+
+
+@pytest.mark.parametrize("steps", [0.4, 1.5, 2.4, 5.3])
+@pytest.mark.parametrize("delay", WITH_LAG.values(), ids=WITH_LAG.keys())
+def test_stamps_that_always_lag_give_what_they_give_where_nothing_waits(
+    engine: tuple[UncertainLTI, Bag], delay: Any, steps: float
+) -> None:
+    """A copied stamp, or the clock of another machine: no sample gets a control that would not have come before it."""
+    model, bag = engine
+    came = lagging(sent(bag), steps * STEP)
+    name = next(name for name, each in WITH_LAG.items() if each is delay)
+    whole = delay(came) if name in ("a pause", "into the stream") else came
+    expected = run(session_of(model, bag, catch_up=0.0), whole)
+    session = session_of(model, bag)
+    live = run(session, delay(came))
+    assert len(live) == len(expected) > 400
+    for verdict, other in zip(live, expected, strict=True):
+        assert verdict.t_ns == other.t_ns and verdict.alarm == other.alarm
+        assert verdict.numbers("lower") == other.numbers("lower")
+    lags = {CONTROL_TOPIC: pytest.approx(steps * STEP, abs=0.1 * STEP)} if steps > 1 else {}
+    assert name != "on time" or session.lags == lags
 
 
 def test_without_it_the_verdicts_are_lost(engine: tuple[UncertainLTI, Bag]) -> None:
@@ -242,3 +288,15 @@ def test_arrivals_never_go_back() -> None:
     assert [topic for topic, _, _ in released] == ["u", "x"] * 20
     arrivals = [arrival for _, arrival, _ in released]
     assert arrivals == sorted(set(arrivals))
+
+
+def test_a_lag_of_more_than_a_step_is_said_when_a_recording_is_read(
+    engine: tuple[UncertainLTI, Bag], tmp_path: Any
+) -> None:
+    model, bag = engine
+    kinds = {topic: bag.topics[topic].type for topic in (STATE_TOPIC, CONTROL_TOPIC)}
+    for steps, said in ((0.9, 0), (2.4, 1)):
+        came = [Message_(topic, log, data) for _, topic, log, data in lagging(sent(bag), steps * STEP)]
+        path = write([Topic(name, kind) for name, kind in kinds.items()], came).save(tmp_path / f"{said}.mcap")
+        notes = read_as_fitted(Bag(path), model.signals).notes
+        assert len([note for note in notes if f"stamps on {CONTROL_TOPIC} lag" in note and "2.4 steps" in note]) == said

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from statistics import median
 
 from uncertain_lti.sampling.instants import to_ns
 
@@ -28,7 +29,8 @@ _QUIET = STALL  # s that messages wait at least: a longer pause counts as anothe
 _BURST = 5  # stamps that advance this many times as fast as the steady time come in a burst
 _LAG = 0.1  # s that stamps may lag more than they did before a stall, and nothing is held back any more
 _PACE = 0.1  # stamps whose pace differs from that of the steady time by a larger share have no usual lag
-_LAGS = 50  # of so many looks the smallest lag is the usual one
+_LAGS = 50  # looks, of which the usual lag is found
+_PROMPT = 3  # messages one after the other that come at their pace show by how much a topic usually lags
 
 Waiting = tuple[str, int, bytes]
 """Topic, arrival in ns, and data of one message."""
@@ -41,6 +43,9 @@ class _Progress:
         self._last: deque[tuple[float, int]] = deque(maxlen=10)  # steady time and stamp of the last messages
         self.newest = 0  # stamp, ns
         self.behind = 0  # ns, the last message behind the clock topic
+        self.prompt: deque[int] = deque(maxlen=_LAGS)  # ns, the last messages behind the clock topic, none in a burst
+        self.most_behind, self.least_behind = -(2**63), 2**63  # ns behind the clock topic, of messages in a burst
+        self.first_behind = -(2**63)  # ns, the first message behind the clock topic
 
     def advance(self, stamp: int, now: float) -> int:
         """Take a stamp; the step from the one before."""
@@ -69,24 +74,38 @@ class _Progress:
 
 
 class Lags:
-    """By how much the stamps of the clock topic usually lag behind the steady time, for whatever reason."""
+    """By how much stamps usually lag: those of the clock topic behind the steady time, of others behind the clock's."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[float, int]] = deque(maxlen=_LAGS)
+        self._behind: dict[str, deque[tuple[float, int]]] = {}
 
     def look(self, heard: float, stamp_ns: int) -> None:
-        """Note the last message; to be called now and then."""
+        """Note the last message of the clock topic; to be called now and then."""
         if not self._seen or heard > self._seen[-1][0]:
             self._seen.append((heard, stamp_ns))
 
+    def look_at(self, topic: str, heard: float, stamp_ns: int) -> None:
+        """Note the last message of another topic, after that of the clock topic."""
+        seen = self._behind.setdefault(topic, deque(maxlen=_LAGS))
+        if self._seen and (not seen or heard > seen[-1][0]):
+            (first, began), (clock_heard, clock) = self._seen[0], self._seen[-1]
+            pace = (clock - began) * 1e-9 / (clock_heard - first) if clock_heard > first else 1.0
+            seen.append((heard, clock + round((heard - clock_heard) * pace * 1e9) - stamp_ns))
+
     def usual(self) -> float | None:
-        """The smallest lag lately."""
+        """The smallest lag of the clock topic lately, s."""
         if len(self._seen) < 2:
             return None
         (first, stamp), (last, newest) = self._seen[0], self._seen[-1]
         if abs((newest - stamp) * 1e-9 - (last - first)) > _PACE * (last - first):
             return None
         return min(heard - stamp * 1e-9 for heard, stamp in self._seen)
+
+    def behind(self) -> dict[str, int]:
+        """How far the other topics are usually behind the clock topic, ns; those that are known."""
+        seen = {topic: [behind for _, behind in looks] for topic, looks in self._behind.items()}
+        return {topic: round(median(looks)) for topic, looks in seen.items() if len(looks) >= _PROMPT}
 
 
 class CatchUp:
@@ -95,16 +114,16 @@ class CatchUp:
     When a monitor starts, or goes on after a stall, the middleware delivers what it held back in bursts, one topic
     after another. Messages wait here until each topic has been heard, has come as far as the clock topic, and stamps
     advance no faster than the time; after a stall, also until stamps lag no more than they did before. They wait at
-    most `longest` seconds. If topics came in bursts, messages are then released by their stamps, each clock message
-    after everything that belongs to it; otherwise as they came. The order within a topic never changes. At a start
+    most `longest` seconds. If topics came in bursts, messages are then released in the order in which they would have
+    come: by their stamps, those of a topic that usually lags behind the clock topic by more than a step so much later;
+    otherwise as they came. The order within a topic never changes. At a start
     there can be no verdict before every topic has been heard: until then each message waits the full time, in case the
     missing topic arrives in a burst.
 
     `clock`: clock topic; its time is that of its header stamps; `stamped`: further topics whose time is that of their
     header stamps; `awaited`: those of them that are expected to arrive; `step`: expected step of the clock topic, s;
     `max_gap_ns`: A step back of more than this is a reset, ns; `longest`: how long a message waits at most, s; `start`:
-    whether the monitor starts; otherwise it goes on after a stall; `lag`: that of the clock topic before the stall, s;
-    None where it is not known; `since`: steady time of the last message before the stall, s; `over`: every message has
+    whether the monitor starts; otherwise it goes on after a stall; `lags`: those before; `since`: steady time of the last message before the stall, s; `over`: every message has
     been released, and none need wait any longer; `reordered`: messages that were released after one that came later;
     `behind_ns`: how far a topic was behind the clock topic at most, ns, while it arrived in a burst; `took`: how long
     the first message waited, s.
@@ -119,18 +138,19 @@ class CatchUp:
         max_gap_ns: int,
         longest: float,
         start: bool,
-        lag: float | None = None,
+        lags: Lags | None = None,
         since: float = 0.0,
     ) -> None:
         self._clock, self._never, self._step_ns = clock, {clock, *awaited}, to_ns(step)
         self._longest, self._max_gap_ns, self._start = longest, max_gap_ns, start
-        self._lag, self._since = lag, since
+        self._lag, self._behind = (lags.usual(), lags.behind()) if lags is not None else (None, {})
+        self._since = since
         self._progress = {topic: _Progress() for topic in (clock, *stamped)}
         self._waiting: deque[tuple[int, float, int, Waiting]] = deque()  # number, steady time, stamp, message
         self._recent: deque[tuple[float, int]] = deque()  # steady time and stamp of clock messages
         self._number, self._began, self._heard, self._until = 0, 0.0, 0.0, math.inf
         self._arrival_ns = -(2**63)  # of the last message released
-        self._bursts = self._stepped_back = False
+        self._stepped_back = self._clock_in_burst = False
         self._most_behind = -math.inf  # clock topic, s more than before the stall
         self.over, self.reordered, self.behind_ns, self.took = False, 0, 0, 0.0
 
@@ -153,17 +173,50 @@ class CatchUp:
         if topic == self._clock:
             if self._lag is not None:
                 self._most_behind = max(self._most_behind, now - stamp_ns * 1e-9 - self._lag)
+            self._clock_in_burst |= progress.in_burst(2)
             self._recent.append((now, stamp_ns))
             while self._recent[0][0] < now - _QUIET:
                 self._recent.popleft()
         else:
-            clock = self._progress[self._clock]
-            before, behind = progress.behind, clock.newest - stamp_ns
-            progress.behind = behind
-            together = progress.in_burst(2) and max(before, behind) > 0  # two messages of which one is late
-            if together or (first and clock.newest and behind > self._step_ns):
-                self._bursts = True
-                self.behind_ns = max(self.behind_ns, before, behind)
+            self._compare(progress, first, now)
+
+    def _compare(self, progress: _Progress, first: bool, now: float) -> None:
+        """How far a message is behind the clock topic."""
+        clock = self._progress[self._clock]
+        if not clock.newest:
+            return
+        before, progress.behind = progress.behind, clock.newest - progress.newest
+        if first:
+            progress.first_behind = progress.behind
+        elif progress.in_burst(2):
+            progress.most_behind = max(progress.most_behind, before, progress.behind)
+            progress.least_behind = min(progress.least_behind, progress.behind)
+            progress.prompt.clear()
+        elif not clock.in_burst(2):
+            since = min(to_ns(now - clock.at), clock.longest_step or self._step_ns)
+            progress.prompt.append(progress.behind + since)
+
+    def lag(self, topic: str) -> int:
+        """How far a topic is usually behind the clock topic, ns; 0 where that is no more than a step."""
+        if topic not in self._behind:
+            prompt = self._progress[topic].prompt
+            found = round(median(prompt)) if len(prompt) >= _PROMPT else 0
+        else:
+            found = self._behind[topic]
+        return found if found > self._step_ns else 0
+
+    def _bursts(self) -> dict[str, int]:
+        """Topics with stamps and their lags, ns, if one of them came in bursts; otherwise none."""
+        lags = {topic: self.lag(topic) for topic in self._progress if topic != self._clock}
+        bursts = False
+        for topic, lag in lags.items():
+            progress = self._progress[topic]
+            late = progress.most_behind - lag
+            early = lag > 0 and (self._clock_in_burst or lag - progress.least_behind > 3 * self._step_ns // 2)
+            if early or late > (self._step_ns // 2 if lag else 0) or progress.first_behind - lag > self._step_ns:
+                bursts = True
+                self.behind_ns = max(self.behind_ns, late, progress.first_behind - lag)  # 0 if the clock topic was late
+        return lags if bursts else {}
 
     def ready(self, now: float) -> list[Waiting]:
         """Messages that need not wait any longer, in the order in which they are to be taken."""
@@ -190,10 +243,10 @@ class CatchUp:
         if self._is_behind():
             return False
         clock = self._progress[self._clock].newest
-        for progress in self._progress.values():
-            if not progress.newest:
+        for topic, progress in self._progress.items():
+            if not progress.newest or topic == self._clock:
                 continue
-            behind = clock - progress.newest
+            behind = clock - progress.newest - self.lag(topic)
             silent = now - progress.at > _QUIET and not progress.in_burst(10)  # else more is on the way
             if behind > (progress.longest_step or self._step_ns) and not silent:
                 return False
@@ -212,7 +265,8 @@ class CatchUp:
 
     def _release(self, until: float) -> list[Waiting]:
         """Those that came before a steady time, and what belongs before them."""
-        if not (self._bursts and not self._stepped_back):
+        lags = {} if self._stepped_back else self._bursts()
+        if not lags:
             released = []
             while self._waiting and self._waiting[0][1] < until:
                 released.append(self._waiting.popleft()[3])
@@ -226,7 +280,7 @@ class CatchUp:
             sample = clock.popleft()
             belonging = []
             for entries in by_topic.values():
-                while entries and _belongs(entries[0], sample):
+                while entries and _belongs(entries[0], sample, lags):
                     belonging.append(entries.popleft())
             order += sorted(belonging)  # as they came
             order.append(sample)
@@ -246,8 +300,10 @@ class CatchUp:
         return released
 
 
-def _belongs(entry: tuple[int, float, int, Waiting], sample: tuple[int, float, int, Waiting]) -> bool:
-    """Whether a sample may choose a message: by stamps if both have one, else by arrival."""
+def _belongs(
+    entry: tuple[int, float, int, Waiting], sample: tuple[int, float, int, Waiting], lags: dict[str, int]
+) -> bool:
+    """Whether a message would have come before a sample: by stamps if both have one, else by arrival."""
     if entry[2] and sample[2]:
-        return entry[2] <= sample[2]
+        return entry[2] + lags.get(entry[3][0], 0) <= sample[2]
     return entry[3][1] <= sample[3][1]

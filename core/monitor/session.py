@@ -221,12 +221,15 @@ class Session(Stream):
             counts[name] = str(counters[name])
         for name, count in sorted(counters.items()):
             counts.setdefault(name, str(count))
+        lags = self.lags
         for topic in self.types:
             counts[f"received {topic}"] = str(self.received[topic])
             if self.unreadable[topic]:
                 counts[f"unreadable {topic}"] = str(self.unreadable[topic])
             if self.future[topic]:
                 counts[f"future {topic}"] = str(self.future[topic])
+            if topic in lags:
+                counts[f"lag {topic}"] = repr(round(lags[topic], 6))
             if (heard := self.heard(topic)) is not None:
                 counts[f"age {topic}"] = repr(round(now - heard, 3))
         return counts

@@ -331,13 +331,22 @@ class Stream:
 
     def _catch_up(self, awaited: Sequence[str], since: float | None = None) -> CatchUp:
         step, max_gap = self.model.sampling.dt_median or 0.0, to_ns(self.sampler.signals.max_gap)
-        clock, start, lag = self.sampler.clock, since is None, self._lags.usual()
-        return CatchUp(clock, self._stamped, awaited, step, max_gap, self._window, start, lag, since or 0.0)
+        clock, start = self.sampler.clock, since is None
+        return CatchUp(clock, self._stamped, awaited, step, max_gap, self._window, start, self._lags, since or 0.0)
 
     def _look_at_lag(self) -> None:
         latest, heard = self.sampler.latest(), self._heard.get(self.sampler.clock)
         if latest is not None and heard is not None:
             self._lags.look(heard, latest[0])
+            for topic in self._stamped:
+                if topic in self._heard and (kept := self.sampler.kept(topic)) and kept[-1][0]:
+                    self._lags.look_at(topic, self._heard[topic], kept[-1][0])
+
+    @property
+    def lags(self) -> dict[str, float]:
+        """Topics whose stamps lag those of the clock topic by more than a step, and by how much, s."""
+        step = to_ns(self.model.sampling.dt_median or 0.0)
+        return {topic: behind * 1e-9 for topic, behind in self._lags.behind().items() if step and behind > step}
 
     def accept(self, topic: str, arrival_ns: int, data: bytes, now: float) -> Sequence[Waiting]:
         """Receive one serialised message, and tell which messages are to be taken now.

@@ -81,8 +81,31 @@ def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None)
         min_step=signals.min_step,
         counters=samples.counters,
         sources=stream.bag.parts,
-        notes=stream.bag.warnings,
+        notes=(*stream.bag.warnings, *lags_in_words(stream, signals)),
     )
+
+
+def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
+    """Topics whose stamps usually lag those of the clock topic by more than a step, a sentence each."""
+    clock = signals.clock or ""
+    of_clock = np.flatnonzero((stream.topic == signals.topics.index(clock)) & (stream.stamp > 0))
+    if signals.time[clock] != "header" or len(of_clock) < 2:
+        return []
+    step, said = float(np.median(np.diff(stream.stamp[of_clock]))), []
+    for position, topic in enumerate(signals.topics):
+        own = np.flatnonzero((stream.topic == position) & (stream.stamp > 0))
+        own = own[own > of_clock[0]]
+        if topic == clock or signals.time[topic] != "header" or not len(own):
+            continue
+        before = of_clock[np.searchsorted(of_clock, own) - 1]  # the clock message that came last
+        since = np.minimum(stream.arrival[own] - stream.arrival[before], step)
+        lag = float(np.median(stream.stamp[before] + since - stream.stamp[own]))
+        if lag > step > 0:
+            said.append(
+                f"{stream.bag.path}: stamps on {topic} lag those on {clock} by {lag * 1e-9:.3g} s, "
+                f"{lag / step:.3g} steps: each sample has the control that had come, not the one of its instant"
+            )
+    return said
 
 
 def sample_by_message(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Samples:
