@@ -116,3 +116,22 @@ def test_a_rule_over_a_horizon_stays_quiet_in_a_segment_without_a_verdict() -> N
     u = np.where(np.arange(10)[:, None] < 5, np.nan, [[0.1, 0.0]])
     verdicts = EnvelopeMonitor(model).check(Transient(t, x, u, signals=model.signals, max_gap=0.025))
     assert verdicts.alarm.tolist() == [False] * 8 + [True] * 2
+
+
+@pytest.mark.parametrize("every", [13, 45, 90])
+def test_single_stamps_ahead_neither_clear_an_alarm_nor_restart_the_grace(every: int, tmp_path: Path) -> None:
+    """A fault that lasts, with one stamp 2 s ahead now and then: live and offline the alarm stays on."""
+    model = plain()
+    rule = Rule(grace=0.5, violations=2, window=5)
+    messages = []
+    for k in range(400):
+        t = EPOCH_NS + k * STEP_NS
+        stamp = t + 2 * 10**9 if k % every == every - 1 else t
+        messages.append(Message(CONTROL, t - 1000, vector(t, 0.0, 0.0, 0.0)))
+        messages.append(Message(STATE, t, joint_state(stamp, [0.3 + 0.4 * (-1) ** k, -0.2])))
+    ours = perturbed.live(session_of(model, rule), messages)
+    theirs = perturbed.offline(model, rule, messages, tmp_path / "run.mcap")
+    assert not perturbed.difference(ours, theirs)
+    alarm = [row["alarm"] for row in ours]
+    assert not any(alarm[:50]) and all(alarm[60:]), sum(alarm)
+    assert sum(row["status"] is Status.RESET for row in ours) == 400 // every - (400 % every == 0)

@@ -73,6 +73,21 @@ class Condition:
         return f"{self.topic} {self.field.text} {self.operator} {self.value:g}"
 
 
+def steps_back(instant: int, last: int, before: int) -> bool:
+    """Whether time steps back at an instant, from the last one and the one before it.
+
+    A step back to later than that returns from one stamp that lay ahead: a single outlier, and no time stepped back.
+    """
+    return instant < last and instant <= before
+
+
+def restarts(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """`steps_back` at each sample (N+1,)."""
+    back = np.diff(t_ns, prepend=t_ns[:1]) < 0
+    back[2:] &= t_ns[2:] <= t_ns[:-2]
+    return back
+
+
 class Armed(NamedTuple):
     """Which samples of a recording may raise the alarm.
 
@@ -147,15 +162,15 @@ class Arming:
         counts, cleared = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         arrived = zip(np.asarray(before).tolist(), np.asarray(values, dtype=np.float64).tolist(), strict=True)
         due, value = next(arrived, (count, 0.0))
-        last = None
+        back = restarts(t_ns).tolist()
         for k, instant in enumerate(t_ns.tolist()):
             while due <= k:
                 self.learn(value)
                 cleared[k] |= not self.on
                 due, value = next(arrived, (count, 0.0))
-            if last is not None and instant < last:
+            if back[k]:
                 self.restart()
-            counts[k], last = self.at(instant), instant
+            counts[k] = self.at(instant)
         return Armed(counts, cleared | ~counts)
 
     def why_off(self) -> str:

@@ -29,7 +29,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, residual_row
-from uncertain_lti.monitor.arming import Armed
+from uncertain_lti.monitor.arming import Armed, restarts, steps_back
 from uncertain_lti.monitor.foreseen import Foreseen
 from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Partly, needs
 from uncertain_lti.monitor.verdict import Verdict
@@ -42,12 +42,11 @@ from uncertain_lti.sampling.transient import Transient, Transitions
 def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int, int]]:
     """[start, stop) of samples over which the alarm goes on from a cleared one; others raise none."""
     count = len(t_ns)
-    restarts = np.zeros(count, dtype=bool)
-    restarts[1:] = np.diff(t_ns) < 0
+    cleared = restarts(t_ns)
     counts = np.ones(count, dtype=bool)
     if armed is not None:
-        counts, restarts = armed.counts, restarts | armed.cleared
-    edges = np.flatnonzero(restarts | np.append(True, counts[1:] != counts[:-1])[:count])
+        counts, cleared = armed.counts, cleared | armed.cleared
+    edges = np.flatnonzero(cleared | np.append(True, counts[1:] != counts[:-1])[:count])
     if not count:
         return []
     return [(int(a), int(b)) for a, b in zip(edges, [*edges[1:], count], strict=True) if counts[a]]
@@ -117,6 +116,8 @@ class EnvelopeMonitor:
     _nothing: Any
     _own: Any
     _frozen_alarm: cython.bint
+    _last_ns: cython.longlong  # instants of the last two samples; at first beyond any
+    _before_ns: cython.longlong
     _shortest: cython.double
     _longest: cython.double
 
@@ -155,6 +156,7 @@ class EnvelopeMonitor:
         self._runs = model.runs_of(self._judge)
         self._nothing = None if self._runs is None else np.full(model.n * len(model.horizons), np.nan)
         self.frozen_watch = self._watch()
+        self._last_ns = self._before_ns = 2**63 - 1
         self._frozen_alarm = False
         self._own = np.diagonal(model.A).tolist() if model.schedule is None else None
         self._shortest, self._longest = model.sampling.step_range
@@ -283,6 +285,10 @@ class EnvelopeMonitor:
         """
         return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
+    def starts_over(self, step: Step) -> bool:
+        """Whether the alarm starts over with a step: time stepped back, and not from a single stamp ahead."""
+        return step.status is _RESET and steps_back(step.t_ns, self._last_ns, self._before_ns)
+
     def judge(self, step: Step, armed: bool = True) -> Verdict:
         """Verdict on one step of the sampler.
 
@@ -299,10 +305,12 @@ class EnvelopeMonitor:
             With the alarm after it.
         """
         alarms, watch = self.alarms, self.frozen_watch
-        if step.status is _RESET or not armed:
+        if self.starts_over(step) or not armed:
             alarms.reset()
             self._frozen_alarm = False
         withheld: tuple[int, ...] = ()
+        if step.status is _OK or not step.status.dropped:
+            self._before_ns, self._last_ns = self._last_ns, step.t_ns
         judgement, status, looked = None, step.status, None
         if status is _OK:
             if not self._shortest <= step.dt <= self._longest:

@@ -412,7 +412,7 @@ class Stream:
         verdicts = []
         for step in sampler.push(topic, arrival_ns, stamp_ns, values):
             before = self.alarm
-            if step.status is _RESET:
+            if step.status is _RESET and self.monitor.starts_over(step):
                 self.arming.restart()
             # a dropped message is no sample and changes nothing; asking every status for that would cost more
             armed = (step.status is not _OK and step.status.dropped) or self.arming.at(step.t_ns)
