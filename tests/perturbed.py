@@ -476,7 +476,7 @@ def of_a_swapped_model(rng: np.random.Generator, folder: Path) -> tuple[list[Row
 
 
 def held_up_on_the_way(rng: np.random.Generator, folder: Path) -> tuple[list[Row], list[Row]]:
-    """Topics come in bursts at the start and after a stop, with a constant lag; expected is what comes without bursts."""
+    """Topics come in bursts at the start and after a stop, with a lag; expected is what comes without bursts."""
     while (model := armed_model(rng)).q:  # by time of receipt, a topic that is held up is another one
         pass
     lag = (int(rng.integers(0, 5)) + 0.5) * STEP_NS * rng.integers(0, 2)  # of the stamps of the controls

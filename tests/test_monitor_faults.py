@@ -868,3 +868,46 @@ def test_a_topic_without_its_time_is_refused_by_name(world: World, tmp_path: Pat
     path.write_text(json.dumps(content))
     assert trigger(world, "reload") == (False, f"{path}: sampling.time says nothing of {CONTROL}; write header or log")
     assert world.status()["state"] == "active"
+
+
+_LEAVES = """
+import time, rclpy
+from std_msgs.msg import Int32
+rclpy.init()
+node = rclpy.create_node("leaves")
+publisher = node.create_publisher(Int32, "/machine/mode", 1)
+print("publishes", flush=True)
+while not publisher.get_subscription_count():
+    time.sleep(0.05)
+node.destroy_node()
+rclpy.shutdown()
+"""
+
+
+def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_is_told(
+    world: World, tmp_path: Path
+) -> None:
+    model = by_hand()
+    process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
+    diagnostics = world.diagnostics()
+    first = world.start("first", "-c", _LEAVES)
+    first.says("publishes")
+    assert world.set(enable="/machine/mode data == 3") == (True, "")
+    first.succeed()
+    mode = world.publisher(UInt8, "/machine/mode", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    mode.publish(UInt8(data=3))
+    until(lambda: world.status()["armed"], "the mode of another type", patience=30.0)
+    before = diagnostics.count
+    assert world.set(enable="/machine/mod data == 3") == (True, "")
+    diagnostics.reaches(STALE, saying="nobody publishes /machine/mod, which parameter enable names", since=before)
+    process.says("nobody publishes /machine/mod,")
+
+
+def test_publishers_that_nothing_comes_from_are_told(world: World, tmp_path: Path) -> None:
+    world.monitor(saved(by_hand(), tmp_path), diagnostics_period=0.1)
+    diagnostics = world.diagnostics()
+    plant = Plant(world, by_hand()).subscribed()
+    diagnostics.reaches(STALE, saying=f"{STATE}: nothing received in 2 s, and there is 1 publisher")
+    before = diagnostics.count
+    plant.send(20)
+    diagnostics.reaches(OK, since=before)

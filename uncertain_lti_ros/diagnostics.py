@@ -18,8 +18,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
 from rclpy.node import Node
 
+from uncertain_lti.base.english import plural
 from uncertain_lti.monitor.session import Report
 from uncertain_lti_ros.subscriptions import MatchedSubscription
+
+_UNHEARD = 2.0  # s without a first message although there are publishers
 
 
 class Diagnostics:
@@ -65,6 +68,9 @@ class Diagnostics:
         problems = []
         for topic, subscription in inputs.items():
             problems += subscription.problems
+            if (waited := subscription.nothing_for()) > _UNHEARD:
+                heard = plural(subscription.publishers, "publisher")
+                problems.append(f"{subscription.topic}: nothing received in {waited:.0f} s, and there is {heard}")
             lost, late = self._reported.get(topic, (0, 0))
             if subscription.lost > lost:
                 problems.append(f"{subscription.topic}: {subscription.lost - lost} messages lost on the way")

@@ -190,6 +190,9 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.get_logger().info(self.session.whole_rule_text())
             if self.active:
                 self.subscribe()
+                self._find_enable_type()
+                if self._enable_problem:
+                    self.get_logger().warning(self._enable_problem)
         elif isinstance(candidate, Session) and self.session is not None:
             self._swap(candidate)
         elif self.session is None and self._starts_itself:
@@ -401,17 +404,25 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _find_enable_type(self) -> None:
         session = self.session
-        if session is None or not self.active or not session.enable_topic or session.enable_type:
+        self._enable_problem = ""
+        if session is None or not self.active or not session.enable_topic or session.enable_type_is_given:
             return
         infos = self.get_publishers_info_by_topic(self._there(session.enable_topic))
-        if infos:
+        found = [info.topic_type for info in infos]
+        if not infos:
+            if not session.enable_type:
+                self._enable_problem = f"nobody publishes {session.enable_topic}, which parameter enable names"
+        elif session.enable_type not in found:
             try:
-                session.found_enable_type(infos[0].topic_type)
+                session.found_enable_type(found[0])
             except UncertainLTIError as error:
                 self._enable_problem = f"parameter enable: {error}"
                 return
+            if (former := self.inputs.pop(session.enable_topic, None)) is not None:
+                former.destroy()
+                return  # the middleware takes no other type before it has let go of the former subscription
+        if session.enable_type and session.enable_topic not in self.inputs:
             self.subscribe()
-        self._enable_problem = ""
 
     def _keep_reason(self) -> None:
         """Publish ~/reason also while nobody subscribes, for whoever will, and where nothing comes any more."""

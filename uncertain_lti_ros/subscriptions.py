@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -108,9 +109,14 @@ class MatchedSubscription:
         self.received = self.lost = self.late = self.publishers = 0
         self.problems: list[str] = []
         self.look_soon = False
+        self._published: float | None = None  # since when there are publishers, steady time in s
         self._subscription: Subscription | None = None
         self._events: PolledEvents | None = None
         self.look()
+
+    def nothing_for(self) -> float:
+        """How long there have been publishers and not a single message, s; 0 without publishers."""
+        return 0.0 if self.received or self._published is None else time.monotonic() - self._published
 
     @property
     def qos(self) -> QoSProfile:
@@ -123,6 +129,10 @@ class MatchedSubscription:
         infos = self._node.get_publishers_info_by_topic(self._asked_topic)
         offers = [i.qos_profile for i in infos if i.topic_type == self.type_name]
         self.publishers = len(offers)
+        if not offers:
+            self._published = None
+        elif self._published is None:
+            self._published = time.monotonic()
         if self._subscription is None:
             self._subscribe(choose_qos(offers, self._requested))
         elif offers:  # when the last publisher leaves, the next one is likely to offer the same

@@ -123,7 +123,8 @@ class CatchUp:
     `clock`: clock topic; its time is that of its header stamps; `stamped`: further topics whose time is that of their
     header stamps; `awaited`: those of them that are expected to arrive; `step`: expected step of the clock topic, s;
     `max_gap_ns`: A step back of more than this is a reset, ns; `longest`: how long a message waits at most, s; `start`:
-    whether the monitor starts; otherwise it goes on after a stall; `lags`: those before; `since`: steady time of the last message before the stall, s; `over`: every message has
+    whether the monitor starts; otherwise it goes on after a stall; `lags`: those before;
+    `since`: steady time of the last message before the stall, s; `over`: every message has
     been released, and none need wait any longer; `reordered`: messages that were released after one that came later;
     `behind_ns`: how far a topic was behind the clock topic at most, ns, while it arrived in a burst; `took`: how long
     the first message waited, s.

@@ -142,8 +142,9 @@ class EventLog:
         if session.caught_up and self._matter("catching up").becomes((session.reordered, session.caught_up), now):
             self._log(OK, session.caught_up)
         if (lags := session.lags) and self._matter("lags").becomes(tuple(lags), now):
+            clock = session.sampler.clock
             for topic, lag in lags.items():
-                self._log(OK, f"stamps on {topic} lag those on {session.sampler.clock} by {lag:.3g} s, more than a step")
+                self._log(OK, f"stamps on {topic} lag those on {clock} by {lag:.3g} s, more than a step")
         for topic in session.types:
             if topic != session.sampler.clock:
                 self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0))

@@ -299,6 +299,11 @@ class Stream:
         self.enable_type = type_name
 
     @property
+    def enable_type_is_given(self) -> bool:
+        """Whether the model or the rule has the type of the condition's topic; otherwise publishers have."""
+        return bool(self.rule.enable_type) or self.enable_topic in self._model_types
+
+    @property
     def types(self) -> dict[str, str]:
         """Topics to listen to with their types, as far as these are known."""
         types = dict(self._model_types)
