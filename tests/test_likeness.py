@@ -19,16 +19,17 @@ import numpy as np
 import pytest
 from test_event_log import Rig
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.signature import Signature, closeness
-from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Likeness, Part
+from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Likeness, Part, Pattern
 from uncertain_lti.monitor.session import OK
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.reports.model_text import model_text
 from uncertain_lti.reports.signature_text import signature_text
+from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.validation.signatures import learn_signatures
 
 DT, ONSET = 0.02, 500
@@ -125,6 +126,35 @@ def test_the_part_is_pointed_to_without_any_signature(model: UncertainLTI, fault
         assert found["label"] is None and not found["matches"]
         text = check_text(check_data(model, EnvelopeMonitor(model).check(run(seed, fault))))
         assert "points to" in text and f"{kind} {name}" in text
+
+
+def test_a_pattern_starts_over_after_a_hundred_quiet_verdicts(model: UncertainLTI) -> None:
+    explainer = Explainer(model)
+    row, side = np.full((1 + len(model.horizons), model.n), 2.0), np.ones(model.n)
+    assert [explainer.push(row, -side, side, quiet) for quiet in (0, 100, 101)] == [True, False, True]
+
+
+def test_outside_the_fitted_domain_nothing_is_pointed_to(model: UncertainLTI) -> None:
+    steps = (1, *(horizon.steps for horizon in model.horizons))
+    table = np.tile(model.blocks[0].B[:, 0] * 100.0, (len(steps), 1))
+    for outside in (False, True):
+        pattern = Pattern(steps, model.n)
+        for _ in range(5):
+            pattern.add(table, np.ones(model.n), outside)
+        assert bool(pattern.parts(model)) is not outside and pattern.verdicts == 5
+
+
+def test_what_remembers_a_state_is_no_actuator() -> None:
+    states = (Signal("a", "/s", "data[0]"), Signal("b", "/s", "data[1]"))
+    controls = (Signal("u", "/c", "data"), Signal("a_before", "/s", "lag(data[0])"))
+    B = [[0.0, 1.0], [1.0, 1.0]]
+    zeros, signals = np.zeros((2, 2)), SignalMap(states, controls)
+    model = UncertainLTI(np.eye(2), B, zeros, zeros, v=[1.0, 1.0], signals=signals)
+    for column, named in ((0, True), (1, False)):
+        pattern = Pattern((1,), 2)
+        for _ in range(5):
+            pattern.add(2.0 * np.array([B])[:, :, column], np.ones(2))
+        assert any(part.kind == "actuator" for part in pattern.parts(model)) is named
 
 
 def test_a_changed_law_points_to_its_row(model: UncertainLTI) -> None:

@@ -150,6 +150,13 @@ class Domain:
         """Greatest [x; u] (n + m,)."""
         return np.concatenate((self.x_max, self.u_max))
 
+    def beyond(self, z: Array) -> NDArray[np.bool_]:
+        """Whether columns z = [x; u; ...] (n + m + q, K) leave the box in some element by more than a tenth of it."""
+        least, greatest = self.least[:, None], self.greatest[:, None]
+        slack = 0.1 * (greatest - least)
+        z = z[: len(least)]
+        return np.asarray(((z < least - slack) | (z > greatest + slack)).any(axis=0))
+
     def outside(self, x: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
         """Whether z = [x; u] leaves the box in some element, or is a combination that was not fitted."""
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)

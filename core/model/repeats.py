@@ -28,11 +28,11 @@ it, if hardly a value of the state came twice in a recording.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
@@ -146,8 +146,9 @@ class Moved(NamedTuple):
 
     `state`: number of the state; `seconds`: since the last fresh sample, s; `run`: how far the nominal model ran, in
     half-widths; `sum`: sum of its one-step movements, in half-widths, likewise without a sign; `start`: the states at
-    the last fresh sample, recorded units; `steps`: transitions of the repeat; `activity`: range of the rates at which
-    the nominal model would move it, in half-widths.
+    the last fresh sample, recorded units; `steps`: transitions of the repeat, but for those outside the fitted ranges,
+    of which nothing counts; `activity`: range of the rates at which the nominal model would move it, in half-widths;
+    `why`: why it is frozen, in words; empty for a state that is not.
     """
 
     state: int
@@ -157,6 +158,24 @@ class Moved(NamedTuple):
     start: Sequence[float]
     steps: int
     activity: float
+    why: str = ""
+
+
+class Transition(NamedTuple):
+    """One transition in which some state repeats.
+
+    `t_ns`: its end, ns; `dt`: s; `before` (n,), `after` (n,): states, recorded units; `lower` (n,), `upper` (n,): their
+    bounds; `own` (n,): elements a_ii of the nominal model, 1/s; `outside`: it begins outside the fitted ranges.
+    """
+
+    t_ns: int
+    dt: float
+    before: Sequence[float]
+    after: Sequence[float]
+    lower: Sequence[float]
+    upper: Sequence[float]
+    own: Sequence[float]
+    outside: bool = False
 
 
 class Repeating:
@@ -169,7 +188,7 @@ class Repeating:
 
     def __init__(self, n: int, margin: float = 1.0) -> None:
         self._margin = margin
-        # of each state: None, or [begin in ns, run, sum, largest half-width, the states then, steps,
+        # of each state: None, or [begin in ns, the states then, run, sum, largest half-width, steps,
         # lowest and highest rate, largest half-width per second]
         self._of: list[list[Any] | None] = [None] * n
 
@@ -177,43 +196,58 @@ class Repeating:
         """No transition leads to the next sample: every repeat ends."""
         self._of = [None] * len(self._of)
 
-    def push(
-        self,
-        t_ns: int,
-        dt: float,
-        before: Sequence[float],
-        after: Sequence[float],
-        lower: Sequence[float],
-        upper: Sequence[float],
-        own: Sequence[float],
-    ) -> list[Moved]:
+    def push(self, step: Transition) -> list[Moved]:
         """Take one transition in which some state repeats; after one in which none does, `forget`."""
-        found = []
-        for i, value in enumerate(after):
-            if value != before[i]:
+        found, dt = list[Moved](), step.dt
+        for i, value in enumerate(step.after):
+            if value != step.before[i]:
                 self._of[i] = None
                 continue
             repeat = self._of[i]
             if repeat is None:
-                since = t_ns - round(dt * 1e9)
-                repeat = self._of[i] = [since, 0.0, 0.0, 0.0, before[: len(after)], 0, math.inf, -math.inf, 0.0]
-            low, high = lower[i], upper[i]
-            movement, half = 0.5 * (low + high) - value, 0.5 * (high - low) / self._margin
-            repeat[1] += dt * own[i] * repeat[1] + movement
-            repeat[2] += movement
-            repeat[3] = half = max(repeat[3], half)
-            repeat[5] += 1
-            repeat[6], repeat[7] = min(repeat[6], movement / dt), max(repeat[7], movement / dt)
-            repeat[8] = max(repeat[8], 0.5 * (high - low) / self._margin / dt)
-            seconds, activity = (t_ns - repeat[0]) * 1e-9, _over(repeat[7] - repeat[6], repeat[8])
-            run, total = _over(abs(repeat[1]), half), _over(abs(repeat[2]), half)
-            found.append(Moved(i, seconds, run, total, repeat[4], repeat[5], activity))
+                nothing = 0.0, 0.0, 0.0, 0, math.inf, -math.inf, 0.0
+                repeat = self._of[i] = [step.t_ns - round(dt * 1e9), step.before[: len(step.after)], *nothing]
+            if not step.outside:
+                movement = 0.5 * (step.lower[i] + step.upper[i]) - value
+                half = 0.5 * (step.upper[i] - step.lower[i]) / self._margin
+                repeat[2] += dt * step.own[i] * repeat[2] + movement
+                repeat[3] += movement
+                repeat[4] = max(repeat[4], half)
+                repeat[5] += 1
+                repeat[6], repeat[7] = min(repeat[6], movement / dt), max(repeat[7], movement / dt)
+                repeat[8] = max(repeat[8], half / dt)
+            since, start, run, total, half, steps, low, high, per_second = repeat
+            activity = _over(high - low, per_second) if steps else 0.0
+            run, total = _over(abs(run), half), _over(abs(total), half)
+            found.append(Moved(i, (step.t_ns - since) * 1e-9, run, total, start, steps, activity))
         return found
 
 
 def _over(size: float, half: float) -> float:
     """A size in half-widths; any is beyond all where the half-width is 0."""
     return size / half if half > 0.0 else math.inf if size > 0.0 else 0.0
+
+
+def walk(
+    model: Any, t_ns: NDArray[np.int64], steps: Any, z: Array, lower: Array, upper: Array
+) -> Iterator[tuple[int, bool, Transition]]:
+    """Transitions in which some state repeats, and those right after: where each begins, and whether it follows on.
+
+    `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `z` (n + m + q, K): normalised; `lower, upper` (K, n):
+    bounds, recorded units.
+    """
+    repeats = np.asarray((steps.x == steps.x_next).any(axis=1))
+    follows = np.concatenate([[False], np.diff(steps.k) == 1])[: len(steps.k)]
+    rows = np.flatnonzero(repeats | (follows & np.roll(repeats, 1)))
+    z = z[:, rows]
+    outside = model.domain.beyond(z) | model.regime(z)[1]
+    given = steps.dt[rows], steps.x[rows], steps.x_next[rows], lower[rows], upper[rows], model.own_rates(z).T, outside
+    on = np.append(False, np.diff(steps.k[rows]) == 1) if len(rows) else rows
+    at = steps.k[rows]
+    for k, after, t, *each in zip(
+        at.tolist(), on.tolist(), t_ns[at + 1].tolist(), *(a.tolist() for a in given), strict=True
+    ):
+        yield k, after, Transition(t, *each)
 
 
 def repeats_of(model: Any, transients: Iterable[Any]) -> Repeats:
@@ -236,33 +270,22 @@ class Found(NamedTuple):
 
 def repeats_in(model: Any, transient: Any) -> Found:
     """What one recording has of them."""
-    longest, run, total, active = most = np.zeros((4, model.n))
-    point, steps = model.operating_point, transient.transitions()
+    most, point, steps = np.zeros((4, model.n)), model.operating_point, transient.transitions()
     windows, noisy = _activity(model, transient, steps)
-    rows = np.flatnonzero((steps.x == steps.x_next).any(axis=1))
-    if not len(rows):
-        return Found(most, windows, noisy)
-    chosen = np.zeros(len(steps.k), dtype=bool)
-    chosen[rows] = True
-    some = steps.take(chosen)
+    some = (steps.x == steps.x_next).any(axis=1)
+    steps = steps.take(np.asarray(some))
     with np.errstate(over="ignore", invalid="ignore"):
-        z = model.normalised_columns(some)
-        centre, half = np.empty((model.n, len(rows))), np.empty((model.n, len(rows)))
-        model.columns_centre_and_half(z, some.dt, centre, half)
+        z = model.normalised_columns(steps)
+        centre, half = np.empty((model.n, len(steps.k))), np.empty((model.n, len(steps.k)))
+        model.columns_centre_and_half(z, steps.dt, centre, half)
         lower, upper = (point.recorded_x(bound.T) for bound in edges(centre, half, 1.0))
-    values = (some.dt, some.x, some.x_next, lower, upper, model.own_rates(z).T)
-    follow, last = Repeating(model.n), -2
-    for k, t_ns, *each in zip(
-        some.k.tolist(), transient.t_ns[some.k + 1].tolist(), *(a.tolist() for a in values), strict=True
-    ):
-        if k != last + 1:
+    follow = Repeating(model.n)
+    for _, follows, step in walk(model, transient.t_ns, steps, z, lower, upper):
+        if not follows:
             follow.forget()
-        last = k
-        for moved in follow.push(t_ns, *each):
-            i = moved.state
-            longest[i] = max(longest[i], moved.seconds)
-            run[i], total[i] = max(run[i], moved.run), max(total[i], moved.sum)
-            active[i] = max(active[i], moved.activity)
+        for moved in follow.push(step):
+            reached = moved.seconds, moved.run, moved.sum, moved.activity
+            most[:, moved.state] = np.maximum(most[:, moved.state], reached)
     return Found(most, windows, noisy)
 
 
@@ -273,7 +296,7 @@ def together(n: int, found: Sequence[Found]) -> Repeats:
     usual = _usual(windows, np.where(longest < WINDOW_S, ACTIVE, ACTIVE / 2))
     noisy = np.array([np.zeros(n), *(one.noisy for one in found)])
     beyond = np.maximum(usual, MORE_ACTIVE * active)
-    run, total, beyond = (np.minimum(values, LARGEST) for values in (run, total, beyond))
+    run, total, beyond = (np.minimum(values, LARGEST) for values in (run, total, beyond))  # JSON has no infinity
     return Repeats(longest, run, total, beyond, np.where((noisy >= 0).all(axis=0), noisy.sum(axis=0), 0.0))
 
 

@@ -27,6 +27,7 @@ from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import LOWER, RESIDUAL, UPPER, UTILISATION, Judgement, judged
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalised
+from uncertain_lti.model.repeats import walk
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, residual_row
 from uncertain_lti.monitor.arming import Armed, restarts, steps_back
@@ -197,12 +198,11 @@ class EnvelopeMonitor:
 
     def _bounds_of(self, step: Step, judgement: Judgement) -> Bounds:
         """What the watch asks for if a state repeats."""
-        own = self._own
-        if own is None:
-            point = self.model.operating_point
-            z = normalised(np.array(step.before, dtype=np.float64), point.steady, point.scale)
-            own = self.model.own_rates(z[:, None])[:, 0].tolist()
-        return judgement.numbers(LOWER).tolist(), judgement.numbers(UPPER).tolist(), own
+        point = self.model.operating_point
+        z = normalised(np.array(step.before, dtype=np.float64), point.steady, point.scale)[:, None]
+        own = self.model.own_rates(z)[:, 0].tolist() if self._own is None else self._own
+        outside = judgement.unknown_regime or bool(self.model.domain.beyond(z)[0])
+        return judgement.numbers(LOWER).tolist(), judgement.numbers(UPPER).tolist(), own, outside
 
     def predict(self, x: ArrayLike, u: ArrayLike, dt: float, s: ArrayLike = ()) -> tuple[Array, Array]:
         """Bounds one step ahead, recorded units.
@@ -320,7 +320,8 @@ class EnvelopeMonitor:
             elif (judgement := self._judge.judge(step.before, step.after, step.dt)) is None:
                 status = Status.MODE
         if judgement is not None and watch is not None:
-            looked = watch.look(step.t_ns, step.dt, step.before, step.after, partial(self._bounds_of, step, judgement))
+            bounds = partial(self._bounds_of, step, judgement)
+            looked = watch.look(step.t_ns, step.dt, step.before, step.after, bounds)
             self._frozen_alarm = armed and bool(looked.frozen)
             if withheld := looked.withheld:
                 if self._counted[np.delete(self._every, withheld)].any():
@@ -411,7 +412,7 @@ class EnvelopeMonitor:
             z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
             flags[arrival], low, high, utilisation[arrival], residual = self._judge_all(z, steps.dt, x_next)
             lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
-        frozen, withheld, repeating = self._look_all(transient, steps, z, lower, upper)
+        frozen, withheld, repeating, why = self._look_all(transient, steps, z, lower, upper)
         longer, longer_residual = np.full((2, count, len(model.horizons), n), np.nan)
         whole: Any = slice(None)
         if withheld.any():
@@ -452,41 +453,29 @@ class EnvelopeMonitor:
         return Verdicts(
             transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
             unknown_regime, frozen, withheld, repeating, statistics, each, alarms, longer,
+            why_frozen=why,
         )  # fmt: skip
 
     def _look_all(
         self, transient: Transient, steps: Transitions, z: Array, lower: Array, upper: Array
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-        """`frozen`, `withheld` and `repeating` of `Verdicts`, by the watch of `judge`, where some state repeats."""
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], dict[tuple[int, int], str]]:
+        """`frozen`, `withheld`, `repeating`, `why_frozen` of `Verdicts`, by the watch of `judge`."""
         frozen, withheld, repeating = (np.zeros(lower.shape, dtype=bool) for _ in range(3))
-        watch = self._watch()
+        why: dict[tuple[int, int], str] = {}
+        watch, at = self._watch(), steps.k + 1
         if watch is None:
-            return frozen, withheld, repeating
-        repeats = np.asarray((steps.x == steps.x_next).any(axis=1))
-        after = np.concatenate([[False], repeats[:-1] & (np.diff(steps.k) == 1)]) if len(repeats) else repeats
-        rows = np.flatnonzero(repeats | after)  # what follows a repeat may thaw
-        own = self.model.own_rates(z[:, rows]).T
-        at = steps.k[rows] + 1
-        taken = (steps.dt[rows], steps.x[rows], steps.x_next[rows], lower[at], upper[at], own)
-        last, given = -1, list[list[float]]()
-
-        def bounds() -> Bounds:
-            lower, upper, own = given
-            return lower, upper, own
-
-        for k, t_ns, dt, x, x_next, *three in zip(
-            at.tolist(), transient.t_ns[at].tolist(), *(a.tolist() for a in taken), strict=True
-        ):
-            if k != last + 1:
+            return frozen, withheld, repeating, why
+        for k, follows, step in walk(self.model, transient.t_ns, steps, z, lower[at], upper[at]):
+            if not follows:
                 watch.forget()
-            last, given = k, three
-            looked = watch.look(t_ns, dt, x, x_next, bounds)
-            withheld[k, list(looked.withheld)] = True
+            looked = watch.take(step)
+            withheld[k + 1, list(looked.withheld)] = True
             for moved in looked.frozen:
-                frozen[k, moved.state] = True
+                frozen[k + 1, moved.state] = True
+                why[k + 1, moved.state] = moved.why
             for moved in looked.repeating:
-                repeating[k, moved.state] = True
-        return frozen, withheld, repeating
+                repeating[k + 1, moved.state] = True
+        return frozen, withheld, repeating, why
 
     def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array, Array]:
         """flags, lower, upper, utilisation, residual of transitions [x; u; s] (n + m + q, K), (K,), (K, n)."""

@@ -9,20 +9,18 @@
 
 """Frozen inputs: a state that repeats exactly while the nominal model moves it.
 
-A parked machine repeats too, so a repeat alone is a warning. A state is frozen if the nominal model, run over the
-repeat, moves it by more than its half-width, and farther than over any repeat of the fit; twice as far if the fit has
-repeats as long. Where another state has left the place that it had when the repeat began, the machine is not
-parked: there the sum of the model's one-step movements counts like its run. Nor is it parked while it is as active
-as in the recordings, and twice as active as over any repeat of theirs: then three repeats are enough. So they are over
-a quarter second, of a state that noise changes at every step, also when the machine is at rest; unless the value is 0,
-as of what is switched off, or all states repeat, as of a machine that is parked. A short repeat is usual up to twice
-the longest of the fit, as a coarse sensor repeats by chance.
+A parked machine repeats too, so a repeat alone is a warning. A state is frozen if one of four measures of a repeat is
+beyond its half-width and beyond twice what healthy recordings reached (`Repeats`): how far its own equation runs from
+the repeated value; the sum of the movements, where another state has moved; how active the machine is meanwhile; or,
+of a state that noise always changed, the time, unless the value is 0, as of what is switched off, or all states
+repeat, as of a machine that is parked. Nothing counts outside the fitted domain, nor what a coarse sensor does by
+chance.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import eq
 from typing import Any, NamedTuple
 
@@ -31,12 +29,11 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import FLAGS, UTILISATION
-from uncertain_lti.model.repeats import Moved, Repeating, Repeats
+from uncertain_lti.model.repeats import Moved, Repeating, Repeats, Transition
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 FARTHER = 2.0
-"""How much farther than over any repeat of the fit the model must move a state whose repeat is no longer than those,
-and how much longer a short one must be."""
+"""How many times what the recordings reached a measure must be, and a short repeat the longest of them."""
 
 USUAL_S = 0.25
 """Seconds up to which a repeat is usual, s, if the fit has repeats half as long: those of a coarse sensor in motion.
@@ -51,8 +48,8 @@ NOISY = 1000
 SLOW_S, SLOW_NOISY = 0.5, 5000
 """Seconds that are enough in place of these steps if so many have shown the noise: of a slow sensor."""
 
-Bounds = tuple[Sequence[float], Sequence[float], Sequence[float]]
-"""Of one transition: lower and upper bound (n,) each, recorded units, and the elements a_ii of the nominal model."""
+Bounds = tuple[Sequence[float], Sequence[float], Sequence[float], bool]
+"""What `Transition` has of bounds, nominal model and domain."""
 
 
 class Looked(NamedTuple):
@@ -77,46 +74,32 @@ class FrozenWatch:
     is masked is never frozen; `needs` (n, n): which rows need which states.
     """
 
-    __slots__ = (
-        "_counted",
-        "_follow",
-        "_frozen",
-        "_longest",
-        "_margin",
-        "_needed_by",
-        "_on",
-        "_run",
-        "_run_within",
-        "_sum",
-        "_active",
-        "_noisy",
-        "_usual",
-    )
+    __slots__ = ("_beyond", "_counted", "_follow", "_frozen", "_margin", "_needed_by", "_on", "_usual", "repeats")
 
     def __init__(self, repeats: Repeats, margin: float, counted: Sequence[bool], needs: NDArray[np.bool_]) -> None:
-        self._longest: list[float] = repeats.longest_repeat_s.tolist()
-        run, total = repeats.largest_run, repeats.largest_sum
-        # how far the model must move a state, by its run in a repeat that is no longer than those of the fit, and in a
-        # longer one, and by its sum there
-        self._run_within: list[float] = np.maximum(1.0, FARTHER * run).tolist()
-        self._run: list[float] = np.maximum(1.0, np.where(np.isfinite(run), run, 0.0)).tolist()
-        self._sum: list[float] = np.maximum(1.0, np.where(np.isfinite(total), total, 0.0)).tolist()
-        self._usual = [min(FARTHER * seconds, USUAL_S) for seconds in self._longest]
-        self._active: list[float] = repeats.active_beyond.tolist()
-        self._noisy: list[float] = np.where(repeats.longest_repeat_s == 0.0, repeats.noisy_steps, 0.0).tolist()
-        self._counted, self._margin = list(counted), margin
+        self.repeats, self._counted, self._margin = repeats, list(counted), margin
         self._needed_by = [np.flatnonzero(column).tolist() for column in needs.T]
-        self._follow = Repeating(len(self._longest), margin)
+        longest, reached = repeats.longest_repeat_s, np.array([repeats.largest_run, repeats.largest_sum])
+        known = np.isfinite(reached)  # of a model that was changed after its fit they are not
+        beyond = np.vstack([np.maximum(1.0, FARTHER * np.where(known, reached, 0.0)), repeats.active_beyond])
+        self._beyond = np.where(beyond < LARGEST, beyond, np.inf).T.tolist()
+        self._usual = np.where(known[0], np.minimum(FARTHER * longest, USUAL_S), longest).tolist()
+        self._follow = Repeating(len(self._counted), margin)
         self.forget()
 
     def forget(self) -> None:
         """No transition leads to the next sample: nothing is known to repeat."""
         self._follow.forget()
-        self._frozen: frozenset[int] = frozenset()
+        self._frozen: dict[int, str] = {}  # and why
         self._on = False  # something repeats
 
     def look(
-        self, t_ns: int, dt: float, before: Sequence[float], after: Sequence[float], bounds: Callable[[], Bounds]
+        self,
+        t_ns: int,
+        dt: float,
+        before: Sequence[float],
+        after: Sequence[float],
+        bounds: Callable[[], Bounds],
     ) -> Looked:
         """Take one transition."""
         if not any(map(eq, before, after)):
@@ -125,45 +108,59 @@ class FrozenWatch:
             withheld = self._rows(self._frozen)
             self.forget()
             return Looked(withheld=withheld)
+        return self.take(Transition(t_ns, dt, before, after, *bounds()))
+
+    def take(self, step: Transition) -> Looked:
+        """Take one in which some state repeats."""
         self._on = True
-        lower, upper, own = bounds()
-        still = len(after) > 1 and all(map(eq, before, after))  # as a parked machine is
         frozen, repeating = [], []
-        for moved in self._follow.push(t_ns, dt, before, after, lower, upper, own):
+        for moved in self._follow.push(step):
             i = moved.state
             if not self._counted[i]:
                 continue
-            if i in self._frozen or self._is_frozen(moved, after, lower, upper, still):
-                frozen.append(moved)
-            elif moved.seconds > self._longest[i]:
+            if why := self._frozen.get(i) or ("" if step.outside else self._why(moved, step)):
+                frozen.append(moved._replace(why=why))
+            elif moved.seconds > self.repeats.longest_repeat_s[i]:
                 repeating.append(moved)
-        now = frozenset(moved.state for moved in frozen)
+        now = {moved.state: moved.why for moved in frozen}
         withheld, self._frozen = self._rows(self._frozen | now), now
         return Looked(tuple(frozen), withheld, tuple(repeating))
 
-    def _rows(self, states: frozenset[int]) -> tuple[int, ...]:
+    def _rows(self, states: Iterable[int]) -> tuple[int, ...]:
         return tuple(sorted({i for j in states for i in self._needed_by[j]}))
 
-    def _is_frozen(
-        self, moved: Moved, after: Sequence[float], lower: Sequence[float], upper: Sequence[float], still: bool
-    ) -> bool:
-        i = moved.state
+    def _why(self, moved: Moved, step: Transition) -> str:
+        """Why a state is frozen, in words; empty if it is not."""
+        i, repeats = moved.state, self.repeats
+        run, total, active = self._beyond[i]
         if moved.seconds <= self._usual[i]:
-            return False
-        if moved.steps >= LEAST and moved.activity > self._active[i]:
-            return True
-        if self._noisy[i] >= NOISY and after[i] != 0.0 and not still:
-            slow = moved.seconds >= SLOW_S and self._noisy[i] >= SLOW_NOISY
-            if slow or (moved.steps >= LEAST and moved.seconds >= USUAL_S):
-                return True
-        if moved.seconds <= self._longest[i]:
-            return moved.run > self._run_within[i]
-        if moved.run > self._run[i]:
-            return True
-        return moved.sum > self._sum[i] and any(
+            return ""
+        if moved.run > run:
+            return _moved("the model moves it", moved.run, repeats.largest_run[i])
+        if moved.sum > total and moved.seconds > repeats.longest_repeat_s[i] and self._moves(moved, step):
+            return _moved("the model's steps add up", moved.sum, repeats.largest_sum[i])
+        if moved.steps >= LEAST and moved.activity > active:
+            size = f"changes by {moved.activity:.3g} half-widths, and beyond {active:.3g} it always moved"
+            return f"while the machine is active: its rate by the model {size}"
+        noisy = repeats.noisy_steps[i] if repeats.longest_repeat_s[i] == 0.0 else 0
+        slow = noisy >= SLOW_NOISY and moved.steps > 0 and moved.seconds >= SLOW_S
+        if slow or (noisy >= NOISY and moved.steps >= LEAST and moved.seconds >= USUAL_S):
+            parked = len(step.after) > 1 and all(map(eq, step.before, step.after))
+            if step.after[i] != 0.0 and not parked:
+                return f"while at constant controls noise changed it {noisy:.0f} times in the fit"
+        return ""
+
+    def _moves(self, moved: Moved, step: Transition) -> bool:
+        """Some state has left the place that it had when the repeat began, so that the machine is not at rest."""
+        return any(
             abs(value - start) > 0.5 * (high - low) / self._margin
-            for value, start, low, high in zip(after, moved.start, lower, upper, strict=True)
+            for value, start, low, high in zip(step.after, moved.start, step.lower, step.upper, strict=True)
         )
+
+
+def _moved(what: str, size: float, most: float) -> str:
+    known = f" (at most {most:.3g} in the fit)" if most < LARGEST else ""
+    return f"while {what} by {size:.3g} half-widths{known}"
 
 
 def needs(model: UncertainLTI) -> NDArray[np.bool_]:
@@ -209,25 +206,12 @@ class Partly:
 
 def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
     """What is said of a frozen state."""
-    what = repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])
-    size, noisy = max(moved.run, moved.sum), repeats.noisy_steps[moved.state]
-    if size <= 1.0 and moved.activity > repeats.active_beyond[moved.state]:
-        return (
-            f"{name} {what}, while the machine is active: its rate by the model changes by {moved.activity:.3g} "
-            f"half-widths, and beyond {repeats.active_beyond[moved.state]:.3g} it always changed"
-        )
-    if size <= 1.0 and noisy >= NOISY:
-        return f"{name} {what}; at constant controls noise changed it {noisy:.0f} times in the fit"
-    return f"{name} {what}, while the model moves it by {size:.3g} half-widths"
-
-
-def why_frozen(state: int, repeats: Repeats) -> str:
-    """Why a repeat of this state may be called frozen."""
-    noisy = repeats.noisy_steps[state] >= NOISY and repeats.longest_repeat_s[state] == 0.0
-    return "while the model moves it" + (", or noise always changed it" if noisy else "")
+    return f"{name} {repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])}, {moved.why}"
 
 
 def repeat_words(seconds: float, longest: float) -> str:
-    """What is said of a repeat."""
-    most = f"at most {longest:.3g} s" if longest > 0.0 else "never"
-    return f"repeats exactly for {seconds:.3g} s ({most} in the fit)"
+    """What is said of a repeat: what is longer than any of the fit, and how long those were."""
+    said = f"repeats exactly for {seconds:.3g} s"
+    if f"{seconds:.3g}" == f"{longest:.3g}" or seconds <= longest:
+        return said
+    return f"{said} ({f'at most {longest:.3g} s' if longest > 0.0 else 'never'} in the fit)"

@@ -104,32 +104,41 @@ class Pattern:
 
     def __init__(self, steps: Sequence[int], n: int) -> None:
         self.steps = tuple(steps)
-        self.verdicts = 0
-        self._sum, self._half = np.zeros((len(self.steps), n, n)), np.zeros(n)
+        self.verdicts = self._inside = 0
+        self._sum, self._own, self._half = np.zeros((len(self.steps), n, n)), np.zeros((n, n)), np.zeros(n)
 
-    def add(self, table: Array, half: Array) -> None:
+    def add(self, table: Array, half: Array, outside: bool = False) -> None:
         """Take one verdict.
 
         `table` (H, n): utilisation; a row with NaN is left out, and the verdict if it is that of one step; `half` (n,):
-        half-widths of one step, normalised; a common factor does not matter.
+        half-widths of one step, normalised; a common factor does not matter; `outside`: it is outside the fitted
+        domain, where the model does not say what a part would leave.
         """
         if np.isnan(table[0]).any():
             return
         self.verdicts += 1
-        self._half += half
-        for total, row in zip(self._sum, np.clip(table, -_LIMIT, _LIMIT), strict=True):
+        table = np.clip(table, -_LIMIT, _LIMIT)
+        for total, row in zip(self._sum, table, strict=True):
             if not np.isnan(row).any():
                 total += row[:, None] * row
+        if not outside:
+            self._inside += 1
+            self._half += half
+            self._own += table[0][:, None] * table[0]
 
     def signature(self, label: str) -> Signature:
         """The pattern as a signature of one recording."""
         return Signature(label, self.steps, scaled(self._sum), 1, self.verdicts)
 
     def parts(self, model: UncertainLTI) -> tuple[Part, ...]:
-        """What single part of the machine explains the one-step pattern."""
-        moment, half = self._sum[0], self._half / max(self.verdicts, 1)
+        """What single part of the machine explains the one-step pattern within the fitted domain.
+
+        What a control remembers of a state is no actuator.
+        """
+        moment, half = self._own, self._half / max(self._inside, 1)
         whole = float(np.trace(moment))
-        if not (whole > 0.0 and (half > 0.0).all() and np.isfinite(half).all()):
+        remembered = {r.position - model.n for r in model.signals.recalled if r.of < model.n}
+        if not (self._inside >= LEAST and whole > 0.0 and (half > 0.0).all() and np.isfinite(half).all()):
             return ()
         block = max(range(len(model.blocks)), key=lambda r: model.block_data[r].transitions or 0)
         A, B = model.blocks[block].A, model.blocks[block].B
@@ -139,7 +148,8 @@ class Pattern:
             size = float(d @ d)
             return float(d @ moment @ d) / (size * whole) if size > 0.0 else 0.0
 
-        found = [Part("actuator", name, share(B[:, j])) for j, name in enumerate(model.control_names)]
+        named = [(j, name) for j, name in enumerate(model.control_names) if j not in remembered]
+        found = [Part("actuator", name, share(B[:, j])) for j, name in named]
         for i, name in enumerate(model.state_names):
             found.append(Part("sensor", name, share(A[:, i])))
             found.append(Part("equation", name, share(np.eye(model.n)[i])))
@@ -184,7 +194,7 @@ class Explainer:
         self.pattern: Pattern | None = None
         self._first: tuple[str, ...] = ()
 
-    def push(self, table: Array, lower: Array, upper: Array, quiet: int) -> bool:
+    def push(self, table: Array, lower: Array, upper: Array, quiet: int, outside: bool = False) -> bool:
         """Take a verdict with an alarm.
 
         `table` (H, n): utilisation for one step and for each horizon; `lower, upper` (n,): bounds of one step, recorded
@@ -198,7 +208,7 @@ class Explainer:
         assert self.pattern is not None
         if self.pattern.verdicts < MOST:
             with np.errstate(over="ignore", invalid="ignore"):
-                self.pattern.add(table, (upper - lower) * self._per_width)
+                self.pattern.add(table, (upper - lower) * self._per_width, outside)
         return begins
 
     def likeness(self) -> Likeness | None:
@@ -213,11 +223,12 @@ def over_recording(
     table: Array,
     lower: Array,
     upper: Array,
+    outside: NDArray[np.bool_],
 ) -> Iterable[tuple[int, int, Explainer]]:
     """`Explainer` over the verdicts of a recording.
 
     `judged, alarm` (N+1,): as in `Verdicts`; `table` (N+1, H, n): utilisation; `lower, upper` (N+1, n): bounds of one
-    step, recorded units.
+    step, recorded units; `outside` (N+1,): outside the fitted domain.
     """
     explainer, begin, last, before = Explainer(model), -1, -1, 0
     count = np.cumsum(judged)
@@ -226,7 +237,7 @@ def over_recording(
         if begin >= 0 and quiet > APART:
             yield begin, last, explainer
             explainer, begin = Explainer(model), -1
-        explainer.push(table[k], lower[k], upper[k], quiet)
+        explainer.push(table[k], lower[k], upper[k], quiet, bool(outside[k]))
         begin, last, before = (k if begin < 0 else begin), k, int(count[k])
     if begin >= 0:
         yield begin, last, explainer

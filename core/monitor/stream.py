@@ -475,7 +475,8 @@ class Stream:
         if not judged:
             return
         if verdict.alarm:
-            self.explainer.push(verdict.horizon_utilisation, verdict.lower, verdict.upper, self._quiet)
+            table, outside = verdict.horizon_utilisation, verdict.outside_domain
+            self.explainer.push(table, verdict.lower, verdict.upper, self._quiet, outside)
             self._quiet = 0
         else:
             self._quiet += 1

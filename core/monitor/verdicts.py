@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,8 @@ class Verdicts:
         The rules, with their `labels` and the `names` of the statistics.
     longer_utilisation : array (N+1, horizons, n)
         Utilisation by each of the model's horizons; NaN where its window is broken.
+    why_frozen : dict, optional
+        Of each sample and number of a state that is frozen there, in words why it is.
     asked : array (N+1,) of bool, optional
         Whether a verdict was asked for; default all.
     """
@@ -89,6 +91,7 @@ class Verdicts:
     rule_alarms: NDArray[np.bool_]
     alarms: Alarm
     longer_utilisation: Array
+    why_frozen: dict[tuple[int, int], str] = field(default_factory=dict)
     asked: NDArray[np.bool_] | None = None
 
     def __repr__(self) -> str:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.jumps import jump_words, jumps
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.frozen import repeat_words, why_frozen
+from uncertain_lti.monitor.frozen import repeat_words
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.regimes import check_regimes, sample_blocks, unknown_in_words
@@ -173,7 +173,7 @@ def _explained(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
         return found
     table = verdicts.horizon_utilisation
     for start, stop, explainer in over_recording(
-        model, verdicts.judged, verdicts.alarm, table, verdicts.lower, verdicts.upper
+        model, verdicts.judged, verdicts.alarm, table, verdicts.lower, verdicts.upper, verdicts.outside_domain
     ):
         like = explainer.likeness()
         if like is None or like.verdicts < LEAST:
@@ -214,7 +214,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: NDArray[np.bool_]) 
                     "seconds": seconds,
                     "told_after": told,
                     "longest_in_fit": longest,
-                    "why": why_frozen(i, model.repeats),
+                    "why": verdicts.why_frozen.get((start, i), ""),
                     "text": f"{name} {repeat_words(seconds, longest)} from {transient.t[begin]:.4f} s",
                 }
             )

@@ -83,7 +83,8 @@ def check_text(data: dict[str, Any]) -> str:
 
 def repeats_text(data: Mapping[str, Any]) -> list[str]:
     """What `check_data` has of frozen states, and of other long repeats."""
-    lines = [f"FROZEN: {r['text']}, {r['why']}" for r in data["frozen"][:MOST_REPEATS]]
+    told = data["frozen"][:MOST_REPEATS]
+    lines = ["FROZEN: {text}, told after {told_after:.3g} s, {why}".format_map(repeat) for repeat in told]
     if (more := len(data["frozen"]) - MOST_REPEATS) > 0:
         lines.append(f"  and {plural(more, 'more frozen repeat')}; --json has all")
     longest: dict[str, dict[str, Any]] = {}
