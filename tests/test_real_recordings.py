@@ -51,6 +51,9 @@ def test_fit_contains_and_is_not_absurd(recordings, signals_folder, bags, signal
     transients = read_transients([recordings / b for b in bags], signals_folder / signals)
     model = fit(transients, criterion, additive=additive)
     assert outside(model, transients) == 0
+    for margin in (1.0, 1.7):
+        monitor = EnvelopeMonitor(model, margin=margin)
+        assert not any(monitor.check(t).frozen.any() for t in transients), "what it was fitted to is never frozen"
     steps = [t.transitions() for t in transients]
     span = np.ptp(np.vstack([s.x for s in steps]), axis=0)
     wide = model.fit_summary["mean_width_recorded"] > 0.5 * span  # an envelope as wide as the range tells nothing

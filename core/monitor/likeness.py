@@ -203,8 +203,8 @@ class Explainer:
         begins = self.pattern is None or quiet > APART
         if begins:
             self.pattern = Pattern(self._steps, self._model.n)
-            outside = np.any(np.abs(table) > 1.0, axis=0).tolist()
-            self._first = tuple(n for n, out in zip(self._model.state_names, outside, strict=True) if out)
+            left = np.any(np.abs(table) > 1.0, axis=0).tolist()
+            self._first = tuple(n for n, out in zip(self._model.state_names, left, strict=True) if out)
         assert self.pattern is not None
         if self.pattern.verdicts < MOST:
             with np.errstate(over="ignore", invalid="ignore"):
