@@ -352,7 +352,7 @@ def test_offline_and_live_give_the_same_with_a_schedule() -> None:
 
 
 def test_a_frozen_state_breaks_the_windows_of_the_horizons() -> None:
-    model = fit([run(1), run(2, rest=(3.0, 4.0))], additive="noise", horizons={"steps": [2, 5]})
+    model = fit([run(1), run(2, rest=(3.0, 4.0))], additive="noise", horizons=[2, 5])
     frozen = held(run(12), 0, 200, 350)
     verdicts = EnvelopeMonitor(model).check(frozen)
     assert verdicts.frozen.any() and np.isnan(verdicts.horizon_utilisation[340:351]).all()
