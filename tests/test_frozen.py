@@ -301,6 +301,13 @@ def test_a_training_recording_with_bounds_of_no_width_is_not_frozen() -> None:
             assert not EnvelopeMonitor(one, margin=margin).check(transient).frozen.any()
 
 
+def test_a_run_beyond_all_numbers_is_learnt_as_the_largest_there_is() -> None:
+    """An unstable row, held for long: the run is infinite, and then no number."""
+    model = UncertainLTI([[1e6]], [[1.0]], [[0.0]], [[0.0]], v=[0.5])
+    run = Transient(np.arange(200.0), np.ones((200, 1)), np.where(np.arange(200) < 100, 0.0, -1e60)[:, None])
+    assert repeats_of(model, [run]).largest_run.tolist() == [LARGEST]
+
+
 def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
     parked = run(5, seconds=12.0, rest=(2.0, 9.0))
     verdicts = EnvelopeMonitor(model).check(parked)

@@ -285,7 +285,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
             follow.forget()
         for moved in follow.push(step):
             reached = moved.seconds, moved.run, moved.sum, moved.activity
-            most[:, moved.state] = np.maximum(most[:, moved.state], reached)
+            most[:, moved.state] = np.fmax(most[:, moved.state], reached)  # a run beyond all numbers is NaN after
     return Found(most, windows, noisy)
 
 
