@@ -10,6 +10,7 @@
 """rosbag2 databases and ROS 1 bags: what they give is what the same data in MCAP gives, and damage is a sentence."""
 
 import random
+import re
 import shutil
 import sqlite3
 import time
@@ -73,7 +74,7 @@ def converted(tmp_path_factory):
     shutil.copy(made["db3"], made["old db3"])
     with closing(sqlite3.connect(made["old db3"])) as database:
         database.execute("DROP TABLE message_definitions")
-        database.execute("UPDATE schema SET ros_distro = 'humble'")
+        database.execute("UPDATE schema SET ros_distro = 'humble', schema_version = 3")
         database.commit()
     made["ROS 1"] = to_ros1(SHIPPED, folder / "plain.bag")
     made["ROS 1 bz2"] = to_ros1(SHIPPED, folder / "bz2.bag", "BZ2")
@@ -193,38 +194,36 @@ def test_real_ones(recordings):
 # --- damaged and hostile --------------------------------------------------------------------------------------
 
 
-def test_a_database_without_its_end_is_refused_with_the_remedy(converted, tmp_path):
-    data = converted["db3"].read_bytes()
-    path = tmp_path / "cut.db3"
+@pytest.mark.parametrize("kind", EVERY[:1] + EVERY[3:])
+def test_a_file_without_its_end_is_refused_with_the_remedy(converted, kind, tmp_path):
+    data = converted[kind].read_bytes()
+    path = tmp_path / f"cut{converted[kind].suffix}"
     path.write_bytes(data[: len(data) // 2])
-    with pytest.raises(BagError, match=r"the database is damaged .*; copy it again, or mend it with `sqlite3 cut\.db3"):
+    with pytest.raises(BagError, match=r"cut or damaged .*; copy it again, or mend it with `(sqlite3|rosbag)") as error:
         Bag(path)
+    assert str(error.value).count("\n") == 0
 
 
-def test_the_rows_before_damage_count(converted, tmp_path):
-    data = bytearray(converted["db3"].read_bytes())
-    begin = len(data) // 2 // 4096 * 4096
-    data[begin : begin + 4096] = b"\xff" * 4096
-    path = tmp_path / "hurt.db3"
+def test_messages_before_damage_count_and_the_rest_is_said(converted, tmp_path):
+    data = bytearray(converted["ROS 1 bz2"].read_bytes())
+    at = data.rindex(b"BZh9")  # the last chunk
+    data[at + 500 : at + 510] = bytes(10)
+    path = tmp_path / "hurt.bag"
     path.write_bytes(data)
-    bag = Bag(path)
-    (warning,) = bag.warnings
-    assert warning.startswith(f"{path}: the database is cut or damaged (") and "before that count" in warning
+    (warning,) = Bag(path).warnings
+    assert re.search(r"is cut or damaged .*; \d+ of [\d ]+ messages before that count", warning)
     (cut,) = read_transients(path, SIGNALS)
     (whole,) = read_transients(SHIPPED, SIGNALS)
     assert 100 < len(cut) < len(whole) and cut.x[:-1].tobytes() == whole.x[: len(cut) - 1].tobytes()
 
 
-def test_a_ros_1_bag_without_its_end(converted, tmp_path):
-    data = converted["ROS 1 lz4"].read_bytes()
-    path = tmp_path / "cut.bag"
-    path.write_bytes(data[: len(data) // 2])
-    bag = Bag(path)
-    (warning,) = bag.warnings
-    assert "the file is cut at byte" in warning and "before that count" in warning
-    (cut,) = read_transients(path, SIGNALS)
-    (whole,) = read_transients(SHIPPED, SIGNALS)
-    assert 100 < len(cut) < len(whole) and cut.x[:-1].tobytes() == whole.x[: len(cut) - 1].tobytes()
+def test_an_index_that_leaves_messages_out_is_not_believed_in_silence(converted, tmp_path):
+    data = bytearray(converted["ROS 1 lz4"].read_bytes())
+    at = data.index(b"chunk_count=") + len(b"chunk_count=")
+    data[at] -= 1
+    path = tmp_path / "fewer.bag"
+    path.write_bytes(data)
+    assert any(re.search(r"holds \d+ chunks, and its index lists \d+", w) for w in Bag(path).warnings)
 
 
 def test_a_ros_1_bag_whose_recorder_was_killed(converted, tmp_path):
@@ -235,8 +234,8 @@ def test_a_ros_1_bag_whose_recorder_was_killed(converted, tmp_path):
     data[at : at + 8] = bytes(8)
     path = tmp_path / "active.bag"
     path.write_bytes(data[:begin])
-    assert "its recorder was ended" in Bag(path).warnings[0]
-    assert len(read_transients(path, SIGNALS)[0]) == len(read_transients(SHIPPED, SIGNALS)[0])
+    with pytest.raises(BagError, match=r"not indexed.*mend it with `rosbag reindex active\.bag`"):
+        Bag(path)
 
 
 def database_of(path, *statements):
@@ -257,7 +256,7 @@ def test_databases_that_are_no_recording(tmp_path):
         [["CREATE TABLE cookies(id)"], [TOPICS, endless], [TOPICS, "CREATE TABLE messages(id, payload)"]]
     ):
         path = database_of(tmp_path / f"{number}.db3", *statements)
-        with pytest.raises(BagError, match=r"\d\.db3: (a database without the tables|its tables topics and messages)"):
+        with pytest.raises(BagError, match=r"\d\.db3: is cut or damaged or no recording of ROS 2"):
             Bag(path)
 
 
@@ -278,7 +277,7 @@ def test_rows_that_are_no_messages_are_left_out(tmp_path):
     bag = Bag(path)
     assert bag.topics["/a"].count == 2
     assert [t for _, t, _ in bag.messages(["/a"])] == []  # cut, and longer than its type
-    assert any("5 messages left out, of no topic or without a log time or data" in w for w in bag.warnings)
+    assert any("its index counts 7 messages, and 2 could be read" in w for w in bag.warnings)
     assert any("2 messages left out that cannot be decoded" in w for w in bag.warnings)
 
 
@@ -293,10 +292,12 @@ def test_other_versions_and_no_space_for_nothing(tmp_path):
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V1.2\n" + bytes(100))
     with pytest.raises(BagError, match="of another version than 2.0"):
         Bag(tmp_path / "a.bag")
-    (tmp_path / "b.bag").write_bytes(b"#ROSBAG V2.0\n")
-    assert Bag(tmp_path / "b.bag").topics == {}
+    for name, head in (("b.bag", b"#ROSBAG V2.0\n"), ("c.bag", b"#ROSBAG V2.0\n" + bytes(1 << 20))):
+        (tmp_path / name).write_bytes(head)
+        with pytest.raises(BagError, match="is cut or damaged or no ROS 1 bag"):
+            Bag(tmp_path / name)
     (tmp_path / "c.db3").write_bytes(b"SQLite format 3\0" + bytes(5000))
-    with pytest.raises(BagError, match="the database is damaged"):
+    with pytest.raises(BagError, match="is cut or damaged or no recording"):
         Bag(tmp_path / "c.db3")
 
 
@@ -315,28 +316,23 @@ def test_elements_without_bytes_do_not_take_for_ever(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["db3", "ROS 1", "ROS 1 bz2", "ROS 1 lz4"])
-def test_damage_anywhere_is_read_or_a_sentence(converted, kind, tmp_path):
+def test_a_flipped_bit_loses_no_message_in_silence(converted, kind, tmp_path):
     data = converted[kind].read_bytes()
+    whole = {topic: info.count for topic, info in Bag(converted[kind]).topics.items()}
     path = tmp_path / converted[kind].name
     rng = random.Random(5)
-    read = refused = 0
-    for _ in range(40):
+    for _ in range(8):
         hurt = bytearray(data)
-        where = rng.randrange(len(hurt)) if rng.random() < 0.6 else rng.randrange(9000)
-        hurt[where : where + rng.choice([1, 4, 200])] = rng.randbytes(rng.choice([1, 4, 200]))
-        path.write_bytes(hurt[: rng.randrange(1, len(hurt))] if rng.random() < 0.2 else hurt)
+        where = rng.randrange(len(hurt)) if rng.random() < 0.5 else len(hurt) - 1 - rng.randrange(6000)
+        hurt[where] ^= 1 << rng.randrange(8)
+        path.write_bytes(hurt)
         try:
             bag = Bag(path)
-            for _ in bag.messages([t for t, info in bag.topics.items() if info.readable]):
-                pass
-            read_stream(bag, SignalMap.load(SIGNALS)) if len(bag.topics) == 2 else None
-            read += 1
+            number = sum(1 for _ in bag.raw_messages())
         except BagError as error:
             assert str(path) in str(error) and "\n" not in str(error)
-            refused += 1
-        except Exception as error:
-            assert type(error).__name__ == "SignalError", repr(error)
-    assert read > 5
+        else:
+            assert bag.warnings or number == sum(whole.values())
 
 
 def test_a_scan_leaves_nothing_beside_the_file(converted, tmp_path):

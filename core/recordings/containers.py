@@ -11,34 +11,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from uncertain_lti.recordings import mcap_index, mcap_scan, ros1_scan, sqlite_scan
+from uncertain_lti.recordings import mcap_index, mcap_scan
+from uncertain_lti.recordings.foreign import scan_foreign
 from uncertain_lti.recordings.mcap_records import Contents
 from uncertain_lti.recordings.unreadable import os_error
-
-_OTHERS: Mapping[bytes, Callable[[Path], Contents]] = {
-    sqlite_scan.MAGIC: sqlite_scan.scan_database,
-    ros1_scan.MAGIC: ros1_scan.scan_ros1,
-}
 
 
 def scan(path: Path) -> Contents:
     """Go through a file once and note where its messages are."""
-    return (_other(path) or mcap_scan.scan)(path)
+    return _foreign(path) or mcap_scan.scan(path)
 
 
 def outline_or_scan(path: Path) -> Contents:
     """What the index of an MCAP file states, or else what is found by `scan`."""
-    return (_other(path) or mcap_index.outline_or_scan)(path)
+    return _foreign(path) or mcap_index.outline_or_scan(path)
 
 
-def _other(path: Path) -> Callable[[Path], Contents] | None:
-    """What scans a file that is no MCAP; None for every other."""
+def _foreign(path: Path) -> Contents | None:
     try:
-        with open(path, "rb") as stream:
-            head = stream.read(max(map(len, _OTHERS)))
+        return scan_foreign(path)
     except OSError as error:
         raise os_error(path, error) from None
-    return next((scan for magic, scan in _OTHERS.items() if head.startswith(magic)), None)

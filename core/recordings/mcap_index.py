@@ -25,6 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
 from uncertain_lti.base.files import MAGIC
+from uncertain_lti.recordings.aside import most_inflated
 from uncertain_lti.recordings.mcap_records import (
     CHUNK,
     FOOTER_SIZE,
@@ -39,7 +40,7 @@ from uncertain_lti.recordings.mcap_records import (
     parse,
     walk,
 )
-from uncertain_lti.recordings.mcap_scan import most_inflated, most_records, scan
+from uncertain_lti.recordings.mcap_scan import most_records, scan
 from uncertain_lti.recordings.unreadable import os_error
 
 _DATA_END_SIZE = RECORD.size + 4

@@ -38,6 +38,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, DataEnd, Footer, Schema, Statistics
 
 from uncertain_lti.base.files import MAGIC
+from uncertain_lti.recordings.aside import LARGEST_RATIO, most_inflated
 from uncertain_lti.recordings.mcap_records import (
     CHUNK,
     FOOTER_SIZE,
@@ -62,8 +63,6 @@ _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
 _CHUNK_AT = struct.Struct("<16xQ")  # in a chunk's index
 _FIRST_WARNINGS = 3  # of a kind that are reported one by one
 _LEAST_RECORDS = 1 << 20
-_LEAST_INFLATED = 1 << 30
-_LARGEST_RATIO = 1000
 _LARGEST_DEFINITION = 1 << 24  # bytes
 _LARGEST_DEFINITIONS = 1 << 26  # bytes, all of a file
 
@@ -71,11 +70,6 @@ _LARGEST_DEFINITIONS = 1 << 26  # bytes, all of a file
 def most_records(size: int) -> int:
     """Records that compressed chunks may hold together; one of a recording takes several bytes."""
     return max(_LEAST_RECORDS, size)
-
-
-def most_inflated(size: int) -> int:
-    """Bytes that compressed chunks may have together when they are decompressed."""
-    return max(_LEAST_INFLATED, _LARGEST_RATIO * size)
 
 
 def scan(path: Path) -> Contents:
@@ -262,7 +256,7 @@ class _Scanner:
             return
         stated = min(stated, max(LARGEST_CHUNK, len(data)))
         if compression and stated > self.bytes_left:
-            self._leave_out(where, f"with it the file is over {_LARGEST_RATIO} times its size when decompressed", cut)
+            self._leave_out(where, f"with it the file is over {LARGEST_RATIO} times its size when decompressed", cut)
             return
         records, trouble = inflate(compression, data, stated)
         self.bytes_left -= len(records) if compression else 0
