@@ -10,6 +10,7 @@
 """Tables as recordings: the bits that the same data gives in MCAP, headers and times of every kind, and bad files."""
 
 import random
+import time
 from decimal import Decimal
 from pathlib import Path
 
@@ -423,3 +424,117 @@ def test_a_folder_of_tables_is_not_one_recording(tables):
 def test_a_run_named_without_a_column_for_it(tables):
     with pytest.raises(BagError, match=r"names a run; say in the signals file which column does"):
         open_recording(f"{tables['.csv']}[2]")
+
+
+# --- what must not pass in silence ----------------------------------------------------------------------------
+
+
+def write(path, *text):
+    path.write_text("\n".join(text) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 10**6), ("[us]", 10**3), ("s", 10**9)])
+def test_a_line_of_units_below_the_names_counts(tmp_path, unit, factor):
+    path = write(tmp_path / "a.csv", "time,x", f"{unit},m", *(f"{i},{i * i}" for i in range(9)))
+    assert Table(path).times.tolist() == [i * factor for i in range(9)]
+
+
+def test_an_unclosed_quote_is_a_sentence_with_its_line(tmp_path):
+    rows = [f"{i},{i},on" for i in range(3000)]
+    rows[1000], rows[2500] = '1000,1000,"on', '2500,2500,on"'
+    with pytest.raises(BagError, match="line 1002 opens a quote that is not closed in it"):
+        Table(write(tmp_path / "a.csv", "time,x,mode", *rows))
+
+
+def test_rows_without_a_run_are_counted(tmp_path):
+    path = write(tmp_path / "a.csv", "time,x,run", "0,1,a", "1,2,", "2,3,", "3,4,b")
+    tables = Table.every_run(path, TableLayout(runs="run"))
+    assert [t.path.name for t in tables] == ["a.csv[a]", "a.csv[b]"]
+    assert any("2 rows without a run left out" in w for t in tables for w in t.warnings)
+
+
+def test_runs_stay_apart(tmp_path):
+    path = write(tmp_path / "a.csv", "time,x,run", "0,1,a[1]", "1,2,a(1)")
+    with pytest.raises(BagError, match=r"runs 'a\(1\)' and 'a\(1\)'|would have one name"):
+        Table.every_run(path, TableLayout(runs="run"))
+    long = [12345678901234567 + i for i in (0, 0, 1, 1)]
+    path = write(tmp_path / "b.csv", "time,x,run", *(f"{i},{i},{run}" for i, run in enumerate(long)))
+    assert [t.path.name for t in Table.every_run(path, TableLayout(runs="run"))] == [f"b.csv[{r}]" for r in long[::2]]
+
+
+@pytest.mark.parametrize("odd", ["\x0c", "\x0b", "\x85", "\u2028"])
+def test_only_line_ends_end_a_line(tmp_path, odd):
+    path = tmp_path / "a.csv"
+    path.write_text(f"made by{odd}somebody{odd}\ntime,x\n0,1\n1,2\n2,3\n", encoding="utf-8")
+    assert len(Table(path).times) == 3
+
+
+def test_an_unsigned_column_that_falls_is_no_time(tmp_path):
+    np.savez(tmp_path / "a.npz", depth=np.array([9, 7, 4, 2], dtype=np.uint8), x=np.arange(4.0))
+    with pytest.raises(BagError, match="no column is called time"):
+        Table(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("cell", ["2026-11-22T06:28:01+99:99", "2026-11-22T06:28:01+15:00", "3026-11-22", "1500-01-01"])
+def test_instants_that_there_are_not_are_refused(tmp_path, cell):
+    with pytest.raises(BagError, match=r"time zone|after 2261"):
+        Table(write(tmp_path / "a.csv", "time,x", f"{cell},1", f"{cell},2"))
+
+
+def test_instants_beyond_ns_in_arrays_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", time=np.array(["3026-01-01", "3026-01-02"], dtype="datetime64[s]"), x=np.arange(2.0))
+    with pytest.raises(BagError, match="after 2261"):
+        Table(tmp_path / "a.npz")
+
+
+def test_nanoseconds_with_a_gap_stay_exact(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    begin = 1_700_000_000_000_000_001
+    table = pa.table({"time": pa.array([begin, None, begin + 7], pa.int64()), "x": [1.0, 2.0, 3.0]})
+    parquet.write_table(table, tmp_path / "a.parquet")
+    assert Table(tmp_path / "a.parquet").times.tolist() == [begin, begin + 7]
+
+
+def test_an_underscore_makes_no_number(tmp_path):
+    path = write(tmp_path / "a.csv", "time,x", "0,1", "1,1_0", "2,3")
+    table = Table(path)
+    assert np.isnan(table.columns_by_field["x"][1]) and any("1_0" in w for w in table.warnings)
+
+
+def test_equal_names_do_not_take_for_ever(tmp_path):
+    number = 3000
+    rows = [",".join([str(i)] * (number + 1)) for i in range(3)]
+    path = write(tmp_path / "a.csv", ",".join(["time"] + ["x"] * number), *rows)
+    begin = time.process_time()
+    assert len(Table(path).columns_by_field) == number
+    assert time.process_time() - begin < 5
+
+
+def test_a_small_parquet_that_expands_is_refused(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    column = pa.array(np.zeros(10_000_000))
+    path = tmp_path / "a.parquet"
+    parquet.write_table(pa.table({f"c{i}": column for i in range(15)}), path)
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(BagError, match="more than is read of a file of its size"):
+        Table(path)
+
+
+def test_a_mat_file_that_breaks_its_reader_down_is_a_sentence(tables, tmp_path):
+    """A flipped bit was a segmentation fault of the reader, and the end of the command."""
+    data = tables[".mat"].read_bytes()
+    rng = random.Random(1)
+    path = tmp_path / "a.mat"
+    for _ in range(12):
+        hurt = bytearray(data)
+        hurt[128 + rng.randrange(64)] ^= 1 << rng.randrange(8)
+        path.write_bytes(hurt)
+        try:
+            Table(path)
+        except BagError as error:
+            assert str(path) in str(error) and "\n" not in str(error)

@@ -39,6 +39,8 @@ TYPE = "table"
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
 _SECOND = 10**9
+_INEXACT = 2**53  # above which a float does not keep each integer
+_NO_RUN = ("", "nan", "None", "NaT")
 
 
 def is_table(path: Path) -> bool:
@@ -114,10 +116,12 @@ class Table:
             kept = kept[known]
         self.times = times[kept]
         self.columns_by_field: dict[str, Column] = {}
+        repeats: dict[str, int] = {}
         for name, column in raw.columns.items():
-            field, number = field_name(name), 2
+            field = plain = field_name(name)
             while field in self.columns_by_field:
-                field, number = f"{field_name(name)}_{number}", number + 1
+                repeats[plain] = repeats.get(plain, 1) + 1
+                field = f"{plain}_{repeats[plain]}"
             if name not in apart:
                 self.columns_by_field[field] = column if len(kept) == len(column) else column[kept]
         first, last = (int(self.times[0]), int(self.times[-1])) if len(kept) else (None, None)
@@ -247,17 +251,26 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
     column = raw.columns[find_column(file, layout.runs, list(raw.columns), "the runs")]
     if column.ndim != 1:
         raise BagError(f"{file}: column '{layout.runs}' has several numbers a row, so it names no run")
-    keys = np.asarray(column.astype(str) if column.dtype.kind != "f" else [f"{value:.15g}" for value in column])
+    keys = column.astype(str)
+    if column.dtype.kind == "f":
+        keys = np.asarray([repr(value).removesuffix(".0") for value in column.tolist()])
+        if raw.exact is not None and len(column) and bool((np.abs(column) >= _INEXACT).any()):
+            keys = np.asarray(raw.exact(find_column(file, layout.runs, list(raw.columns), "the runs")))
     names, first, rows = np.unique(keys, return_index=True, return_inverse=True)
     if len(names) > _MOST_RUNS:
         raise BagError(f"{file}: column '{layout.runs}' has {len(names)} values, so it names no runs; choose another")
     order = np.argsort(rows, kind="stable")
     pieces = np.split(order, np.cumsum(np.bincount(rows, minlength=len(names)))[:-1])
-    return {
-        str(names[i]).replace("[", "(").replace("]", ")"): pieces[i]
-        for i in np.argsort(first, kind="stable").tolist()
-        if str(names[i]) not in ("", "nan")
-    }
+    found: dict[str, NDArray[np.intp]] = {}
+    for i in np.argsort(first, kind="stable").tolist():
+        name = str(names[i]).replace("[", "(").replace("]", ")")
+        if name in _NO_RUN:
+            raw.notes.append(f"{plural(len(pieces[i]), 'row')} without a run left out")
+        elif name in found:
+            raise BagError(f"{file}: runs '{names[i]}' and '{name}' would have one name; rename one of them")
+        else:
+            found[name] = pieces[i]
+    return found
 
 
 def _field_type(column: Column) -> FieldType:

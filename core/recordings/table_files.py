@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.mcap_scan import most_inflated
+from uncertain_lti.recordings.aside import aside, most_inflated, one_line
 from uncertain_lti.recordings.unreadable import os_error
 
 _DELIMITERS = ",;\t|"
@@ -37,6 +37,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?inf(inity)?$|
 _WITH_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?$")
 _INSTANT = re.compile(r"\d{4}-\d\d-\d\d([T ]|$)|\d{1,2}:\d\d(:\d\d|$)|\d{1,2}[./]\d{1,2}[./]\d{2,4}")
 _MOST_COLUMNS = 20_000
+YEARS = (1678, 2261)  # that ns since 1970 can say
 _ODD_SHARE = 0.1  # of lines with another number of cells, above which the file is no table
 
 Column = NDArray[Any]
@@ -49,12 +50,13 @@ class RawTable:
 
     `columns`: by the names in the file, in their order; `notes`: what was left out or changed, each a part of a
     sentence; `exact`: takes the name of a column of numbers, and returns the text of its cells; None where there is no
-    text.
+    text; `units`: what a line below the names says of some columns.
     """
 
     columns: Mapping[str, Column]
     notes: list[str] = field(default_factory=list)
     exact: Callable[[str], Sequence[str]] | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_table(path: Path) -> RawTable:
@@ -77,6 +79,7 @@ class _Shape:
     delimiter: str
     skip: int
     names: tuple[str, ...]
+    units: tuple[str, ...] = ()
 
 
 def _read_csv(path: Path) -> RawTable:
@@ -85,7 +88,7 @@ def _read_csv(path: Path) -> RawTable:
     encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     if encoding != "utf-16" and b"\0" in head:
         raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; check the path and its suffix")
-    lines = head.decode(encoding, errors="replace").splitlines()[:_LOOK_LINES]
+    lines = re.split(r"\r\n|\r|\n", head.decode(encoding, errors="replace"))[:_LOOK_LINES]
     shape = _shape(path, lines if len(head) < _LOOK else lines[:-1] or lines)
     names = _unique(shape.names)
     exact = _Texts(path, encoding, shape, names)
@@ -98,7 +101,11 @@ def _read_csv(path: Path) -> RawTable:
         return _read_cells(path, encoding, shape, names)
     if values.shape[1] != len(names) or not len(values):
         return _read_cells(path, encoding, shape, names)
-    return RawTable(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), [], exact)
+    return RawTable(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), [], exact, _units(shape, names))
+
+
+def _units(shape: _Shape, names: Sequence[str]) -> dict[str, str]:
+    return {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
 
 
 class _Texts:
@@ -118,8 +125,14 @@ def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[
         for _ in range(shape.skip):
             text.readline()
         reader = csv.reader(text, delimiter=shape.delimiter, skipinitialspace=True)
+        before = 0
         try:
             for cells in reader:
+                if reader.line_num > before + 1:
+                    raise BagError(
+                        f"{path}: line {shape.skip + before + 1} opens a quote that is not closed in it; mend it"
+                    )
+                before = reader.line_num
                 if cells and any(cells):
                     yield shape.skip + reader.line_num, cells
         except csv.Error as error:
@@ -159,7 +172,7 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
         found[name], note = _column(texts_of, shape.delimiter)
         if note:
             notes.append(f"column '{name}': {note}")
-    table = RawTable(found, notes)
+    table = RawTable(found, notes, units=_units(shape, names))
     texts = dict(zip(names, columns, strict=True))
     table.exact = lambda name: [cell.strip() for cell in texts[name]]
     return table
@@ -167,15 +180,16 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
 
 def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
     """Numbers where most cells are some, else text; and what was done."""
-    try:
-        return np.array([float(cell) for cell in cells]), ""
-    except ValueError:
-        pass
     plain = [cell.strip() for cell in cells]
-    try:
-        return np.array([np.nan if cell.lower() in _MISSING else float(cell) for cell in plain]), ""
-    except ValueError:
-        pass
+    if not any("_" in cell for cell in cells):  # `1_0` is 10 to Python alone
+        try:
+            return np.array([float(cell) for cell in cells]), ""
+        except ValueError:
+            pass
+        try:
+            return np.array([np.nan if cell.lower() in _MISSING else float(cell) for cell in plain]), ""
+        except ValueError:
+            pass
     numbers = np.full(len(plain), np.nan)
     comma = missing = odd = 0
     first = ""
@@ -201,16 +215,15 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
 
 def _unique(names: Iterable[str]) -> list[str]:
     """Names of which none is there twice; the second gets a number."""
-    found: list[str] = []
+    found: dict[str, None] = {}
+    repeats: dict[str, int] = {}
     for number, name in enumerate(names, start=1):
-        text = " ".join(name.replace("\ufffd", "").split()) or f"column {number}"
-        repeat = 2
-        chosen = text
+        chosen = text = " ".join(name.replace("\ufffd", "").split()) or f"column {number}"
         while chosen in found:
-            chosen = f"{text} {repeat}"
-            repeat += 1
-        found.append(chosen)
-    return found
+            repeats[text] = repeats.get(text, 1) + 1
+            chosen = f"{text} {repeats[text]}"
+        found[chosen] = None
+    return list(found)
 
 
 def _shape(path: Path, lines: Sequence[str]) -> _Shape:
@@ -236,13 +249,16 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     if delimiter == " ":
         raise BagError(f"{path}: its cells are apart by spaces alone; write commas, semicolons or tabs between them")
     names: tuple[str, ...] = tuple(f"column {i + 1}" for i in range(wide))
-    for line in lines[:-begin]:
+    units: tuple[str, ...] = ()
+    for number, line in enumerate(lines[:-begin], start=1):
         cells = _split(line.lstrip("#% "), delimiter)
         trimmed = cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells
         if len(trimmed) == wide and len({c for c in trimmed if c}) > 1:
             names = tuple(trimmed)
-            break  # what follows it are units
-    return _Shape(delimiter, -begin, names)
+            below = [_split(text.lstrip("#% "), delimiter) for text in lines[number:-begin]]
+            units = next((tuple(cells) for cells in below if len(cells) >= wide), ())
+            break
+    return _Shape(delimiter, -begin, names, units)
 
 
 def _split(line: str, delimiter: str) -> list[str]:
@@ -272,11 +288,20 @@ def _read_arrow(path: Path) -> RawTable:
         raise BagError(_wants(path, "pyarrow")) from None
     try:
         if path.suffix.lower() == ".parquet":
+            rows = pa.parquet.read_metadata(path)
+            if rows.num_rows * rows.num_columns * 8 > most_inflated(path.stat().st_size):
+                raise BagError(
+                    f"{path}: states {rows.num_rows} rows of {rows.num_columns} columns, which is more than is read of "
+                    f"a file of its size; write the columns and rows that are needed"
+                )
             table = pa.parquet.read_table(path, memory_map=False)
         else:
             table = pa.feather.read_table(path, memory_map=False)
+        table.validate(full=True)
+    except BagError:
+        raise
     except (pa.ArrowException, ValueError, OSError) as error:
-        raise BagError(f"{path}: is damaged or no {path.suffix} file ({_one_line(error)}); copy it again") from None
+        raise BagError(f"{path}: is damaged or no {path.suffix} file ({one_line(error)}); copy it again") from None
     found: dict[str, Any] = {}
     notes = []
     for name, column in zip(_unique(map(str, table.column_names)), table.columns, strict=True):
@@ -284,7 +309,7 @@ def _read_arrow(path: Path) -> RawTable:
         if pa.types.is_dictionary(kind):
             column, kind = column.cast(kind.value_type), kind.value_type
         if pa.types.is_timestamp(kind) or pa.types.is_date(kind):
-            found[name] = np.asarray(column.cast(pa.timestamp("ns"), safe=False), dtype="datetime64[ns]")
+            found[name] = _nanoseconds(path, name, np.asarray(column))
         elif pa.types.is_boolean(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
             found[name] = np.asarray(column.cast(pa.float64(), safe=False), dtype=np.float64)
         elif pa.types.is_integer(kind):
@@ -293,7 +318,19 @@ def _read_arrow(path: Path) -> RawTable:
             found[name] = np.array([text or "" for text in column.to_pylist()], dtype=object)
         else:
             notes.append(f"column '{name}' left out, it is of type {kind}")
-    return _of_one_length(path, found, notes)
+    read = _of_one_length(path, found, notes)
+    texts = {name: column for name, column in zip(_unique(map(str, table.column_names)), table.columns, strict=True)}
+    read.exact = lambda name: [str(value) for value in texts[name].to_pylist()]  # integers with gaps
+    return read
+
+
+def _nanoseconds(path: Path, name: str, values: Column) -> Column:
+    """Instants in ns, which end in 2262."""
+    known = values[~np.isnat(values)]
+    years = known.astype("datetime64[Y]").astype(np.int64) + 1970
+    if len(years) and (years.min() < YEARS[0] or years.max() > YEARS[1]):
+        raise BagError(f"{path}: column '{name}': has days before {YEARS[0]} or after {YEARS[1]}; mend it")
+    return values.astype("datetime64[ns]")
 
 
 def _read_mat(path: Path) -> RawTable:
@@ -310,8 +347,14 @@ def _read_mat(path: Path) -> RawTable:
     except MemoryError:
         raise
     except Exception as error:  # whatever the bytes lead its reader to
-        raise BagError(f"{path}: is damaged or no .mat file ({_one_line(error)}); copy it again") from None
+        raise BagError(f"{path}: is damaged or no .mat file ({one_line(error)}); copy it again") from None
     return _of_arrays(path, {name: value for name, value in variables.items() if not name.startswith("__")})
+
+
+def _read_mat_aside(path: Path) -> RawTable:
+    """Damage may break its reader down."""
+    read: RawTable = aside(_read_mat, path, ".mat file")
+    return read
 
 
 def _read_npz(path: Path) -> RawTable:
@@ -331,7 +374,7 @@ def _read_npz(path: Path) -> RawTable:
     except (BagError, OSError, MemoryError):
         raise
     except Exception as error:  # whatever the bytes lead its reader to
-        raise BagError(f"{path}: is damaged or no .npz file ({_one_line(error)}); copy it again") from None
+        raise BagError(f"{path}: is damaged or no .npz file ({one_line(error)}); copy it again") from None
     return _of_arrays(path, found)
 
 
@@ -352,7 +395,7 @@ def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
         if array.ndim == 2 and 1 in array.shape:
             array = array.ravel()
         if array.dtype.kind == "M":
-            array = array.astype("datetime64[ns]")
+            array = _nanoseconds(path, name, array)
         elif array.dtype.kind in "US":
             array = array.astype(str).astype(object)
         elif array.dtype.kind == "O" and array.ndim == 1 and len(array) and all(isinstance(v, str) for v in array):
@@ -396,16 +439,11 @@ def _wants(path: Path, package: str) -> str:
     )
 
 
-def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 120 else text[:120] + " ..."
-
-
 _READERS: Mapping[str, Callable[[Path], RawTable]] = {
     ".csv": _read_csv,
     ".tsv": _read_csv,
     ".parquet": _read_arrow,
     ".feather": _read_arrow,
-    ".mat": _read_mat,
+    ".mat": _read_mat_aside,
     ".npz": _read_npz,
 }

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.mcap_records import LATEST
+from uncertain_lti.recordings.table_files import YEARS as _YEARS
 from uncertain_lti.recordings.table_files import Column, RawTable
 from uncertain_lti.signals.table_layout import UNITS, TableLayout
 
@@ -39,6 +40,7 @@ _UNIT = {
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
+_LARGEST_ZONE = 14  # hours
 _INEXACT = 10**15  # ns, above which a float of seconds does not keep each
 
 
@@ -78,7 +80,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         return column, values.astype("datetime64[ns]").astype(np.int64), words
     if values.dtype.kind == "O":
         return column, _of_text(where, values.tolist()), words
-    unit = layout.unit or _unit(column, values)
+    unit = layout.unit or _unit(column, values, table.units.get(column, ""))
     if layout.unit is None and unit != "s":
         words = f"{words}{' and ' if words else ''}its numbers are taken for {unit}"
     return column, _of_numbers(where, table, column, UNITS[unit]), f"column '{column}': {words}" if words else ""
@@ -102,7 +104,7 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     values = table.columns[first] if first else np.empty(0)
     if first == names[0] or names[:1] == ["column 1"]:
         values = table.columns[names[0]]
-        if values.ndim == 1 and values.dtype.kind in "iuf" and len(values) > 2 and (np.diff(values) > 0).all():
+        if values.ndim == 1 and values.dtype.kind in "iuf" and len(values) > 2 and (values[1:] > values[:-1]).all():
             return names[0], "it is taken for the time, as it grows from row to row"
     raise BagError(
         f"{path}: no column is called time or looks like it; name it in the signals file, `table: {{time: COLUMN}}`; "
@@ -118,9 +120,12 @@ def _may_be(column: Column) -> bool:
     return bool(_ISO.match(first) or _CLOCK.match(first))
 
 
-def _unit(name: str, values: Column) -> str:
-    """Unit in the name, such as `t_ms` or `time [us]`, else by the size of times since 1970, else s."""
+def _unit(name: str, values: Column, stated: str = "") -> str:
+    """Unit below the names, or in the name, such as `t_ms` or `time [us]`, else by the size of times since 1970."""
     low = name.lower().replace("μ", "µ")
+    for unit, pattern in _UNIT.items():
+        if re.fullmatch(rf"[\[(]?\s*({pattern})\s*[\])]?", stated.lower().replace("μ", "µ")):
+            return unit
     for unit, pattern in _UNIT.items():
         if re.search(rf"[\[(]\s*({pattern})\s*[\])]", low) or re.search(rf"[_\s]({pattern})$", low):
             return unit
@@ -180,7 +185,7 @@ def _of_text(where: str, cells: Sequence[object]) -> NDArray[np.int64]:
             day, clock, zone = match.groups()
             plain.append(f"{day}T{(clock or '00:00').replace(',', '.')}")
             rows.append(row)
-            shifts.append(_shift(zone))
+            shifts.append(_shift(where, zone))
         elif match := _CLOCK.match(text):
             hours, minutes, seconds = match.groups()
             fraction = Decimal((seconds or "0").replace(",", ".")) * 10**9
@@ -191,6 +196,9 @@ def _of_text(where: str, cells: Sequence[object]) -> NDArray[np.int64]:
                 f"2026-11-22T06:28:01.25Z; write all of them as one or the other"
             )
     if plain:
+        for text in plain:
+            if not _YEARS[0] <= int(text[:4]) <= _YEARS[1]:
+                raise BagError(f"{where}: '{text[:40]}' is before {_YEARS[0]} or after {_YEARS[1]}; mend it")
         try:
             parsed = np.array(plain, dtype="datetime64[ns]").astype(np.int64)
         except ValueError:
@@ -210,10 +218,12 @@ def _parses(text: str) -> bool:
     return True
 
 
-def _shift(zone: str | None) -> int:
+def _shift(where: str, zone: str | None) -> int:
     """Nanoseconds by which a zone is before UTC."""
     if not zone or zone in ("Z", "UTC"):
         return 0
     sign = -1 if zone[0] == "-" else 1
     digits = zone[1:].replace(":", "")
+    if int(digits[:2]) > _LARGEST_ZONE or int(digits[2:]) > 59:
+        raise BagError(f"{where}: there is no time zone '{zone}'; mend it")
     return sign * (int(digits[:2]) * 60 + int(digits[2:])) * 60 * 10**9
