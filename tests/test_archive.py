@@ -22,6 +22,7 @@ from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import OperatingPoint, Transient, read_transients
 from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.base.files import whole_file
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
 from uncertain_lti.identification.assembly import assemble
@@ -255,3 +256,18 @@ def test_cache_of_the_command(bags, tmp_path, capsys):
     assert np.array(one["dA"]) == pytest.approx(np.array(two["dA"]), rel=1e-9, abs=1e-9)
     assert one["fit"]["sources"] == two["fit"]["sources"]
     capsys.readouterr()
+
+
+def test_what_a_killed_writer_left_goes_at_the_next_start(tmp_path):
+    left, young, other = (tmp_path / name for name in (".w.mcap-1.tmp", ".w.mcap-2.tmp", ".v.mcap-1.tmp"))
+    for path in (left, young, other):
+        path.write_bytes(b"half")
+    for path in (left, other):
+        os.utime(path, (1e9, 1e9))
+    with whole_file(tmp_path / "w.mcap") as first:
+        os.utime(first.fileno(), (1e9, 1e9))
+        with whole_file(tmp_path / "w.mcap") as stream:  # beside one that is still writing
+            stream.write(b"whole")
+        first.write(b"first")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [other.name, young.name, "w.mcap"]
+    assert (tmp_path / "w.mcap").read_bytes() == b"first"

@@ -357,3 +357,27 @@ def test_a_value_that_the_bounds_cannot_carry_has_no_verdict_live_as_offline(val
 def test_a_duration_beyond_64_bits_is_the_longest():
     assert to_ns(1e308) == to_ns(np.float64(1e300)) == to_ns(1e10) == to_ns(np.inf) == LONGEST_NS
     assert to_ns(-1e308) == -LONGEST_NS and to_ns(1.5) == 1_500_000_000
+
+
+def test_info_on_odd_leaves_of_the_fit_is_no_defect(folder, tmp_path):
+    """What a file says of its own fit may be anything; no command ends with 70 for it."""
+    whole = json.loads((folder / "m.model.json").read_text())
+
+    def leaves(value, path=()):
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                yield from leaves(inner, (*path, key))
+        else:
+            yield path
+
+    path = tmp_path / "odd.model.json"
+    statuses = set()
+    for number, leaf in enumerate(leaves(whole["fit"])):
+        data = json.loads(json.dumps(whole))
+        inner = data["fit"]
+        for key in leaf[:-1]:
+            inner = inner[key]
+        inner[leaf[-1]] = ["text", [1], {"a": None}, None][number % 4]
+        path.write_text(json.dumps(data))
+        statuses.add(main(["info", str(path)]))
+    assert statuses <= {0, 2}, statuses

@@ -599,3 +599,26 @@ def test_checking_a_map_names_the_topic_and_the_field() -> None:
     with pytest.raises(SignalError, match="field 'data\\[0\\]' of /b \\(std_msgs/msg/Float64\\)"):
         signals.check("/b", "std_msgs/msg/Float64", fields)
     signals.check("/c", "std_msgs/msg/String", fields)  # carries no signal
+
+
+def test_aliases_and_old_numbers_of_yaml(tmp_path):
+    """Nine lists of nine aliases each were 1.6 GB in 30 s; `010` was 8 and `1:30` was 90."""
+    path = tmp_path / "s.yaml"
+    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n"
+    bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10))
+    path.write_text(bomb)
+    with pytest.raises(SignalError, match=r"at line 2: an alias \(\*name\); write out what it stands for"):
+        SignalMap.load(path)
+    from uncertain_lti.base.plain_yaml import compose, construct
+
+    text = "{a: 010, b: 1:30, c: 1_000, d: 10, e: 1.5e-3, f: -0.5, g: 0x10, h: 0}"
+    assert construct(compose(text)) == {
+        "a": "010", "b": "1:30", "c": "1_000", "d": 10, "e": "1.5e-3", "f": -0.5, "g": 16, "h": 0
+    } | {"e": construct(compose("1.5e-3"))}  # fmt: skip
+
+
+def test_a_unit_of_the_table_that_is_a_list(tmp_path):
+    from uncertain_lti.signals.table_layout import TableLayout
+
+    with pytest.raises(SignalError, match="unit is \\['ms'\\]"):
+        TableLayout.from_dict({"unit": ["ms"]}, "table")

@@ -11,10 +11,13 @@
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import hashlib
 import os
 import re
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,6 +27,8 @@ from uncertain_lti.base.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of an MCAP recording."""
+
+_YOUNG = 10  # s
 
 
 @contextmanager
@@ -39,8 +44,12 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         return
     path = os.path.realpath(path)
     folder, name = os.path.split(path)
-    descriptor, temporary = tempfile.mkstemp(dir=folder, prefix=f".{name[:100]}-", suffix=".tmp")
+    beginning = f".{name[:100]}-"
+    _clear(folder, beginning)
+    descriptor, temporary = tempfile.mkstemp(dir=folder, prefix=beginning, suffix=".tmp")
     try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with os.fdopen(descriptor, "wb") as stream:
             yield stream
             stream.flush()
@@ -53,6 +62,16 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
         raise
+
+
+def _clear(folder: str, beginning: str) -> None:
+    """Remove what writers of a file left that were killed, whose locks are free; a young one may not have its yet."""
+    with suppress(OSError):
+        for left in Path(folder or ".").glob(f"{glob.escape(beginning)}*.tmp"):
+            with suppress(OSError), open(left, "rb") as stream:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if time.time() - left.stat().st_mtime > _YOUNG:
+                    left.unlink()
 
 
 def natural(path: Path) -> tuple[tuple[int, str], ...]:
@@ -80,8 +99,7 @@ def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
 
 
 def target(output: str | os.PathLike[str], *, holds: bytes, kind: str, example: str) -> Path:
-    """Where a file of a kind goes, that holds such words (`may_replace`); an older one is replaced, and nothing else.
-    """
+    """Where a file of a kind goes, that holds such words (`may_replace`); an older one alone is replaced."""
     path = Path(output)
     if not path.parent.is_dir():
         raise BagError(f"{path}: the folder {path.parent} is not there; make it first")

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.cli.command import DONE, Command, add_model, load_model, print_json
 
 
@@ -37,7 +38,14 @@ def run(options: argparse.Namespace) -> int:
         regimes = finite_data(block_facts(model))
         print_json(model.to_dict() | ({"regimes": regimes} if regimes else {}))
     else:
-        print(model_text(model))
+        try:
+            text = model_text(model)
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            raise ModelError(
+                f"{options.model}: what it says of its own fit is odd ({type(error).__name__}: {error}); fit it again, "
+                f"or print it with --json"
+            ) from None
+        print(text)
     return DONE
 
 

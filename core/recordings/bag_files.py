@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import natural
+from uncertain_lti.base.plain_yaml import compose, construct
 from uncertain_lti.recordings.unreadable import SUFFIXES, file_names, no_recording, os_error
 
 _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.(?:mcap|db3|bag)")
@@ -34,7 +35,7 @@ def listed_parts(folder: Path) -> list[Path] | None:
     path = folder / "metadata.yaml"
     try:
         text = path.read_text(encoding="utf-8")
-        about = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        about = construct(compose(text))["rosbag2_bagfile_information"]
         names = [str(name) for name in about["relative_file_paths"]]
     except (OSError, UnicodeDecodeError, ValueError, yaml.YAMLError, KeyError, TypeError, RecursionError):
         return None

@@ -18,6 +18,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from uncertain_lti.base.files import MAGIC
+from uncertain_lti.base.plain_yaml import compose, construct
 from uncertain_lti.recordings.mcap_records import RECORD, parse
 
 _LARGEST = 1 << 20  # bytes of one metadata record that is read
@@ -40,7 +41,7 @@ def _custom_data(path: Path) -> dict[str, str]:
     import yaml
 
     try:
-        about = yaml.safe_load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        about = construct(compose(path.read_text(encoding="utf-8")))["rosbag2_bagfile_information"]
         return {str(key): str(value) for key, value in (about.get("custom_data") or {}).items()}
     except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError, AttributeError, RecursionError):
         return {}

@@ -19,6 +19,7 @@ from typing import Any
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.files import kind_of
+from uncertain_lti.base.plain_yaml import compose, construct
 
 
 def load_yaml(path: str | os.PathLike[str]) -> Any:
@@ -29,13 +30,13 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
         raise SignalError(f"{path}: this is {kind}, and a signals file is wanted here; {_remedy(kind)}")
     try:
         with open(path, encoding="utf-8") as stream:
-            node = yaml.compose(stream, Loader=yaml.SafeLoader)
+            node = compose(stream)
         if repeated := _repeated_key(node):
             raise SignalError(
                 f"{path}: key '{repeated.value}' is twice in one mapping, again at line "
                 f"{repeated.start_mark.line + 1}; keep one"
             )
-        data = yaml.SafeLoader("").construct_document(node) if node else None
+        data = construct(node)
     except FileNotFoundError:
         raise SignalError(f"{path}: there is no such signals file; check the path") from None
     except OSError as error:

@@ -47,9 +47,9 @@ class TableLayout:
             if value is not None and (isinstance(value, bool) or not isinstance(value, (str, int, float)) or not value):
                 raise SignalError(f"{where}: {key} is {reprlib.repr(value)}; write the name of a column, in quotes")
         unit = given.get("unit")
-        if unit is not None and unit not in UNITS:
+        if unit not in (None, *UNITS):  # which may be no text
             raise SignalError(
-                f"{where}: unit is {reprlib.repr(unit)}{meant(unit, UNITS)}; write one of {', '.join(UNITS)}"
+                f"{where}: unit is {reprlib.repr(unit)}{meant(str(unit), UNITS)}; write one of {', '.join(UNITS)}"
             )
         names = {key: None if given.get(key) is None else str(given[key]) for key in ("time", "runs")}
         return cls(names["time"], unit, names["runs"])
