@@ -97,8 +97,8 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
         assert math.sqrt(sample.thresholds(2)[i]) >= max(peak, max(np.abs(u[:, i]).max() for u in inside))
         every = np.concatenate([np.abs(u[:, i]) for u in [*(p.utilisation for p in parts), *inside]])
         N, top = len(every) / 2, every.max()
-        allowance = math.sqrt(math.log(N * 2 * 4) / math.log(N))
-        expected = (np.median(every) + allowance * (top - np.median(every))) * (1 + 0.2 / 8)
+        allowance = math.sqrt(math.log(N * 2) / math.log(N))
+        expected = (np.median(every) + allowance * (top - np.median(every))) * (1 + 0.1 / 8)
         assert math.sqrt(sample.thresholds(2)[i]) == pytest.approx(expected, rel=1e-9)
         window = [np.convolve(p.utilisation[:, i] ** 2, np.ones(10) / 10, "valid").max() for p in parts]
         assert energy.thresholds(2)[i] > max(window) * (1 - 0.06)  # a window of 10.5 steps

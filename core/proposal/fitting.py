@@ -227,19 +227,20 @@ def fit(
             lengths, choice_of_horizons = chosen_horizons.chosen, chosen_horizons.facts()
             listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
             messages.append(f"{listed}: {chosen_horizons.reason}")
-    options |= {"schedule": asked, "horizons": list(lengths), "widths": lengths}
-    options["transient_weights"] = transient_weights
+    shape = {"schedule": asked, "horizons": list(lengths), "widths": lengths, "transient_weights": transient_weights}
     said: dict[str, Any] = {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
     if alarm == "panel" and method == "working-set":
         if additive is None and not asked:
-            options["additive"] = _terms(transients, options)
+            options["additive"] = _terms(transients, {**options, **shape})
         tried = [
-            fit_monitored(transients, groups=groups, false_alarms=false_alarms, **{**options, "criterion": one}, **said)
+            fit_monitored(
+                transients, groups=groups, false_alarms=false_alarms, **{**options, **shape, "criterion": one}, **said
+            )
             for one in ((criterion,) if criterion else ("lp", "qp"))
         ]
         model = min(tried, key=lambda way: math.inf if way.panel is None else way.panel.figure).finished()
     else:
-        model = fitting.fit(transients, **options, **said)
+        model = fitting.fit(transients, **options, **shape, **said)
         if not isinstance(alarm, str):
             model = model.replace(alarm=alarm)
     added: dict[str, Any] = {"schedule": facts} if facts else {}

@@ -122,15 +122,13 @@ def left_out_text(data: dict[str, Any]) -> str:
         return f"not validated, so how it does on other recordings is unknown: {data['not_done']}"
     what = "recording" if data["kind"] == "transients" else "block"
     ratio = max((s["left_out_to_full"] for s in data["states"].values()), default=math.nan)
-    alarm = data["false_alarms"][0]
     inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} of the verdicts inside"
     groups = data["groups"]
     of = f"{groups['count']} at a time ({_how_many(data)})" if groups else f"{data['parts']} at a time"
     line = (
         f"left out one {_unit(data)} of {of}: {inside}, "
-        f"{plural(data['parts_inside'], f'whole {what}')}, widths at most {ratio:.3g} times those above; "
-        f"{number(alarm['per_hour'])} false alarms per hour ({_interval(*alarm['interval'])} "
-        f"{data['condition_short']}); more: uncertain-lti validate"
+        f"{plural(data['parts_inside'], f'whole {what}')}, widths at most {ratio:.3g} times those above; more: "
+        f"uncertain-lti validate"
     )
     return f"{line}\nnote: {data['hint']}" if data["hint"] else line
 

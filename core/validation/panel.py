@@ -11,10 +11,10 @@
 
 The size of a rule is |utilisation| of one verdict, the root of the mean square over a window, the size of the mean over
 a window, or the root of the joint chi-square. Its threshold for a state is the largest size on healthy data, whether
-left out or fitted, with an allowance for the largest of so few: of N independent windows, sizes of n states and R rules
-reach beyond those of one as the quantiles of a normal distribution do,
+left out or fitted, with an allowance for the largest of so few: of N independent windows, sizes of n states reach
+beyond those of one as the quantiles of a normal distribution do,
 
-    threshold = median + a (largest - median),   a = sqrt(log(N n R) / log N).
+    threshold = median + a (largest - median),   a = sqrt(log(N n) / log N).
 
 Where windows are few, the largest of one state is chance, and the states share what is relative to their typical peak.
 """
@@ -44,7 +44,7 @@ PANEL = (("energy", 1, 1), ("energy", 10, 10), ("mean", 30, 3), ("chi2", 10, 10)
 """Kind and window of each rule, in verdicts, and how many such windows a typical left-out stretch must hold."""
 FEW = 30
 """Windows of the left-out data below which the states share how far peaks go."""
-MORE = 0.2
+MORE = 0.1
 """Over the number of recordings, groups or blocks: share by which thresholds are raised for what the next one brings."""
 CONFIDENCE = 0.9
 """Of the limit of the false-alarm rate, one-sided."""
@@ -165,7 +165,7 @@ def learn(validation: Validation, rate: float | None = None) -> Panel:
     fitted = [judge(model, model, part.transient, "") for part in parts if part.transient is not None]
     units = unit_numbers(parts)
     thresholds = [
-        _threshold(rule, len(rules), model.n, dt, units, [sizes_of([rule], p)[0] for p in (*left, *fitted)])
+        _threshold(rule, model.n, dt, units, [sizes_of([rule], p)[0] for p in (*left, *fitted)])
         for rule in rules
     ]
     shown = [part for part in left if part.judged]
@@ -186,7 +186,7 @@ def learn(validation: Validation, rate: float | None = None) -> Panel:
 
 
 def _threshold(
-    rule: StatisticRule, count: int, n: int, dt: float, units: NDArray[np.intp], sizes: Sequence[Array]
+    rule: StatisticRule, n: int, dt: float, units: NDArray[np.intp], sizes: Sequence[Array]
 ) -> Array:
     """Threshold (n,) or (1,) of one rule: `sizes` of every left-out part, then of the same parts by the full model."""
     peaks = np.full((int(units.max()) + 1, sizes[0].shape[1]), 1e-9)
@@ -195,7 +195,7 @@ def _threshold(
     every, top = np.concatenate(sizes), peaks.max(axis=0)
     median = np.median(every, axis=0)
     windows = max(3.0, len(every) / 2.0 / max(1, round(rule.window_s / dt)))
-    found = median + math.sqrt(math.log(windows * n * count) / math.log(windows)) * (top - median)
+    found = median + math.sqrt(math.log(windows * n) / math.log(windows)) * (top - median)
     if windows < FEW:
         typical = np.exp(np.log(peaks).mean(axis=0))
         found = np.maximum(found, typical * (top / typical).max())
