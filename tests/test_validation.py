@@ -318,7 +318,7 @@ def test_groups_of_one_recording_are_single_recordings(runs, validation):
 
 
 def test_the_condition_stands_beside_every_interval(days):
-    from uncertain_lti.reports.validation_text import left_out_text, validation_text
+    from uncertain_lti.reports.validation_text import validation_text
 
     runs, names = days
     for groups, what in ((None, "recordings"), (names, "groups")):

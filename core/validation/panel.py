@@ -45,7 +45,7 @@ PANEL = (("energy", 1, 1), ("energy", 10, 10), ("mean", 30, 3), ("chi2", 10, 10)
 FEW = 30
 """Windows of the left-out data below which the states share how far peaks go."""
 MORE = 0.1
-"""Over the number of recordings, groups or blocks: share by which thresholds are raised for what the next one brings."""
+"""Over the number of recordings, groups or blocks: share by which thresholds are raised for what the next brings."""
 CONFIDENCE = 0.9
 """Of the limit of the false-alarm rate, one-sided."""
 UNLIKE = 1 / 3
