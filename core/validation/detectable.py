@@ -12,12 +12,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
@@ -55,12 +55,6 @@ OFF = 1.1
 """Factor by which the nominal model's response to actuators and dynamics may be off, for the interval of a share."""
 MOST_TOGETHER = 2_000_000
 """Numbers that are judged at a time, about."""
-COMPARED = ("bias", "drift", "noise", "offset")
-"""Kinds by which alarm rules and fits are compared, ..."""
-COMPARED_CASES = 40
-"""... and onsets of each."""
-MOST_SEEN = 2.0
-"""A size that is never seen counts as this many times the largest tried, where sizes are compared."""
 GROWS = 10.0
 """Growth of a deviation within the time, by the nominal model, from which on its response to faults says nothing."""
 
@@ -210,24 +204,6 @@ class _Cases:
             **self.template,
         )
         return np.asarray(monitor.check(run).alarm.reshape(len(t_ns), L))
-
-
-def log_sizes(faults: Iterable[tuple[ArrayLike, float]], kept: NDArray[np.bool_] | None = None) -> Array:
-    """Logarithms of the smallest detectable sizes of some faults, to be compared.
-
-    `faults` (cases,): of each the `Seen.thresholds`, and the largest size tried; `kept` (cases,): cases that count;
-    default all; Returns (faults,): what is never seen counts as MOST_SEEN times the largest tried; NaN without a case.
-    """
-    found = []
-    for thresholds, largest in faults:
-        every = np.asarray(thresholds, dtype=np.float64)
-        every = np.sort(every if kept is None or not len(every) else every[kept])
-        if len(every):
-            size = float(every[math.ceil(SHARE * len(every) - 1e-9) - 1])
-            found.append(math.log(min(size, MOST_SEEN * largest)))
-        else:
-            found.append(math.nan)
-    return np.array(found)
 
 
 def check_within(within: float | None) -> None:
