@@ -372,17 +372,14 @@ def recorded_definition(kind: str) -> Any:
 
 def read_recorded(kind: str, paths: list[Any], messages: list[bytes]) -> tuple[int | None, bytes] | None:
     """Stamp and values of the last of these messages of a recording; None where it is left out, or names repeat."""
-    from uncertain_lti.recordings.cdr_arrays import NO_STAMP, SLACK, FieldReader, Messages, RepeatedNamesError
+    from uncertain_lti.recordings.cdr_arrays import NO_STAMP, SLACK, FieldReader, Messages
 
     ends = np.cumsum([len(data) for data in messages]) + SLACK
     begins = ends - [len(data) for data in messages]
     buffer = bytearray(SLACK) + b"".join(messages) + bytearray(SLACK)
     values, stamps = np.empty((len(messages), len(paths))), np.empty(len(messages), np.int64)
-    try:
-        failures = FieldReader(recorded_definition(kind), paths).read(Messages(buffer, begins, ends), values, stamps)
-        if any(failure.row == len(messages) - 1 for failure in failures):
-            return None
-    except RepeatedNamesError:
+    failures = FieldReader(recorded_definition(kind), paths).read(Messages(buffer, begins, ends), values, stamps)
+    if any(failure.row == len(messages) - 1 for failure in failures):
         return None
     return None if stamps[-1] == NO_STAMP else int(stamps[-1]), values[-1].tobytes()
 

@@ -76,9 +76,9 @@ def true_alarms_of(model: UncertainLTI, x: np.ndarray, u: np.ndarray, rules: Seq
     return float((alarm[:, 1:] & ~alarm[:, :-1]).sum() + alarm[:, 0].sum())
 
 
-def panel_keeps(validation: Validation, x: np.ndarray, u: np.ndarray) -> bool:
+def panel_keeps(validation: Validation, runs: Sequence[Transient], x: np.ndarray, u: np.ndarray) -> bool:
     """Whether the panel's alarms on fresh transients stay below the limit that it states."""
-    panel = learn(validation)
+    panel = learn(validation, runs)
     hours = x.shape[0] * (x.shape[1] - 1) * DT / 3600
     return true_alarms_of(validation.model, x, u, panel.rules) / hours <= panel.limit
 
@@ -111,7 +111,7 @@ def recordings(plants: Iterable[int]) -> Held:
         if "interval" in data["scenario"]:
             low, high = data["scenario"]["interval"]
             held.setdefault("recordings that leave, by support", []).append(low <= risk <= high)
-        held.setdefault("the panel keeps to its limit", []).append(panel_keeps(validation, x, u))
+        held.setdefault("the panel keeps to its limit", []).append(panel_keeps(validation, runs, x, u))
     return held
 
 
@@ -233,7 +233,7 @@ def groups(plants: Iterable[int]) -> Held:
             either = NEITHER if name == IN_VAIN else name
             whole = low <= 1 - left.any(axis=1).mean() <= high
             held.setdefault(f"{either}: recordings wholly inside", []).append(whole)
-            held.setdefault(f"{name}: the panel keeps to its limit", []).append(panel_keeps(validation, x, u))
+            held.setdefault(f"{name}: the panel keeps to its limit", []).append(panel_keeps(validation, runs, x, u))
     return held
 
 
@@ -254,7 +254,7 @@ def rare(plants: Iterable[int]) -> Held:
         fresh = [rough(500_000 + 1000 * seed + i, 2) for i in range(200)]
         validation = validate(runs, criterion=("qp", "lp")[seed % 2], additive="noise")
         found: Held = {}
-        _compare(found, validation, fresh, NEITHER, IN_VAIN, "one recording at a time")
+        _compare(found, validation, runs, fresh, NEITHER, IN_VAIN, "one recording at a time")
         for what, hits in found.items():
             held.setdefault(what, []).extend(hits)
             of = f"{PART}a rough run recorded" if recorded else f"{NEITHER}, no rough run recorded"
@@ -278,7 +278,7 @@ def drift(plants: Iterable[int]) -> Held:
         for name, by in (("by four in a row", [i // 4 for i in range(20)]), (IN_VAIN, None)):
             validation = validate(runs, criterion=("qp", "lp")[seed % 2], additive="noise", groups=by)
             either = NEITHER if name == IN_VAIN else name
-            _compare(held, validation, fresh, either, name, either)
+            _compare(held, validation, runs, fresh, either, name, either)
     return held
 
 
@@ -289,6 +289,7 @@ def _transient(x: np.ndarray, u: np.ndarray) -> Transient:
 def _compare(
     held: Held,
     validation: Validation,
+    runs: Sequence[Transient],
     fresh: list[tuple[np.ndarray, ...]],
     alarms_of: str,
     rest_of: str,
@@ -309,7 +310,7 @@ def _compare(
     held.setdefault(f"{rest_of}: verdicts inside", []).append(low <= 1 - left.mean() <= high)
     low, high = data["parts_inside_interval"]
     held.setdefault(f"{whole_of}: recordings wholly inside", []).append(low <= 1 - left.any(axis=1).mean() <= high)
-    held.setdefault(f"{rest_of}: the panel keeps to its limit", []).append(panel_keeps(validation, x, u))
+    held.setdefault(f"{rest_of}: the panel keeps to its limit", []).append(panel_keeps(validation, runs, x, u))
 
 
 STUDIES: dict[str, Callable[[Iterable[int]], Held]] = {

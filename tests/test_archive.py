@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
 
+import uncertain_lti
 from uncertain_lti import OperatingPoint, Transient, read_transients
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.files import whole_file
@@ -95,14 +96,15 @@ def test_scheduled_from_disk_as_in_memory(bags, tmp_path):
     )
     (tmp_path / "signals.yaml").write_text(signals.read_text() + further)
     schedule = {"level": (-0.05, 0.0, 0.05)}
-    model = fit(read_transients(paths, tmp_path / "signals.yaml"), schedule=schedule)
+    runs = read_transients(paths, tmp_path / "signals.yaml")
+    model = uncertain_lti.fit(runs, "qp", additive="none", schedule=schedule, alarm="containment")
     same = fit_archive(paths, tmp_path / "signals.yaml", schedule=schedule, cache=tmp_path / "cache")
     equal(same, model)
     assert same.schedule == model.schedule and same.block_data == model.block_data
     noted = [[m for m in one.fit_summary["messages"] if "schedules nothing" in m] for one in (same, model)]
     assert noted[0] == noted[1] and len(noted[0]) == 1 and "'weather'" in noted[0][0]
     assert f"note: {noted[0][0]}" in archive_text(same)
-    assert "schedules nothing" not in next_text(same, "m.json", None)
+    assert "schedules nothing" not in next_text(same, "m.json")
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
@@ -249,7 +251,8 @@ def test_cache_of_the_command(bags, tmp_path, capsys):
     from uncertain_lti.cli.main import main
 
     signals, paths = bags
-    arguments = ["fit", *map(str, paths), "--signals", str(signals), "--output"]
+    arguments = ["fit", *map(str, paths), "--signals", str(signals)]
+    arguments += ["--criterion", "qp", "--additive", "none", "--output"]
     assert main([*arguments, str(tmp_path / "a.json")]) == 0
     assert main([*arguments, str(tmp_path / "b.json"), "--cache", str(tmp_path / "cache")]) == 0
     one, two = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))

@@ -74,7 +74,7 @@ def test_fit_says_what_it_used(folder, capsys):
 
 def test_check_tells_when_and_how_long(folder, capsys):
     """A sensor that jumps for three samples: two transitions of the jump and nothing else."""
-    assert fitted(folder, "--additive", "noise") == 0
+    assert fitted(folder, "--additive", "noise", "--alarm", "containment") == 0
     bad = engine_bag(folder / "bad.mcap", change=lambda k, x: x + (5.0 if 100 <= k < 103 else 0.0) * np.eye(5)[0])
     capsys.readouterr()
     assert main(["check", str(folder / "m.model.json"), str(bad), "--json"]) == 1
@@ -275,13 +275,13 @@ def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, capsys):
     middle = np.median([s["state"][0] for s in printed["recordings"][0]["verdict_per_sample"]])
     model["domain"]["x_max"][0] = float(middle)  # half of what was seen is now beyond what was fitted
     path.write_text(json.dumps(model))
-    assert main(["check", str(path), str(folder / "run.mcap")]) == 0
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith("no alarm, but UNKNOWN: 4") or last.startswith("no alarm, but UNKNOWN: 5")
-    assert "outside the fitted domain, where nothing vouches for the bounds" in last
-    assert main(["check", str(path), str(folder / "run.mcap"), "--json"]) == 0
+    assert main(["check", str(path), str(folder / "run.mcap")]) == 3
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("UNKNOWN: 4") or first.startswith("UNKNOWN: 5")
+    assert "outside the fitted domain, where nothing vouches for the bounds" in first and "says nothing" in last
+    assert main(["check", str(path), str(folder / "run.mcap"), "--json"]) == 3
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["outcome"], printed["exit_status"], printed["alarm"]) == ("unknown", 0, False)
+    assert (printed["outcome"], printed["exit_status"], printed["alarm"]) == ("unknown", 3, False)
     (recording,) = printed["recordings"]
     assert 0.4 < recording["outside_domain_share"] < 0.6 and "nothing vouches" in recording["reason"]
     main(["report", str(path), str(folder / "run.mcap"), "--json"])

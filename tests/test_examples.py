@@ -30,7 +30,7 @@ def said_by(name: str, folder: Path, *arguments: str) -> str:
 
 def test_arrays_are_fitted_with_none_outside_and_only_the_changed_run_alarms(tmp_path):
     said = said_by("fit_arrays.py", tmp_path)
-    assert "6000 transitions fitted, 0 outside" in said
+    assert "12000 transitions fitted, 0 outside" in said
     assert re.search(r"^healthy: .*no alarm$", said, re.MULTILINE)
     onset = float(re.search(r"^friction from 12 s: .*first alarm at (\S+) s$", said, re.MULTILINE)[1])
     assert 12.0 < onset < 13.0

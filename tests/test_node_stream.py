@@ -304,8 +304,10 @@ def test_an_output_that_fails_is_reported_and_the_node_goes_on(ros: None, tmp_pa
     for k, message in enumerate(stream(model, rng, 60, 0.0)):
         if k == 60:
             node.outputs.publishers["upper"].send = fail
+            node.outputs.sender.changed()
         if k == 70:
             node.outputs.publishers["upper"].send = kept
+            node.outputs.sender.changed()
         node.arrive(*message)
     assert node.failures.count == node.session.failures > 0
     assert node.session.verdicts > 45
@@ -331,6 +333,7 @@ def test_an_interrupt_while_something_is_sent_ends_the_process(ros: None, tmp_pa
         raise KeyboardInterrupt
 
     node.outputs.publishers["upper"].send = interrupt
+    node.outputs.sender.changed()
     with pytest.raises(KeyboardInterrupt):
         node.arrive(*last)
     assert not node.failures.count

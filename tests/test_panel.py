@@ -88,9 +88,10 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
     from uncertain_lti.identification import fit as plain
 
     full = plain(runs, "lp", additive="noise", describe_data=False)
-    panel = learn(validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise"))
+    left = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise")
+    panel = learn(left, runs)
     sample, energy = (rule for rule in panel.rules if rule.kind == "energy")
-    parts = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise").parts
+    parts = left.parts
     inside = [full_utilisation(full, run) for run in runs]
     for i in range(2):
         peak = max(np.abs(part.utilisation[:, i]).max() for part in parts)
@@ -197,7 +198,8 @@ def test_states_that_are_blind_are_named(runs):
     from uncertain_lti.identification import fit as plain
 
     full = plain(runs, "lp", additive="noise", describe_data=False)
-    panel = learn(validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise"))
+    left = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise")
+    panel = learn(left, runs)
     from dataclasses import replace
 
     span = full.domain.x_max - full.domain.x_min

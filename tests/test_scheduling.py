@@ -13,17 +13,19 @@ import argparse
 import inspect
 import json
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
 
+import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, OperatingPoint, Transient, UncertainLTI, validate
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.fit import _schedule
 from uncertain_lti.cli.main import main
-from uncertain_lti.identification import fit, fitting
+from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.free_run import free_run
 from uncertain_lti.proposal.scheduling import (
@@ -60,6 +62,9 @@ def run(seed, N=800, low=-1.0, high=1.0, bend=4.0, noise=2e-4):
 RUNS = [run(seed) for seed in range(6)]
 LINEAR = [run(seed, bend=0.0) for seed in range(6)]
 APART = [run(1, low=-1.0, high=-0.4), run(2, low=-0.2, high=0.3), run(3, low=0.5, high=1.0)]
+
+
+fit = partial(uncertain_lti.fit, criterion="qp", alarm="containment")
 
 
 def options(**more):
@@ -279,7 +284,7 @@ def test_a_suggestion_says_what_the_recordings_lack():
 
 
 def test_nothing_is_suggested_where_a_schedule_is_asked_for():
-    assert "suggestion" not in fit(RUNS, schedule={"x1": 2}, suggest=True).fit_summary
+    assert "suggestion" not in fit(RUNS, schedule={"x1": 2}, suggest=True, additive="noise").fit_summary
 
 
 def test_pieces_hold_transitions_of_the_recording_alone():
@@ -301,13 +306,12 @@ def test_promise_is_largest_for_the_signal_that_bends_the_plant():
 
 
 def test_the_public_fit_takes_what_the_identification_takes():
-    inner, outer = inspect.signature(fitting.fit).parameters, inspect.signature(fit).parameters
-    chosen = {"horizons", "widths"}  # there numbers of steps and kinds of half-widths, here what they are chosen by
+    inner, outer = inspect.signature(fitting.fit).parameters, inspect.signature(uncertain_lti.fit).parameters
+    chosen = {"criterion", "horizons", "widths", "alarm_rule"}  # here what they are chosen by
     assert [outer[name] for name in inner if name not in chosen] == [inner[n] for n in inner if n not in chosen]
-    assert list(outer)[: len(inner)] == list(inner)
-    assert list(outer)[len(inner) :] == ["groups", "suggest"]
+    assert set(outer) - set(inner) == {"alarm", "false_alarms", "groups", "suggest"}
 
-    parameters = inspect.getdoc(fit).split("Parameters\n----------\n")[1].split("\n\nReturns")[0]
+    parameters = inspect.getdoc(uncertain_lti.fit).split("Parameters\n----------\n")[1].split("\n\nReturns")[0]
     described = {line.split(" : ")[0] for line in parameters.splitlines() if not line.startswith(" ")}
     assert described == set(outer), "the public fit is where each parameter is described"
     assert "As in" not in parameters

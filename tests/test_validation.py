@@ -314,7 +314,7 @@ def test_groups_of_one_recording_are_single_recordings(runs, validation):
     one, other = alone.to_dict(), validation.to_dict()
     for key in ("inside_interval", "false_alarms"):
         assert one[key] == other[key]
-    assert learn(alone).rules == learn(validation).rules
+    assert learn(alone, runs).rules == learn(validation, runs).rules
 
 
 def test_the_condition_stands_beside_every_interval(days):

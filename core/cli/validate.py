@@ -95,7 +95,8 @@ def run(options: argparse.Namespace) -> int:
         )
     said: list[str] = []
     if options.false_alarms is not None:
-        panel = learn(validation, options.false_alarms)
+        on = [s.name for s in model.signals.scheduling]
+        panel = learn(validation, [t.scheduled_on(on) for t in transients], options.false_alarms)
         model = model.with_residuals_of(validation.model).replace(alarm=panel.rules)
         said = promises(model, panel)
     data = replace(validation, model=model).to_dict() | ({"promises": said} if said else {})

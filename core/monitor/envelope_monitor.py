@@ -286,7 +286,18 @@ class EnvelopeMonitor:
         return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
     def starts_over(self, step: Step) -> bool:
-        """Whether the alarm starts over with a step: time stepped back, and not from a single stamp ahead."""
+        """Whether the alarm starts over with a step: time stepped back, and not from a single stamp ahead.
+
+        Parameters
+        ----------
+        step : Step
+            Of the sampler.
+
+        Returns
+        -------
+        bool
+            Before `judge` has taken the step.
+        """
         return step.status is _RESET and steps_back(step.t_ns, self._last_ns, self._before_ns)
 
     def judge(self, step: Step, armed: bool = True) -> Verdict:

@@ -227,7 +227,8 @@ def fit(
             lengths, choice_of_horizons = chosen_horizons.chosen, chosen_horizons.facts()
             listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
             messages.append(f"{listed}: {chosen_horizons.reason}")
-    shape = {"schedule": asked, "horizons": list(lengths), "widths": lengths, "transient_weights": transient_weights}
+    shape: dict[str, Any] = {"schedule": asked, "horizons": list(lengths), "widths": lengths}
+    shape["transient_weights"] = transient_weights
     said: dict[str, Any] = {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
     if alarm == "panel" and method == "working-set":
         if additive is None and not asked:

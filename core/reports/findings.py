@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.files import sha256
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.check_data import check_data
@@ -31,6 +31,7 @@ from uncertain_lti.reports.plain_data import finite_data, list_of, numbers_of
 from uncertain_lti.reports.regimes import block_facts, blocks_in_words
 from uncertain_lti.reports.reliance import answer, reasons
 from uncertain_lti.reports.tables import number, shortened
+from uncertain_lti.reports.validation_text import rule_text
 
 APART = 10
 """Verdicts without a violation that end an episode."""
@@ -74,6 +75,7 @@ def findings(
         A file of a recording cannot be read.
     """
     rule = rule or model.alarm_rule
+    rules = model.alarm if rule == model.alarm_rule else with_containment(model.alarm, rule)
     recordings = [_recording(model, verdicts) for verdicts in checked]
     validation = _validation(model)
     for_and_against = reasons(model, validation, recordings)
@@ -83,6 +85,7 @@ def findings(
         "happened": [_happened(r) for r in recordings],
         "alarm": any(r["alarm"] for r in recordings),
         "rule": {
+            "words": "; or ".join(one.words for one in rules),
             "violations": rule.violations,
             "window": rule.window,
             "margin": rule.margin,
@@ -164,8 +167,9 @@ def _validation(model: UncertainLTI) -> dict[str, Any] | None:
             "confidence": _real(data["confidence"]),
             "false_alarms": [
                 {
-                    **{key: int(alarm[key]) for key in ("violations", "window", "alarms")},
-                    **{key: _real(alarm[key]) for key in ("margin", "per_hour")},
+                    "rule": rule_text(alarm),
+                    "alarms": int(alarm["alarms"]),
+                    "per_hour": _real(alarm["per_hour"]),
                     "interval": [None if v is None else _real(v) for v in (alarm["interval"][0], alarm["interval"][1])],
                 }
                 for alarm in data["false_alarms"]

@@ -171,10 +171,8 @@ def _summary(facts: Mapping[str, Any]) -> str:
         if "transitions" in fit:
             runs = plural(fit.get("transients", "?"), "recording")
             text += f" to {plural(fit['transitions'], 'transition')} of {runs}"
-    said = f"{rule['violations']} of the last {rule['window']} verdicts violated"
-    said = "at every violation" if rule["window"] == 1 else said
     conditions = f", {rule['conditions']}" if rule["conditions"] else ""
-    return f"{text}. Alarm rule: {said}, margin {number(rule['margin'])}{conditions}."
+    return f"{text}. Alarm: {rule['words']}{conditions}."
 
 
 # --- sections ----------------------------------------------------------------------------------------------------
@@ -387,7 +385,7 @@ def _validated(v: Mapping[str, Any]) -> Iterator[Block]:
     heads = ("left out", "inside", f"{what}s inside", "mean width", "mean width of the full fit")
     yield _table(heads, rows, most=200)
     rows = [
-        [f"{a['violations']} of {a['window']}, margin {number(a['margin'])}", str(a["alarms"]), number(a["per_hour"]),
+        [a["rule"], str(a["alarms"]), number(a["per_hour"]),
          f"{number(a['interval'][0])} to {'unknown' if a['interval'][1] is None else number(a['interval'][1])}"]
         for a in v["false_alarms"]
     ]  # fmt: skip

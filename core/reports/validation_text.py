@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from uncertain_lti.base.english import plural
@@ -66,7 +67,7 @@ def validation_text(data: dict[str, Any]) -> str:
                 ("alarm rule", "alarms", "per hour", f"{percent} interval{under}", "time in alarm"),
                 [
                     [
-                        _rule(a),
+                        rule_text(a),
                         str(a["alarms"]),
                         number(a["per_hour"]),
                         _interval(*a["interval"]),
@@ -86,7 +87,7 @@ def validation_text(data: dict[str, Any]) -> str:
     return "\n".join(lines + [f"note: {note}" for note in data["notes"]])
 
 
-def _rule(alarm: dict[str, Any]) -> str:
+def rule_text(alarm: Mapping[str, Any]) -> str:
     """An alarm in a table, of files of before this version as well."""
     if "rule" not in alarm:
         return f"{alarm['violations']} of {alarm['window']}, margin {number(alarm['margin'])}"

@@ -79,9 +79,9 @@ def fit_monitored(
     left.pop("transient_weights", None)
     if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT:
         why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
-        parts = [judge(model, model, run, run.name) for run in _some(transients, model)]
-        seen = Validation(model, tuple(parts), "transients", 0.0, 0.9)
-        return Monitored(*_armed(model, seen, false_alarms), None, why)
+        runs = _some(transients, model)
+        seen = Validation(model, tuple(judge(model, model, run, run.name) for run in runs), "transients", 0.0, 0.9)
+        return Monitored(*_armed(model, seen, runs, false_alarms), None, why)
     try:
         validation = validate(
             transients,
@@ -93,15 +93,18 @@ def fit_monitored(
             progress=progress,
             **left,
         )
-        return Monitored(*_armed(model, validation, false_alarms), validation)
+        runs = [t.scheduled_on([s.name for s in model.signals.scheduling]) for t in transients]
+        return Monitored(*_armed(model, validation, runs, false_alarms), validation)
     except (FitError, ModelError) as error:  # too little is left to fit to: the fit itself is valid
         if false_alarms is not None:
             raise FitError(f"no alarm can be learnt for a rate: {error}") from None
         return Monitored(model, None, why=str(error))
 
 
-def _armed(model: UncertainLTI, validation: Validation, rate: float | None) -> tuple[UncertainLTI, Panel]:
-    panel = learn(validation, rate)
+def _armed(
+    model: UncertainLTI, validation: Validation, runs: Sequence[Transient], rate: float | None
+) -> tuple[UncertainLTI, Panel]:
+    panel = learn(validation, runs, rate)
     return model.replace(alarm=panel.rules), panel
 
 

@@ -36,6 +36,7 @@ from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.part import Part, by_unit, judge, rising, unit_numbers
 from uncertain_lti.validation.result import Validation
@@ -140,11 +141,11 @@ def sizes_of(rules: Sequence[Rule], part: Part) -> list[Array]:
     return found
 
 
-def learn(validation: Validation, rate: float | None = None) -> Panel:
+def learn(validation: Validation, transients: Sequence[Transient], rate: float | None = None) -> Panel:
     """The panel of a model, from what was left out of the fit and from the fit itself.
 
-    `rate`: false alarms per hour, the upper limit with CONFIDENCE; the thresholds come as near to it as the data can
-    show. Raises FitError if there is nothing to learn from.
+    `transients`: what was fitted; `rate`: false alarms per hour, the upper limit with CONFIDENCE; the thresholds are
+    as near to it as the data can show. Raises FitError if there is nothing to learn from.
     """
     if rate is not None and not (math.isfinite(rate) and rate > 0):
         raise FitError(f"false_alarms is {rate}; give a positive number per hour")
@@ -162,10 +163,12 @@ def learn(validation: Validation, rate: float | None = None) -> Panel:
             far = part.extrapolated > 0
             unlike.append(part.name)
         left.append(part.without(far))
-    fitted = [judge(model, model, part.transient, "") for part in parts if part.transient is not None]
+    fitted = [judge(model, model, run, run.name) for run in transients]
     units = unit_numbers(parts)
     thresholds = [
-        _threshold(rule, model.n, dt, units, [sizes_of([rule], p)[0] for p in (*left, *fitted)])
+        _threshold(
+            rule, model.n, dt, units, [sizes_of([rule], p)[0] for p in left], [sizes_of([rule], p)[0] for p in fitted]
+        )
         for rule in rules
     ]
     shown = [part for part in left if part.judged]
@@ -186,13 +189,14 @@ def learn(validation: Validation, rate: float | None = None) -> Panel:
 
 
 def _threshold(
-    rule: StatisticRule, n: int, dt: float, units: NDArray[np.intp], sizes: Sequence[Array]
+    rule: StatisticRule, n: int, dt: float, units: NDArray[np.intp], left: Sequence[Array], fitted: Sequence[Array]
 ) -> Array:
-    """Threshold (n,) or (1,) of one rule: `sizes` of every left-out part, then of the same parts by the full model."""
-    peaks = np.full((int(units.max()) + 1, sizes[0].shape[1]), 1e-9)
-    for unit, size in zip(np.tile(units, 2).tolist(), sizes, strict=True):
+    """Threshold (n,) or (1,) of one rule: its sizes on every left-out part, and on what was fitted."""
+    peaks = np.full((int(units.max()) + 1, left[0].shape[1]), 1e-9)
+    for unit, size in zip(units.tolist(), left, strict=True):
         peaks[unit] = np.maximum(peaks[unit], size.max(axis=0, initial=0.0))
-    every, top = np.concatenate(sizes), peaks.max(axis=0)
+    every = np.concatenate([*left, *fitted])
+    top = every.max(axis=0)
     median = np.median(every, axis=0)
     windows = max(3.0, len(every) / 2.0 / max(1, round(rule.window_s / dt)))
     found = median + math.sqrt(math.log(windows * n) / math.log(windows)) * (top - median)
