@@ -97,8 +97,9 @@ def test_scheduled_from_disk_as_in_memory(bags, tmp_path):
     (tmp_path / "signals.yaml").write_text(signals.read_text() + further)
     schedule = {"level": (-0.05, 0.0, 0.05)}
     runs = read_transients(paths, tmp_path / "signals.yaml")
-    model = uncertain_lti.fit(runs, "qp", additive="none", schedule=schedule, alarm="containment")
     same = fit_archive(paths, tmp_path / "signals.yaml", schedule=schedule, cache=tmp_path / "cache")
+    additive = same.fit_summary["additive"]
+    model = uncertain_lti.fit(runs, "qp", additive=additive, schedule=schedule, alarm="containment")
     equal(same, model)
     assert same.schedule == model.schedule and same.block_data == model.block_data
     noted = [[m for m in one.fit_summary["messages"] if "schedules nothing" in m] for one in (same, model)]

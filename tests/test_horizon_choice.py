@@ -78,7 +78,7 @@ def test_what_is_no_rule_is_refused_in_one_sentence(data: Any, words: str) -> No
 
 
 def test_what_holds_on_left_out_data_stays_with_a_table_that_says_why() -> None:
-    model = fit(RUNS, "lp", additive="noise", horizons={"longest": 0.4})
+    model = fit(RUNS, criterion="lp", additive="noise", horizons={"longest": 0.4})
     choice = model.fit_summary["horizon_choice"]
     assert choice["units"] == len(RUNS) and choice["left_out"] == "recording"
     rows = {(row["steps"], row["widths"]): row for row in choice["candidates"]}

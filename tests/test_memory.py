@@ -196,7 +196,8 @@ def test_a_memory_is_suggested_with_what_it_gains_on_left_out_data() -> None:
     narrow, wide = (validate(some, additive="noise") for some in (with_it, runs))
     widths = [np.mean([part.mean_width[0] for part in left.parts]) for left in (narrow, wide)]
     assert widths[0] / widths[1] == pytest.approx(first["width"], rel=0.05)
-    message = next(m for m in fit(runs, additive="noise", suggest=True).fit_summary["messages"] if "memory" in m)
+    model = fit(runs, "qp", additive="noise", alarm="containment", suggest=True)
+    message = next(m for m in model.fit_summary["messages"] if "memory" in m)
     assert message == suggestion.message
 
 

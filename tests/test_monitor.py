@@ -11,7 +11,6 @@
 
 import math
 from collections import deque
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -258,7 +257,7 @@ def test_silence_is_never_contained_and_ends_no_alarm() -> None:
         verdict = monitor.judge(a_step(0.0, 0.0, status))
         assert verdict.alarm and not verdict.judged
         assert all(np.isnan(part).all() for part in (verdict.flags, verdict.lower, verdict.upper, verdict.utilisation))
-    assert not monitor.judge(replace(a_step(0.0, 0.0, Status.RESET), t_ns=-(10**10))).alarm
+    assert not monitor.judge(Step(Status.RESET, -(10**10), 0, 1.0, [0.0], [0.0])).alarm
     assert not monitor.judge(a_step(0.0, 0.5)).alarm
 
 

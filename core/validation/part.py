@@ -47,7 +47,8 @@ class Part:
     horizon on this part, recorded units; NaN likewise; `residual` (K, n): x_next - centre of every judged transition,
     normalised; `longer_residual` (K, H, n): the same of each horizon; NaN as in `longer`; `judged_by`: the full model
     with the residuals of the left-out one: what a statistic on this part takes; `extrapolated` (K,): `Reach.level` of
-    each judged transition; `usual_width` (n,): width that USUAL of them have at most, recorded units.
+    each judged transition; `usual_width` (n,): width that USUAL of them have at most, recorded units; `outside`
+    (K, n): left its bounds at margin 1, which rounding decides where `utilisation` is about 1.
     """
 
     name: str
@@ -72,6 +73,7 @@ class Part:
     judged_by: UncertainLTI | None = None
     extrapolated: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     usual_width: Array = field(default_factory=lambda: np.zeros(0))
+    outside: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
@@ -83,7 +85,7 @@ class Part:
         kept = ~left
         starts = sorted({int(np.count_nonzero(kept[:s])) for s in self.starts})
         count = int(np.count_nonzero(kept))
-        names = ("dt", "utilisation", "block", "longer", "residual", "longer_residual", "extrapolated")
+        names = ("dt", "utilisation", "outside", "block", "longer", "residual", "longer_residual", "extrapolated")
         arrays: dict[str, Any] = {name: getattr(self, name) for name in names}
         changes = {name: a[kept] if len(a) == len(kept) else a for name, a in arrays.items()}
         return replace(self, starts=tuple(s for s in starts if s < count) or (0,), **changes)
@@ -101,7 +103,7 @@ class Part:
     @property
     def severity(self) -> Array:
         """(K,): the largest |utilisation| of the states; a verdict is violated where it exceeds the margin."""
-        return np.asarray(np.abs(self.utilisation).max(axis=1))
+        return np.asarray(np.abs(settled(self.utilisation, ~self.outside)).max(axis=1))
 
     @property
     def spans(self) -> list[tuple[int, int]]:
@@ -143,7 +145,7 @@ def judge(
     return Part(
         name,
         steps.dt,
-        np.asarray(settled(utilisation, ~flags)),
+        utilisation,
         tuple(starts),
         flags.sum(axis=0),
         int(flags.any(axis=1).sum()),
@@ -162,6 +164,7 @@ def judge(
         longer_residual=longer_residual,
         judged_by=full.with_residuals_of(model, instead=True),
         extrapolated=np.zeros(len(steps.dt), dtype=np.intp) if reach is None else reach.level(steps),
+        outside=flags,
         usual_width=np.full(n, np.nan) if empty else np.quantile(width, USUAL, axis=0),
     )
 

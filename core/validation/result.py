@@ -176,8 +176,9 @@ def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
     raised = raised_on(model.alarm, part)
     farthest: dict[str, Any] = {"farthest": None, "farthest_state": None}
     if part.judged:
-        k, i = np.unravel_index(int(np.argmax(np.abs(part.utilisation))), part.utilisation.shape)
-        value = abs(float(part.utilisation[k, i]))
+        sizes = np.nan_to_num(np.abs(part.utilisation), posinf=np.inf)
+        k, i = np.unravel_index(int(np.argmax(sizes)), sizes.shape)
+        value = float(sizes[k, i])
         farthest = {"farthest": value if math.isfinite(value) else None, "farthest_state": model.state_names[int(i)]}
     return {
         "name": part.name,
