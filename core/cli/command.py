@@ -74,8 +74,11 @@ def print_summary(options: argparse.Namespace, text: str) -> None:
 
 def complain(command: str, text: str) -> None:
     """Print an error on standard error, if anybody listens."""
-    with suppress(OSError, AttributeError):
+    try:
         print(f"uncertain-lti {command}: {printable(text)}".replace(" :", ":"), file=sys.stderr, flush=True)
+    except (OSError, AttributeError):
+        with suppress(OSError, AttributeError, ValueError):  # the end of the process shall not find it unwritten
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 def print_json(data: Any) -> None:

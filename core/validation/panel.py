@@ -37,7 +37,7 @@ from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.validation.intervals import rate_interval
+from uncertain_lti.validation.intervals import cluster_size, rate_interval
 from uncertain_lti.validation.part import Part, by_unit, judge, rising, unit_numbers
 from uncertain_lti.validation.result import Validation
 
@@ -51,6 +51,8 @@ CONFIDENCE = 0.9
 """Of the limit of the false-alarm rate, one-sided."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
+NEARBY = 0.75
+"""Down to this share of the thresholds, alarms are assumed to cluster as they do at the thresholds."""
 BLIND = 0.5
 """A bias of more than this share of the range of a state is no fault worth an alarm."""
 _LEAST, _FINE = 0.25, 1.02
@@ -177,10 +179,10 @@ def learn(validation: Validation, transients: Sequence[Transient], rate: float |
         np.max([(s / t).max(axis=1) for s, t in zip(sizes_of(rules, part), thresholds, strict=True)], axis=0)
         for part in shown
     ]
-    factor, limit, alarms = _factor(shown, levels, hours, rate)
+    factor, limit, alarms = _factor(shown, levels, hours, len(rules), rate)
     thresholds = [factor * t for t in thresholds]
     half = np.average([p.usual_width for p in parts], axis=0, weights=[p.judged for p in parts]) / 2.0
-    at = next(i for i, rule in enumerate(rules) if rule.kind == "energy" and (rule.window_s or len(rules) < 2 or i))
+    at = max(i for i, rule in enumerate(rules) if rule.kind == "energy" and rule.horizon == 1)
     return Panel(
         tuple(_with_threshold(rule, t) for rule, t in zip(rules, thresholds, strict=True)),
         limit, alarms, hours, int(units.max()) + 1, validation.what, half * thresholds[at],
@@ -208,15 +210,27 @@ def _threshold(
 
 
 def _factor(
-    parts: Sequence[Part], levels: Sequence[Array], hours: float, rate: float | None
+    parts: Sequence[Part], levels: Sequence[Array], hours: float, rules: int, rate: float | None
 ) -> tuple[float, float, int]:
-    """The lowest factor on the thresholds that keeps to a rate, the limit of the rate there, and alarms left out."""
+    """The lowest factor on the thresholds that keeps to a rate, the limit of the rate there, and alarms left out.
+
+    A threshold that is the largest size of so many hours is passed about once in as many: every rule but one counts as
+    a cluster of alarms, and those come in clusters as they do somewhat below the thresholds.
+    """
+    largest = np.zeros(int(unit_numbers(parts).max(initial=-1)) + 1)
+    for unit, level in zip(unit_numbers(parts).tolist(), levels, strict=True):
+        largest[unit] = max(largest[unit], float(level.max(initial=0.0)))
+    third = float(np.sort(largest)[::-1][min(2, len(largest) - 1)])
+
+    def raised(factor: float) -> Array:
+        return by_unit(parts, [rising(v > factor, p.starts) for v, p in zip(levels, parts, strict=True)])
 
     def limit_at(factor: float) -> tuple[float, int]:
-        counts = [rising(level > factor, part.starts) for level, part in zip(levels, parts, strict=True)]
-        by = by_unit(parts, counts)
-        upper = rate_interval(by, hours, CONFIDENCE, one_sided=True)[1] if hours else math.inf
-        return float(upper), int(sum(counts))
+        counts = raised(factor)
+        size = cluster_size(raised(min(factor, max(0.95 * third, NEARBY * factor))))
+        counted = counts + (rules - 1) * size / len(counts)
+        upper = rate_interval(counted, hours, CONFIDENCE, size, one_sided=True)[1] if hours else math.inf
+        return float(upper), int(counts.sum())
 
     chosen = (1.0, *limit_at(1.0))
     factor = 1.0
