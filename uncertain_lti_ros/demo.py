@@ -105,7 +105,7 @@ def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     )
     raised = offline.transient.t[offline.alarm]
     print(
-        f"the alarm ({model.alarm_rule.violations} of {model.alarm_rule.window} verdicts violated) is raised "
+        "the alarm is raised "
         + (f"{raised[0] - t:.3f} s after that" if len(raised) and raised[0] >= t else "too early or not at all")
     )
     event = (t, what)
