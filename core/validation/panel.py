@@ -87,10 +87,10 @@ class Panel:
 
     @property
     def needed_hours(self) -> float:
-        """Hours without an alarm that show the rate that was asked for; 0 if none was."""
-        if self.asked is None:
+        """Hours without an alarm that show the rate that was asked for; 0 if none was, or nothing says."""
+        if self.asked is None or not math.isfinite(self.limit):
             return 0.0
-        return float(rate_interval(np.zeros(max(self.units, 2)), 1.0, CONFIDENCE, one_sided=True)[1]) / self.asked
+        return self.limit * self.hours / self.asked  # the limit falls with the hours
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the model file."""
