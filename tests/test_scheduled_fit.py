@@ -229,20 +229,6 @@ def test_five_knots_reach_the_least_largest_width_and_its_ties():
         assert np.mean(half**2) / unit**2 < 1.001 * squares.value
 
 
-@pytest.mark.parametrize("criterion", ["qp", "lp"])
-def test_what_is_kept_sorted_from_pass_to_pass_changes_no_bit(monkeypatch, criterion):
-    transient = drawn(THREE, 3000, 9, noise=1e-4)
-    sorted_once = []
-    of = passes.Cells.of
-    monkeypatch.setattr(passes.Cells, "of", lambda *given: sorted_once.append(len(given[1])) or of(*given))
-    model = fit(transient, criterion, additive="both", schedule=THREE)
-    assert sorted_once == [3000]
-    monkeypatch.setattr(passes, "_KEPT", 0)
-    again = fit(transient, criterion, additive="both", schedule=THREE)
-    assert len(sorted_once) > 3
-    assert again.to_dict() == model.to_dict()
-
-
 LIMITED = Structure(2, 2, upper={"v": np.array([1.0, np.inf])})
 LEAST = Structure(2, 2, lower={"dA": np.array([[1e-3, 0.0], [0.0, 0.0]])})
 

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.assembly import assemble, is_constant
@@ -202,10 +201,10 @@ def fit_archive(
         "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
     found = visit("repeats in", repeats, model)
-    step_max = np.max([largest for _, largest in found], axis=0)
+    step_max = largest_steps(model, found)
     return model.replace(
         fit_summary=facts,
-        repeats=together(model.n, [one for one, _ in found]),
+        repeats=together(model.n, found),
         domain=replace(model.domain, step_max=step_max),
     )
 
@@ -264,13 +263,9 @@ def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     )
 
 
-def repeats(recording: Recording, model: UncertainLTI) -> tuple[Found, Array]:
-    """What one recording has of exact repeats, and its largest steps.
-
-    Returns (n,): as of `largest_steps`.
-    """
-    transient = _sampled(recording, model.signals)
-    return repeats_in(model, transient), largest_steps(model, [transient])
+def repeats(recording: Recording, model: UncertainLTI) -> Found:
+    """What one recording has of exact repeats."""
+    return repeats_in(model, _sampled(recording, model.signals))
 
 
 def _constant_dt(recording: Recording, signals: SignalMap) -> bool:

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -18,14 +19,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.cores import on_cores
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.identification.columns import Columns, Regimes
-from uncertain_lti.identification.problem import BLOCK, Problem
+from uncertain_lti.identification.problem import Problem
+from uncertain_lti.kernel.arithmetic import normalised_columns
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.signals.additive import Additive
+
+_PIECE = 100_000
+"""Samples, about, that a thread normalises at a time."""
 
 
 def is_constant(dt: Array) -> bool:
@@ -195,16 +201,9 @@ def _factors(
 
 def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> float:
     """(recorded - steady) / scale as `OperatingPoint` does it, into columns; (K, n) to (n, K). The sum of squares."""
-    square = 0.0
-    with np.errstate(over="ignore", invalid="ignore"):
-        for start in range(0, len(recorded), BLOCK):  # a piece of the rows stays in the cache while they become columns
-            part = slice(start, start + BLOCK)
-            for row, values, a, b in zip(out[:, part], recorded[part].T, steady, scale, strict=True):
-                np.subtract(values, a, out=row)
-                if b != 1.0:
-                    row /= b
-                square += float(row @ row)
-    return square
+    edges = np.linspace(0, len(recorded), max(len(recorded) // _PIECE, 1) + 1).astype(int).tolist()
+    pieces = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    return sum(on_cores(normalised_columns, [(recorded[piece], steady, scale, out[:, piece]) for piece in pieces]))
 
 
 def scaled_eigenvalues(weights: Array) -> Array:

@@ -92,6 +92,11 @@ class Columns:
         return tuple(term for term in ADDITIVE if term.half in self.names)
 
     @property
+    def extra(self) -> tuple[int, tuple[bool, ...]]:
+        """How many additive terms have unknown nominal elements, and of each half-width whether Δt multiplies it."""
+        return len(self.nominal), tuple(term.times_dt for term in self.half)
+
+    @property
     def drift(self) -> bool:
         """Whether c is unknown."""
         return "c" in self.names

@@ -41,7 +41,7 @@ from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.jumps import largest_steps
 from uncertain_lti.model.operating_point import OperatingPoint
-from uncertain_lti.model.repeats import repeats_of
+from uncertain_lti.model.repeats import repeats_in, together
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, listed_transients
@@ -187,17 +187,18 @@ def fit(
         facts["with_discarded"] = {
             key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
         }
-    domain = replace(model.domain, step_max=largest_steps(model, transients))
-    model = model.replace(repeats=repeats_of(model, transients), domain=domain)
+    found = [repeats_in(model, transient) for transient in transients]
+    domain = replace(model.domain, step_max=largest_steps(model, found))
+    model = model.replace(repeats=together(model.n, found), domain=domain)
     if not horizons:
         return model.replace(fit_summary=facts)
     lengths = [int(h) for h in horizons]
     run, corrected = better_run(model, problem, lengths, structure)
     model = model.replace(run=run)
-    found, facts["horizons"], dropped = fit_horizons(model, problem, lengths, widths, criterion, progress, corrected)
+    over, facts["horizons"], dropped = fit_horizons(model, problem, lengths, widths, criterion, progress, corrected)
     if "messages" in facts or dropped:
         facts["messages"] = [*facts.get("messages", []), *dropped]
-    return model.replace(fit_summary=facts, horizons=found, run=model.run if found else None)
+    return model.replace(fit_summary=facts, horizons=over, run=model.run if over else None)
 
 
 def fit_fleet(

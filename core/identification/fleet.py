@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -20,6 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.cores import core_count
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
@@ -32,8 +32,8 @@ T = TypeVar("T")
 
 _LOOKED_AT = 50_000
 """Transitions that the domain is made from, about; of more, every second, third, ... counts."""
-_WORTH_A_THREAD = 100_000
-"""Transitions per part from which on a thread of its own pays."""
+_PART = 100_000
+"""Transitions per part, about: the sums of the parts are added in their order, however many threads there are."""
 _COMPARED = 20_000
 """Residuals that the two forms of `model.residuals` are compared on, about."""
 
@@ -41,24 +41,21 @@ _COMPARED = 20_000
 class Fleet:
     """Partitions visited in this process, in turn or by threads; passes over all data as map and reduce.
 
-    `partitions`: with the same columns, states and controls; `threads`: how many partitions a pass visits at a time:
-    numpy works outside the interpreter's lock.
+    `partitions`: with the same columns, states and controls; `threads`: how many partitions a pass visits at a time,
+    which the kernel does without the interpreter's lock.
     """
 
     def __init__(self, partitions: Sequence[Partition], threads: int = 1) -> None:
         self.partitions = list(partitions)
-        self._threads = threads
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._describe([(part.N, part.n, part.p, part.columns) for part in self.partitions])
 
     @classmethod
     def of(cls, problem: Problem) -> Fleet:
-        """A problem in memory, in as many parts as there are cores if it is large."""
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        count = min(cores, problem.N // _WORTH_A_THREAD)
-        if count < 2:
-            return cls([problem])
+        """A problem in memory, in parts for all cores if it is large; how many there are depends on its size alone."""
+        count = max(problem.N // _PART, 1)
         edges = np.linspace(0, problem.N, count + 1).astype(int).tolist()
-        return cls([problem.subset(slice(a, b)) for a, b in itertools.pairwise(edges)], count)
+        return cls([problem.subset(slice(a, b)) for a, b in itertools.pairwise(edges)], min(count, core_count()))
 
     def _describe(self, facts: Sequence[tuple[int, int, int, Columns]]) -> None:
         self.counts = [count for count, *_ in facts]
@@ -74,11 +71,10 @@ class Fleet:
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
         """function(partition, *arguments of that partition) for every partition."""
-        if self._threads == 1:
+        if self._pool is None:
             return [function(part, *args) for part, args in zip(self.partitions, arguments, strict=True)]
-        with ThreadPoolExecutor(self._threads) as pool:
-            futures = [pool.submit(function, p, *args) for p, args in zip(self.partitions, arguments, strict=True)]
-            return [future.result() for future in futures]
+        futures = [self._pool.submit(function, p, *args) for p, args in zip(self.partitions, arguments, strict=True)]
+        return [future.result() for future in futures]
 
     def _same(self, *arguments: Any) -> list[tuple[Any, ...]]:
         return [arguments] * len(self.counts)

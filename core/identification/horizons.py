@@ -17,7 +17,6 @@ unknown is linear again, so working set, proof and repair are those of one step.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,7 +36,6 @@ from uncertain_lti.identification.several_steps import Elements, runs_over_steps
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.horizon import Horizon, Run, Widths
-from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 _UNKNOWN = frozenset({"c", "v"})
@@ -49,26 +47,6 @@ PAYS = 0.4
 WIDER = 1.1
 """An envelope whose mean half-width is this many times the largest move of a state over as many steps is useless: that
 the state stays where it is, give or take what it ever moved, says more."""
-
-
-@dataclass(frozen=True)
-class _Envelope:
-    """A horizon with the schedule of its model: what gives bounds."""
-
-    horizon: Horizon
-    schedule: Schedule | None
-
-    @property
-    def tables(self) -> tuple[Array, Array, Array]:
-        """As of the horizon."""
-        return self.horizon.tables
-
-    def columns_centre_and_half(
-        self, z: Array, dt: Array, centre: Array, half: Array, base: Array | None = None
-    ) -> None:
-        """As of the horizon."""
-        assert base is not None
-        self.horizon.columns_centre_and_half(z, dt, centre, half, base, self.schedule)
 
 
 def run_of(problem: Problem, structure: Structure | None = None) -> Run:
@@ -238,7 +216,7 @@ def _fitted(
     engine = WorkingSet(Fleet.of(part), structure)
     sums = engine.sums
 
-    def build(theta: Array, d: Array) -> _Envelope:
+    def build(theta: Array, d: Array) -> Horizon:
         nominal, half = theta.reshape(columns.count, -1, n), d.reshape(columns.count, -1, n)
         arrays: dict[str, Any] = {
             "A": nominal[:, :n].transpose(0, 2, 1),
@@ -250,7 +228,7 @@ def _fitted(
         }
         if columns.regimes is None:
             arrays = {name: values[0] for name, values in arrays.items()}
-        return _Envelope(Horizon(steps, **arrays, widths=widths), model.schedule)
+        return Horizon(steps, **arrays, widths=widths)
 
     try:
         envelope, d, judged, objective, gap, _ = optimum(engine, criterion, build, model.state_names, sizes=largest)
@@ -259,7 +237,7 @@ def _fitted(
     mean_width = 2.0 * (sums.width_sum @ d) / sums.count
     X = model.operating_point.X
     some = part if part.N <= 2 * _LOOKED_AT else part.subset(slice(None, None, part.N // _LOOKED_AT))
-    return envelope.horizon.with_residuals(Fleet.of(some).envelope(envelope)[0]), {
+    return envelope.with_residuals(Fleet.of(some).envelope(envelope)[0]), {
         "steps": steps,
         "seconds": float(np.median(part.dt)),
         "widths": widths,

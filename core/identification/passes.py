@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -20,11 +20,9 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.assembly import scaled_eigenvalues
-from uncertain_lti.identification.cells import Cells, Whole
-from uncertain_lti.identification.columns import Columns, Regimes
-from uncertain_lti.identification.problem import Block, Partition, Problem
-from uncertain_lti.identification.products import gram_of, product
-from uncertain_lti.kernel.arithmetic import occupy, pair_count, utilisations
+from uncertain_lti.identification.columns import Columns
+from uncertain_lti.identification.problem import Block, Partition
+from uncertain_lti.kernel.arithmetic import Blocks, centre_and_half, near_bounds, occupy, pair_count, sums_of, verdicts
 
 
 @dataclass
@@ -120,56 +118,12 @@ class Moments:
         return np.where(scale > 0, scale, 1.0)
 
 
-_PIECE = 2**18
-"""Numbers of z and x_next in a piece: they stay in the cache, and numpy is long enough at each operation on them for
-other threads not to wait for the interpreter."""
-_FEW = 256
-"""Transitions of a piece that are worth judging one by one."""
-_FEW_ALL = 20_000
-"""Transitions up to which a scan spends its time elsewhere."""
-_KEPT = 2**20
-"""Transitions of a schedule up to which those in memory are kept sorted from one pass to the next: a copy of them."""
-_NARROW = 1e8
-"""Half-widths are so many times as large as rounding where the order of the sums does not show in a utilisation."""
-_EPS, _TINY = float(np.finfo(np.float64).eps), 1e-290
-"""Relative rounding of one operation, twice; and more than underflow can add up to."""
-
-
-def _pieces(part: Partition) -> Iterator[Block]:
-    """All transitions, in pieces of a size that suits the cache."""
-    most = max(_PIECE // (part.p + part.n), 2048)
-    for block in part.blocks():
-        if len(block) <= most:
-            yield block
-            continue
-        for start in range(0, len(block), most):
-            yield block.piece(start, start + most)
-
-
-def _sorted_pieces(part: Partition, regimes: Regimes) -> Iterator[tuple[Block, Cells, Block]]:
-    """As `_pieces`, with how each is sorted, and sorted; in memory that is kept for the next pass."""
-    kept = part.sorted_pieces if isinstance(part, Problem) and part.N <= _KEPT else None
-    if kept:
-        yield from kept
-        return
-    found = []
-    for block in _pieces(part):
-        cells = Cells.of(regimes, block)
-        piece = block, cells, cells.sort(block)
-        if kept is not None:
-            found.append(piece)
-        yield piece
-    if kept is not None:
-        kept.extend(found)
-
-
-def _pieces_as_sorted(part: Partition) -> Iterator[tuple[Block, Cells | None, Block]]:
-    """As `_sorted_pieces`; without a schedule the pieces as they are."""
-    if part.columns.regimes is not None:
-        yield from _sorted_pieces(part, part.columns.regimes)
-        return
-    for block in _pieces(part):
-        yield block, None, block
+def _given(block: Block, columns: Columns) -> tuple[Array, Array, Array, Array | None, Blocks | None, Array | None]:
+    """A piece as the kernel takes it: z, Δt, next states, what they are counted from, schedule, scheduling vectors."""
+    regimes = columns.regimes
+    if regimes is None:
+        return block.z, block.dt, block.x_next, block.base, None, None
+    return block.z, block.dt, block.x_next, block.base, regimes.schedule.table, regimes.vectors(block.z, block.s)
 
 
 def occupied(partition: Partition, least: Array, greatest: Array, cells: int, stride: int) -> NDArray[np.bool_]:
@@ -187,51 +141,38 @@ def occupied(partition: Partition, least: Array, greatest: Array, cells: int, st
 def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Samples]]:
     """One pass for everything in `Moments`, and a sample of the transitions."""
     columns, n, p = part.columns, part.n, part.p
-    q = columns.count * (p + len(columns.half))
     sums: Moments | None = None
     sampled: list[Block] = []
     index: list[Index] = []
-    for block, sorting, some in _pieces_as_sorted(part):
+    for block in part.blocks():
         if stride:
             first = -(block.start + offset) % stride
             sampled.append(block.every(first, stride))
             index.append(np.arange(first, len(block), stride) + (block.start + offset))
-        cells, block = sorting or Whole(), some
-        # a constant step goes into the sums
-        constant = bool((block.dt == block.dt[0]).all())
-        unit = float(block.dt[0]) if constant else 1.0
-        plain = columns.plain_phi(block.z)
-        plain = plain if constant else plain * block.dt
-        own = np.empty((p + len(columns.half), len(block)))
-        np.abs(plain[:p], out=own[:p])  # Δt > 0
-        for row, term in zip(own[p:], columns.half, strict=True):
-            row[:] = (block.dt if term.times_dt else 1.0) / unit
-        phi, psi = cells.spread(plain), cells.spread(own)
-        step = block.x_next - block.origin
-        weights = block.weights
-        gram = np.stack([cells.gram(psi, weights[:, i]) for i in range(n)]) if weights.ndim == 2 else None
+        weights, (i, j) = block.weights, np.triu_indices(n)
+        factors = None if weights.ndim == 1 else weights.T if weights.ndim == 2 else weights[:, i, j].T
+        plain, grams, centre, target, square, width, visits = sums_of(
+            n, *_given(block, columns), *columns.extra, factors
+        )
         coupled = None
         if weights.ndim == 3:
-            parts = np.empty((n, q, n, q))
-            for i in range(n):
-                for j in range(i, n):
-                    parts[i, :, j] = cells.gram(psi, weights[:, i, j])
-                    parts[j, :, i] = parts[i, :, j].T
-            coupled = parts.reshape(n * q, n * q)
+            parts = np.empty((n, len(plain), n, len(plain)))
+            parts[i, :, j] = parts[j, :, i] = grams
+            coupled = parts.reshape(n * len(plain), -1)
         found = Moments(
-            cells.gram(psi) * unit**2,
-            None if gram is None else gram * unit**2,
-            None if coupled is None else coupled * unit**2,
-            cells.gram(phi) * unit**2,
-            cells.against(phi, step) * unit,
-            np.einsum("ik,ik->i", step, step),
-            cells.total(psi) * unit,
+            plain,
+            np.stack(grams) if weights.ndim == 2 else None,
+            coupled,
+            centre,
+            target,
+            square,
+            width,
             block.z.min(axis=1),
             block.z.max(axis=1),
             float(block.dt.min()),
             float(block.dt.max()),
             len(block),
-            cells.visits(len(block)),
+            visits,
         )
         sums = found if sums is None else sums + found
     if sums is None:
@@ -336,51 +277,22 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
     are returned, and the reach is the least slack of the others.
     """
     columns, p = part.columns, part.p
-    theta, d = np.ascontiguousarray(candidate.theta.T), np.ascontiguousarray(candidate.d.T)
-    n = len(theta)
-    rows = slice(part.n) if n == part.n else candidate.rows  # a slice is no copy
+    theta, d, rows = candidate.theta, candidate.d, candidate.rows
+    n = len(rows)
     found: list[_Near] = []
     kept = np.zeros(n, dtype=np.intp)
     reach = np.minimum(candidate.reach, 1e100)  # inf asks for all, and inf x 0 is nothing
+    unit = np.reshape(candidate.size_unit, (len(d), -1)) * candidate.scale
 
     # slack < reach is a comparison with half-widths that are smaller, for the width of (11) larger, by the reach
-    def shifted() -> Array:
-        unit = candidate.size_unit.T
-        inner = d - (reach * candidate.scale)[:, None] * unit
-        if candidate.limit is None:
-            return inner
-        outer = d + (np.minimum(reach, candidate.room) * candidate.scale)[:, None] * unit
-        return np.vstack([inner, outer])
+    def shifted() -> tuple[Array, Array | None]:
+        outer = None if candidate.limit is None else d + np.minimum(reach, candidate.room) * unit
+        return d - reach * unit, outer
 
     halves = shifted()
-    for block, cells, some in _pieces_as_sorted(part):
-        times = product if cells is None else cells.product
-        # a constant step goes into the elements, unless the transitions are too few for it to save time
-        step = float(block.dt[0]) if part.N > _FEW_ALL and (block.dt == block.dt[0]).all() else None
-        if cells is not None:
-            residual = cells.product(theta * (step or 1.0), columns.plain_phi(some.z))
-        else:
-            residual = product(theta[:, :p] * (step or 1.0), block.z)
-            if columns.drift:
-                residual += theta[:, p:] * (step or 1.0)
-        rate = some.x_next[rows] - some.origin[rows]
-        if not step:
-            rate /= some.dt
-        residual -= rate
-        np.abs(residual, out=residual)
-        half = times(halves * (step or 1.0), columns.plain_psi(some.z, some.dt))
-        below = residual > half[:n]
-        if candidate.limit is not None:
-            width = half[n:]
-            if not step:
-                width *= some.dt
-            root = some.root_weights()
-            below |= width > candidate.limit[:, None] / (2.0 * (root if len(root) == 1 else root[rows]))
-        chosen = np.flatnonzero(below)
-        distance = residual.ravel()[chosen] / (step or 1.0)
-        if cells is not None:
-            chosen, sorting = cells.before(chosen)
-            distance = distance[sorting]
+    for block in part.blocks():
+        limit = None if candidate.limit is None else candidate.limit[:, None] / block.root_weights()[rows]
+        chosen, distance = near_bounds(part.n, *_given(block, columns), *columns.extra, theta, *halves, limit, rows)
         if not len(chosen):
             continue
         found.append(_near(candidate, block, columns, chosen, distance, offset))
@@ -497,179 +409,14 @@ class Envelope(Protocol):
         """Nominal elements and half-widths of the rates, and what the step does not multiply."""
         ...
 
-    def columns_centre_and_half(
-        self, z: Array, dt: Array, centre: Array, half: Array, base: Array | None = None
-    ) -> None:
-        """Centre and half-width of the bounds of samples in columns, into given arrays.
-
-        `z` (n + m + q, K): normalised [x; u; s]; `dt` (K,): s; `centre, half` (n, K): take the result; `base` (n, K):
-        what the rates are added to; default the states.
-        """
-
 
 def judge(part: Partition, model: Envelope) -> Judged:
     """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`."""
     zeros = np.zeros(part.n)
     total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
-    for block, cells, some in _pieces_as_sorted(part):
-        quick = block.weights.ndim == 1
-        found = _judged_in_doubt(some, model, total.largest, cells) if quick else None
-        total = total + (found or _judged(block, model))
+    for block in part.blocks():
+        total = total + Judged(*verdicts(model.tables, *_given(block, part.columns), block.root_weights())[:3])
     return total
-
-
-def _judged(block: Block, model: Envelope) -> Judged:
-    """`judge` of one piece, every transition by the verdict's arithmetic."""
-    inside, half = _inside_and_half(model, block)
-    largest = 2.0 * half.max(axis=1)
-    if block.weights.ndim == 1:
-        weighted = largest * np.sqrt(block.weights)
-    else:
-        weighted = 2.0 * (half * block.root_weights()).max(axis=1)
-    return Judged(len(block) - np.count_nonzero(inside, axis=1), largest, weighted)
-
-
-def _inside_and_half(model: Envelope, block: Block) -> tuple[NDArray[np.bool_], Array]:
-    """The verdict on each row of each transition, and its half-width, both (n, K)."""
-    centre, half = _centre_and_half(model, block)
-    inside: NDArray[np.bool_] = centre - half <= block.x_next
-    centre += half
-    inside &= block.x_next <= centre
-    return inside, half
-
-
-def _centre_and_half(model: Envelope, block: Block) -> tuple[Array, Array]:
-    """Of each transition, both (n, K)."""
-    centre, half = np.empty(block.x_next.shape), np.empty(block.x_next.shape)
-    base = () if block.base is None else (block.base,)
-    model.columns_centre_and_half(block.signals, block.dt, centre, half, *base)
-    return centre, half
-
-
-@dataclass(frozen=True)
-class _Quick:
-    """Bounds of some transitions by sums in another order than the verdict's, and how far they can be off.
-
-    `distance` (n, K): centre less x_next; `half` (n, K): half-width less the floor; `floor` (n,): part of every half-
-    width; `widest` (n,): no half-width less the floor is larger; `error` (n,): no distance is off by more; `relative`:
-    rounding of the sums, relative to what they add.
-    """
-
-    distance: Array
-    half: Array
-    floor: Array
-    widest: Array
-    error: Array
-    relative: float
-
-    @classmethod
-    def of(cls, block: Block, model: Envelope, cells: Cells | None) -> _Quick:
-        """Of some transitions; `cells` is how they are sorted, where the model has a schedule."""
-        with np.errstate(over="ignore", invalid="ignore"):  # values that it cannot carry: no error is finite
-            return cls._of(block, model.tables, cells)
-
-    @classmethod
-    def _of(cls, block: Block, tables: tuple[Array, Array, Array], cells: Cells | None) -> _Quick:
-        # blended elements are no larger than those of the blocks
-        nominal, spread, v = tables if cells is None else (np.abs(table).max(axis=0) for table in tables)
-        n, p = block.n, len(block.z)
-        drift, steady = nominal[:, p:].sum(axis=1), spread[:, p:].sum(axis=1)  # beyond z the regressors are 1
-        longest = float(block.dt.max())
-        psi = np.abs(block.z)
-        most = psi.max(axis=1)
-        constant = cells is None and float(block.dt.min()) == longest
-        widest, floor = longest * (spread[:, :p] @ most), v
-        if constant:
-            floor = longest * steady + v
-        else:
-            widest = widest + longest * steady
-        if cells is not None:
-            widest, floor = widest + v, np.zeros(n)
-        size = longest * (np.abs(nominal[:, :p]) @ most + np.abs(nominal[:, p:]).sum(axis=1)) + widest + floor
-        size += most[:n] if block.base is None else np.abs(block.base).max(axis=1)
-        relative = 8.0 * (p + 8) * _EPS
-        error = relative * size + _TINY
-        if constant:  # the step goes into the elements
-            own = np.eye(n, p) if block.base is None else 0.0
-            distance = product(nominal[:, :p] * longest + own, block.z)
-            half = product(spread[:, :p] * longest, psi)
-            if drift.any():
-                distance += (drift * longest)[:, None]
-        elif cells is None:
-            distance, half = product(nominal[:, :p], block.z), product(spread[:, :p], psi)
-            distance += drift[:, None]
-            half += steady[:, None]
-            distance *= block.dt
-            half *= block.dt
-        else:
-            distance, half = _blended(cells, block, psi, tables)
-        if block.base is not None:
-            distance += block.base
-        elif not constant:
-            distance += block.z[:n]
-        distance -= block.x_next
-        return cls(distance, half, floor, widest, error, relative)
-
-
-def _blended(cells: Cells, block: Block, psi: Array, tables: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """Centre less the states, and half-width, of sorted transitions; psi: |z|."""
-    nominal, spread, v = tables
-    n, p = block.n, len(psi)
-    step = float(block.dt[0])
-    constant = bool((block.dt == step).all())
-
-    def rates(table: Array, regressors: Array, always: Array) -> Array:
-        """Of elements of all blocks (R, n, q), and of (R, n) for a regressor of 1 that no step multiplies."""
-        one = table[:, :, p:].sum(axis=2)  # beyond z the regressors are 1
-        table = table[:, :, :p]
-        if constant:  # the step goes into the elements
-            table, one = table * step, one * step + always
-        elements = np.concatenate([table, one[:, :, None]], axis=2).transpose(1, 0, 2).reshape(n, -1)
-        found = cells.product(elements, np.vstack([regressors, np.ones((1, len(block)))]))
-        if not constant:
-            found *= block.dt
-            found += cells.product(always.T, np.ones((1, len(block))))
-        return found
-
-    return rates(nominal, block.z, np.zeros_like(v)), rates(spread, psi, v)
-
-
-def _judged_in_doubt(block: Block, model: Envelope, known: Array, cells: Cells | None) -> Judged | None:
-    """`_judged` to the bit, from the transitions alone that the rounding of a faster arithmetic leaves in doubt.
-
-    A transition that is inside, or narrower than the widest, by more than any order of the sums can differ is so by the
-    verdict's arithmetic too; the others are judged by it. The bound is that of a sum of k products, k ε Σ |a b| (Higham
-    2002, section 3.1), with room to spare.
-
-    `known` (n,): widths that were found already; transitions that are narrower need not be judged.
-    """
-    quick = _Quick.of(block, model, cells)
-    error, half, widest, floor = quick.error, quick.half, quick.widest, quick.floor
-    if not np.isfinite(error).all():
-        return None
-    n, distance, relative = block.n, quick.distance, quick.relative
-    np.abs(distance, out=distance)
-    distance += (error - floor)[:, None]
-    doubtful: NDArray[np.bool_] = np.any(distance > half, axis=0)
-    # rounding keeps the order, so the widest is where the half-width without the floor, added last, is the largest
-    doubt = 2.0 * (relative * widest + _TINY)
-    for i, least in enumerate(half.max(axis=1) - doubt):
-        if 2.0 * (least + 2.0 * doubt[i] + floor[i]) * (1.0 + relative) < known[i]:
-            continue
-        if widest[i] == 0.0:
-            doubtful[0] = True
-        else:
-            doubtful |= half[i] >= least
-    chosen = np.flatnonzero(doubtful)
-    if len(chosen) > _FEW:
-        return None
-    outside, largest = np.zeros(n, dtype=np.intp), np.zeros(n)
-    if len(chosen):
-        padded = np.resize(chosen, _FEW)  # a fixed number, as `ordered_sum` tries each shape first
-        inside, widths = _inside_and_half(model, block.take(padded))
-        outside = len(chosen) - np.count_nonzero(inside[:, : len(chosen)], axis=1)
-        largest = 2.0 * widths.max(axis=1)
-    return Judged(outside, largest, largest * np.sqrt(block.weights))
 
 
 def envelope_sums(part: Partition, model: Envelope, stride: int) -> tuple[Array, ...]:
@@ -682,30 +429,19 @@ def envelope_sums(part: Partition, model: Envelope, stride: int) -> tuple[Array,
     of each block of a schedule the sum of the widths, normalised; Returns (R, n): of each block of a schedule the
     largest width; Returns (K, n): some residuals; Returns (K, n): their half-widths.
     """
-    columns, n = part.columns, part.n
-    total, products = np.zeros((2, n)), np.zeros((2, n, n))
+    found: list[tuple[Array, ...]] = []
     some: list[list[Array]] = [[], []]
-    widths, largest = np.zeros((columns.count, n)), np.zeros((columns.count, n))
-    for block, cells, ordered in _pieces_as_sorted(part):
-        quick = _Quick.of(ordered, model, cells)
-        half = quick.half + quick.floor[:, None]
-        for k, where, there in () if cells is None else cells.main_parts():
-            own = 2.0 * half[:, where] * there
-            widths[k] += own.sum(axis=1)
-            largest[k] = np.maximum(largest[k], own.max(axis=1))
-        if (half.min(axis=1) > _NARROW * quick.error).all():
-            left = -quick.distance
-            r = left / half
-        else:
-            centre, half = _centre_and_half(model, block)
-            left = block.x_next - centre
-            r = utilisations(left, half)
-        for i, values in enumerate((r, left)):
-            total[i] += values.sum(axis=1)
-            products[i] += gram_of(values, values)
-        for kept, values in zip(some, (left, half), strict=True):
-            kept.append(values[:, ::stride].T.copy())
-    return total, products, widths, largest, np.concatenate(some[0]), np.concatenate(some[1])
+    for block in part.blocks():
+        found.append(verdicts(model.tables, *_given(block, part.columns), block.root_weights(), True)[3:])
+        few = block.every(0, stride)
+        z, dt, x_next, base, blocks, s = _given(few, part.columns)
+        centre, half = np.empty(x_next.shape), np.empty(x_next.shape)
+        centre_and_half(model.tables, z, dt, centre, half, blocks, s, base)
+        some[0].append((x_next - centre).T)
+        some[1].append(half.T)
+    total, products, widths, largest = (np.stack(each) for each in zip(*found, strict=True))
+    sums = total.sum(axis=0), products.sum(axis=0), widths.sum(axis=0), largest.max(axis=0)
+    return *sums, np.concatenate(some[0]), np.concatenate(some[1])
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:

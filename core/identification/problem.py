@@ -12,8 +12,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,7 +183,6 @@ class Problem:
     columns: Columns
     s_columns: Array | None = None
     base_columns: Array | None = None
-    sorted_pieces: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)  # of the passes
 
     @property
     def N(self) -> int:

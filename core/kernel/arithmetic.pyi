@@ -115,3 +115,44 @@ def judged(x: Array, centre: Array, half: Array, margin: float) -> Array: ...
 def pair_count(size: int) -> int: ...
 def outside_domain(z: Array, least: Any, greatest: Any, occupied: Any = None) -> NDArray[np.bool_]: ...
 def occupy(z: Array, least: Array, greatest: Array, occupied: NDArray[np.bool_]) -> None: ...
+def sums_of(
+    n: int,
+    z: Array,
+    dt: Array,
+    after: Array,
+    base: Array | None,
+    blocks: Blocks | None,
+    s: Array | None,
+    ones: int,
+    times_dt: Sequence[bool],
+    weights: Array | None,
+) -> tuple[Any, ...]: ...
+def near_bounds(
+    n: int,
+    z: Array,
+    dt: Array,
+    after: Array,
+    base: Array | None,
+    blocks: Blocks | None,
+    s: Array | None,
+    ones: int,
+    times_dt: Sequence[bool],
+    theta: Array,
+    inner: Array,
+    outer: Array | None,
+    limit: Array | None,
+    rows: Any,
+) -> tuple[NDArray[np.intp], Array]: ...
+def verdicts(
+    tables: tuple[Array, Array, Array],
+    z: Array,
+    dt: Array,
+    after: Array,
+    base: Array | None,
+    blocks: Blocks | None,
+    s: Array | None,
+    roots: Array,
+    sums: bool = False,
+) -> tuple[Any, ...]: ...
+def normalised_columns(values: Array, steady: Any, scale: Any, out: Array) -> float: ...
+def changes(before: Array, after: Array) -> tuple[NDArray[np.bool_], Array]: ...

@@ -17,11 +17,13 @@ import numpy as np
 cimport cython
 from cpython cimport array as arrays
 from libc.math cimport INFINITY, NAN, fabs
-from libc.stdlib cimport free, malloc
+from libc.stdlib cimport calloc, free
 
 include "equations.pxi"
 include "elements.pxi"
+include "tiles.pxi"
 include "rows.pxi"
+include "passes.pxi"
 include "judge.pxi"
 include "runs.pxi"
 include "statistics.pxi"

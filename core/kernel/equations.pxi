@@ -103,20 +103,6 @@ cdef inline void add_columns(
             total[i] += table[j * n + i] * values[j]
 
 
-cdef inline void add_columns_of_many(
-    const double* table, const double* values, Py_ssize_t n, Py_ssize_t p, Py_ssize_t count, double* total
-) noexcept nogil:
-    """One row of `add_columns` for samples side by side: values (p, _TOGETHER), of which `count` are there."""
-    cdef Py_ssize_t j, q
-    cdef double element = table[0]
-    for q in range(count):
-        total[q] = element * values[q]
-    for j in range(1, p):
-        element = table[j * n]
-        for q in range(count):
-            total[q] += element * values[j * _TOGETHER + q]
-
-
 cdef inline void blend(
     const double* table,
     Py_ssize_t size,

@@ -19,64 +19,22 @@ def centre_and_half(tables, z, dt, centre, half, Blocks blocks=None, s=None, bas
     states.
     """
     cdef Elements elements = Elements(*tables)
-    cdef const double[:, :] phi = z
-    cdef const double[:] step = dt
+    cdef Tiles tiles = Tiles(elements.n, elements.p, z, dt, base, None, blocks, s)
     cdef double[:, :] middle = centre
     cdef double[:, :] width = half
-    cdef const double[:, :] start = z[: elements.n] if base is None else base
-    cdef const double[:, :] vectors = z[:0] if s is None else s
-    cdef Py_ssize_t n = elements.n, p = elements.p, size = phi.shape[0], count = step.shape[0]
-    cdef Py_ssize_t i, j, k, q, axis, many
-    cdef Py_ssize_t places[_CORNERS]
-    cdef double weights[_CORNERS]
-    cdef double here[2]
-    cdef bint scheduled = blocks is not None and blocks.corners > 0
-    fits = size <= p and phi.shape[1] == start.shape[1] == middle.shape[1] == width.shape[1] == count
-    if not (fits and start.shape[0] == middle.shape[0] == width.shape[0] == n):
+    cdef Py_ssize_t i, q
+    if not centre.shape == half.shape == (elements.n, tiles.count):
         raise ValueError("the samples do not fit the terms")
-    if scheduled and (vectors.shape[0] != blocks.axes or vectors.shape[1] != count):
-        raise ValueError("the scheduling vectors do not fit the samples")
-    cdef double* room = <double*>malloc((2 * p + 2) * _TOGETHER * sizeof(double))
-    if room == NULL:
-        raise MemoryError
-    cdef double* psi = room + p * _TOGETHER
-    cdef double* rate = psi + p * _TOGETHER
-    cdef double* spread = rate + _TOGETHER
+    cdef double* psi = room_for(elements.p + 2)
+    cdef double* one = psi + elements.p * _TOGETHER
     with nogil:
-        if scheduled:
-            for j in range(size, p):
-                room[j] = 1.0
-            for k in range(count):
-                for axis in range(blocks.axes):
-                    here[axis] = vectors[axis, k]
-                for j in range(size):
-                    room[j] = phi[j, k]
-                if blocks.find(here, places, weights) < 0:
-                    for i in range(n):
-                        middle[i, k] = width[i, k] = NAN
-                    continue
-                elements.sum(room, places, weights, blocks.corners)
-                for i in range(n):
-                    middle[i, k] = centre_of(start[i, k], step[k], elements.rate[i])
-                    width[i, k] = half_of(step[k], elements.spread[i], elements.still[i])
-        else:
-            for j in range(size * _TOGETHER, p * _TOGETHER):
-                room[j] = psi[j] = 1.0
-            k = 0
-            while k < count:
-                many = count - k if count - k < _TOGETHER else _TOGETHER
-                for j in range(size):
-                    for q in range(many):
-                        room[j * _TOGETHER + q] = phi[j, k + q]
-                        psi[j * _TOGETHER + q] = fabs(room[j * _TOGETHER + q])
-                for i in range(n):
-                    add_columns_of_many(elements.theta + i, room, n, p, many, rate)
-                    add_columns_of_many(elements.delta + i, psi, n, p, many, spread)
-                    for q in range(many):
-                        middle[i, k + q] = centre_of(start[i, k + q], step[k + q], rate[q])
-                        width[i, k + q] = half_of(step[k + q], spread[q], elements.v[i])
-                k += many
-    free(room)
+        while tiles.take():
+            tiles.sizes(elements.p, psi)
+            for i in range(elements.n):
+                tiles.bounds(elements, i, psi, one, one + _TOGETHER)
+                for q in range(tiles.many):
+                    middle[i, tiles.index[q]], width[i, tiles.index[q]] = one[q], one[_TOGETHER + q]
+    free(psi)
 
 
 def edges(centre, half, double margin):

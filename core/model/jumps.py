@@ -20,23 +20,10 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.limits import LARGEST
 
-_BLOCK = 1 << 11  # transitions that are looked at together: they stay in the cache
 
-
-def largest_steps(model: Any, transients: Iterable[Any]) -> Array:
-    """The largest change of each state in one transition of recordings.
-
-    Returns (n,): normalised.
-    """
-    largest = np.zeros(model.n)
-    for transient in transients:
-        steps = transient.transitions()
-        for a in range(0, len(steps.k), _BLOCK):
-            part = slice(a, a + _BLOCK)
-            with np.errstate(over="ignore", invalid="ignore"):
-                change = steps.x_next[part] - steps.x[part]
-            along = np.ascontiguousarray(change.T)  # numpy is slow at the maximum of short rows
-            largest = np.maximum(largest, np.abs(along, out=along).max(axis=1, initial=0.0))
+def largest_steps(model: Any, found: Iterable[Any]) -> Array:
+    """The largest change of each state in one transition (n,), normalised; `found`: of recordings, `repeats.Found`."""
+    largest = np.max([np.zeros(model.n), *(one.largest for one in found)], axis=0)
     return np.asarray(np.minimum(largest / model.operating_point.X, LARGEST))
 
 

@@ -37,7 +37,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
-from uncertain_lti.kernel.arithmetic import edges
+from uncertain_lti.kernel.arithmetic import changes, edges
 from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.terms import checked
 
@@ -260,20 +260,22 @@ class Found(NamedTuple):
 
     `most` (4, n): of each state the longest repeat, the farthest run, the largest sum and the greatest activity of a
     repeat; `windows` (windows, n): activity in each window of WINDOW_S; NaN for a state that repeats in half of it or
-    more; `noisy` (n,): steps that show noise; -1 for a state of which values came twice.
+    more; `noisy` (n,): steps that show noise; -1 for a state of which values came twice; `largest` (n,): the largest
+    change in one transition, recorded units.
     """
 
     most: Array
     windows: Array
     noisy: Array
+    largest: Array
 
 
 def repeats_in(model: Any, transient: Any) -> Found:
     """What one recording has of them."""
     most, point, steps = np.zeros((4, model.n)), model.operating_point, transient.transitions()
     windows, noisy = _activity(model, transient, steps)
-    some = (steps.x == steps.x_next).any(axis=1)
-    steps = steps.take(np.asarray(some))
+    some, largest = changes(steps.x, steps.x_next)
+    steps = steps.take(some)
     with np.errstate(over="ignore", invalid="ignore"):
         z = model.normalised_columns(steps)
         centre, half = np.empty((model.n, len(steps.k))), np.empty((model.n, len(steps.k)))
@@ -286,7 +288,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
         for moved in follow.push(step):
             reached = moved.seconds, moved.run, moved.sum, moved.activity
             most[:, moved.state] = np.fmax(most[:, moved.state], reached)  # a run beyond all numbers is NaN after
-    return Found(most, windows, noisy)
+    return Found(most, windows, noisy, largest)
 
 
 def together(n: int, found: Sequence[Found]) -> Repeats:

@@ -21,6 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
+from uncertain_lti.base.cores import core_count
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.sampling.streams import Stream, read_stream
@@ -36,8 +37,7 @@ def processes_for(bags: Sequence[Recording]) -> int:
     One process keeps nearly two cores busy, as it reads ahead.
     """
     size = sum(bag.size for bag in bags)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(len(bags), cores // 2)) if size >= WORTH_IT else 1
+    return max(1, min(len(bags), core_count() // 2)) if size >= WORTH_IT else 1
 
 
 def read_streams(

@@ -1,0 +1,32 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Work that leaves the interpreter's lock, on all cores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+def core_count() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def on_cores(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
+    """function(*arguments) for each, by threads; in their order."""
+    if len(arguments) < 2 or core_count() < 2:
+        return [function(*some) for some in arguments]
+    with ThreadPoolExecutor(min(core_count(), len(arguments))) as pool:
+        return list(pool.map(lambda some: function(*some), arguments))

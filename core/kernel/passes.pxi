@@ -1,0 +1,291 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Passes of a fit over transitions in columns: sums, the transitions near their bounds, and the verdict on all.
+
+Each is of one piece of the data. A transition is given as z (p, K), dt (K,), after and base (n, K), the blocks of a
+schedule and the scheduling vectors s (axes, K), as of `Tiles`. Of the regressors psi of the half-widths, those beyond
+|z| are 1, or 1 / dt if dt does not multiply the term.
+"""
+
+
+cdef void add_products(
+    const double* a, Py_ssize_t rows, const double* b, Py_ssize_t columns, const double* factor, Tiles tiles,
+    double* room, double[:, ::1] total,
+) noexcept nogil:
+    """Add the products a bᵀ of the rows of a tile to `total` (R rows, columns), those of a to the blocks that hold.
+
+    b: NULL for those of a with themselves, of which the upper triangle is filled in; factor: on each transition, or
+    NULL; room: for as many rows as a has at all corners, and one.
+    """
+    cdef Py_ssize_t c, d, i, j, q, corners = tiles.corners or 1, whole = tiles.whole
+    cdef double* weighted = room + corners * rows * _TOGETHER
+    cdef const double* left
+    if tiles.corners:
+        for c in range(corners):
+            for i in range(rows):
+                for q in range(whole):
+                    room[(c * rows + i) * _TOGETHER + q] = a[i * _TOGETHER + q] * tiles.weights[c * _TOGETHER + q]
+        a = room
+    for c in range(corners):
+        for i in range(rows):
+            left = a + (c * rows + i) * _TOGETHER
+            if factor != NULL:
+                for q in range(whole):
+                    weighted[q] = left[q] * factor[q]
+                left = weighted
+            if b != NULL:
+                for j in range(columns):
+                    total[tiles.places[c] * rows + i, j] += dot(left, b + j * _TOGETHER, whole)
+                continue
+            for d in range(c, corners):
+                for j in range(i if c == d else 0, rows):
+                    total[tiles.places[c] * rows + i, tiles.places[d] * rows + j] += dot(
+                        left, a + (d * rows + j) * _TOGETHER, whole
+                    )
+
+
+cdef inline Py_ssize_t main_corner(Tiles tiles, Py_ssize_t q) noexcept nogil:
+    """Which of the blocks that hold at a transition has the largest weight, of two alike the first."""
+    cdef Py_ssize_t c, found = 0
+    for c in range(1, tiles.corners):
+        if tiles.weights[c * _TOGETHER + q] > tiles.weights[found * _TOGETHER + q]:
+            found = c
+    return found
+
+
+def mirrored(matrix):
+    """A symmetric matrix from its upper triangle."""
+    return matrix + np.triu(matrix, 1).T
+
+
+def sums_of(Py_ssize_t n, z, dt, after, base, Blocks blocks, s, Py_ssize_t ones, times_dt, weights):
+    """What `identification.passes.Moments` sums, of one piece.
+
+    `ones`: additive terms with nominal elements; `times_dt`: of each with a half-width, whether dt multiplies it;
+    `weights`: (f, K) factors. Returns Σ ψψᵀ, the same with each factor (f, q, q), Σ φφᵀ, Σ φ (x_next - x)ᵀ,
+    Σ (x_next - x)² (n,), Σ ψ and of how many transitions each block is the main one; ψ and φ times Δt.
+    """
+    cdef Tiles tiles = Tiles(n, z.shape[0] + ones, z, dt, base, after, blocks, s)
+    cdef Py_ssize_t p = tiles.p, r = tiles.p + ones, size = tiles.p + len(times_dt), count = tiles.blocks.count
+    cdef Py_ssize_t f, i, j, k, q
+    cdef const unsigned char[::1] by_dt = np.array([*times_dt, 0], dtype=np.uint8)
+    cdef const double[:, :] by = z[:0] if weights is None else weights
+    plain, centre = np.zeros((count * size, count * size)), np.zeros((count * r, count * r))
+    target, square, total = np.zeros((count * r, n)), np.zeros(n), np.zeros((count * size, 1))
+    grams, visits = np.zeros((by.shape[0], count * size, count * size)), np.zeros(count, dtype=np.intp)
+    cdef double[:, ::1] of_psi = plain
+    cdef double[:, ::1] of_phi = centre
+    cdef double[:, ::1] to_moved = target
+    cdef double[::1] moved_square = square
+    cdef double[:, ::1] of_sizes = total
+    cdef double[:, :, ::1] weighted = grams
+    cdef Py_ssize_t[::1] visited = visits
+    cdef double* phi = room_for(r + size + n + 2 + _CORNERS * (r + size) + 1)
+    cdef double* psi = phi + r * _TOGETHER
+    cdef double* moved = psi + size * _TOGETHER
+    cdef double* factor = moved + n * _TOGETHER
+    cdef double* all_ones = factor + _TOGETHER
+    cdef double* room = all_ones + _TOGETHER
+    with nogil:
+        for q in range(_TOGETHER):
+            all_ones[q] = 1.0
+        while tiles.take():
+            for j in range(r):
+                for q in range(tiles.whole):
+                    phi[j * _TOGETHER + q] = tiles.phi[j * _TOGETHER + q] * tiles.step[q]
+            for j in range(size):
+                for q in range(tiles.whole):
+                    k = j * _TOGETHER + q
+                    psi[k] = fabs(phi[k]) if j < p else tiles.step[q] if by_dt[j - p] else q < tiles.many
+            for i in range(n):
+                for q in range(tiles.whole):
+                    k = i * _TOGETHER + q
+                    moved[k] = tiles.end[k] - tiles.start[k]
+                moved_square[i] += dot(moved + i * _TOGETHER, moved + i * _TOGETHER, tiles.whole)
+            add_products(psi, size, NULL, 0, NULL, tiles, room, of_psi)
+            add_products(phi, r, NULL, 0, NULL, tiles, room, of_phi)
+            add_products(phi, r, moved, n, NULL, tiles, room, to_moved)
+            add_products(psi, size, all_ones, 1, NULL, tiles, room, of_sizes)
+            for f in range(by.shape[0]):
+                for q in range(tiles.whole):
+                    factor[q] = by[f, tiles.index[q]] if q < tiles.many else 0.0
+                add_products(psi, size, NULL, 0, factor, tiles, room, weighted[f])
+            for q in range(tiles.many):
+                visited[tiles.places[main_corner(tiles, q)]] += 1
+    free(phi)
+    return mirrored(plain), [mirrored(gram) for gram in grams], mirrored(centre), target, square, total[:, 0], visits
+
+
+def near_bounds(
+    Py_ssize_t n, z, dt, after, base, Blocks blocks, s, Py_ssize_t ones, times_dt, theta, inner, outer, limit, rows
+):
+    """Transitions outside a candidate's bounds, or wider than its limit, of each of some rows of the model.
+
+    `theta` (R r, k): nominal elements; `inner` (R q, k): half-widths of the bounds; `outer` (R q, k) and `limit` (k,)
+    or (k, K): those of which twice the width per step is held against the limit, or None; `rows` (k,): rows of the
+    model. Returns positions row x K + transition, in order, and |rate - centre| of each.
+    """
+    cdef Tiles tiles = Tiles(n, z.shape[0] + ones, z, dt, base, after, blocks, s)
+    cdef Py_ssize_t p = tiles.p, r = tiles.p + ones, size = tiles.p + len(times_dt), count = len(rows)
+    cdef Py_ssize_t i, j, k, q, kept = 0, held = tiles.blocks.count
+    cdef const unsigned char[::1] by_dt = np.array([*times_dt, 0], dtype=np.uint8)
+    cdef const Py_ssize_t[::1] which = np.ascontiguousarray(rows, dtype=np.intp)
+    cdef arrays.array nominal = doubles(theta), within = doubles(inner), beyond = doubles(inner if outer is None else outer)
+    cdef bint limited = limit is not None
+    cdef const double[:, :] most = np.zeros((1, 1)) if limit is None else np.reshape(limit, (count, -1))
+    cdef bint each = limited and most.shape[1] > 1
+    if not (len(nominal) >= held * r * count and len(within) >= held * size * count <= len(beyond)):
+        raise ValueError("the candidate does not fit the terms")
+    found, distances = np.empty(count * tiles.count, dtype=np.intp), np.empty(count * tiles.count)
+    cdef Py_ssize_t[::1] position = found
+    cdef double[::1] distance = distances
+    cdef double* psi = room_for(size + 3)
+    cdef double* left = psi + size * _TOGETHER
+    cdef double* half = left + _TOGETHER
+    cdef double* wide = half + _TOGETHER
+    with nogil:
+        while tiles.take():
+            tiles.sizes(p, psi)
+            for j in range(p, size):
+                for q in range(tiles.many):
+                    psi[j * _TOGETHER + q] = 1.0 if by_dt[j - p] else 1.0 / tiles.step[q]
+            for i in range(count):
+                tiles.sum(nominal.data.as_doubles, i, count, r, tiles.phi, left)
+                tiles.sum(within.data.as_doubles, i, count, size, psi, half)
+                if limited:
+                    tiles.sum(beyond.data.as_doubles, i, count, size, psi, wide)
+                k = which[i] * _TOGETHER
+                for q in range(tiles.many):
+                    left[q] = fabs(left[q] * tiles.step[q] - (tiles.end[k + q] - tiles.start[k + q]))
+                    half[q] = left[q] > half[q] * tiles.step[q]
+                if limited:
+                    for q in range(tiles.many):
+                        if 2.0 * wide[q] * tiles.step[q] > most[i, tiles.index[q] if each else 0]:
+                            half[q] = 1.0
+                for q in range(tiles.many):
+                    if half[q] != 0.0:
+                        position[kept] = i * tiles.count + tiles.index[q]
+                        distance[kept] = left[q] / tiles.step[q]
+                        kept += 1
+    free(psi)
+    order = np.argsort(found[:kept])
+    return found[order], distances[order]
+
+
+def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots, bint sums=False):
+    """The verdict on all transitions, by the arithmetic of every other verdict.
+
+    `tables`: as of `centre_and_half`; `roots` (n, K) or (n, 1): √w. Returns of each state the transitions outside, the
+    largest width and the largest √w x width; and with `sums` Σ of the utilisation and of the residual (2, n), their
+    products (2, n, n), and of each block the sum and the largest of the widths where it is the main one (R, n).
+    """
+    cdef Elements elements = Elements(*tables)
+    cdef Tiles tiles = Tiles(elements.n, elements.p, z, dt, base, after, blocks, s)
+    cdef Py_ssize_t i, j, k, q, c, n = elements.n
+    cdef const double[:, :] root = roots
+    cdef bint each = roots.shape[1] > 1
+    outside, largest = np.zeros(n, dtype=np.intp), np.zeros((2, n))
+    total, products = np.zeros((2, n)), np.zeros((2, n, n))
+    widths = np.zeros((2, tiles.blocks.count, n))
+    cdef Py_ssize_t[::1] left_out = outside
+    cdef double[:, ::1] most = largest
+    cdef double[:, ::1] sum_of = total
+    cdef double[:, :, ::1] product_of = products
+    cdef double[:, :, ::1] of_block = widths
+    cdef double* psi = room_for(elements.p + 2 + 2 * n)
+    cdef double* centre = psi + elements.p * _TOGETHER
+    cdef double* half = centre + _TOGETHER
+    cdef double* values = half + _TOGETHER  # utilisations, then residuals
+    cdef double width, x_next, high, weighted
+    if not (root.shape[0] == n and root.shape[1] in (1, tiles.count)):
+        raise ValueError("the weights do not fit the transitions")
+    with nogil:
+        while tiles.take():
+            tiles.sizes(elements.p, psi)
+            for i in range(n):
+                tiles.bounds(elements, i, psi, centre, half)
+                high = weighted = 0.0
+                k = 0
+                for q in range(tiles.many):
+                    x_next = tiles.end[i * _TOGETHER + q]
+                    k += not is_contained(lower_of(centre[q], half[q], 1.0), x_next, upper_of(centre[q], half[q], 1.0))
+                    high = half[q] if half[q] > high else high
+                left_out[i] += k
+                most[0, i] = 2.0 * high if 2.0 * high > most[0, i] else most[0, i]
+                if each:
+                    for q in range(tiles.many):
+                        width = 2.0 * (half[q] * root[i, tiles.index[q]])
+                        weighted = width if width > weighted else weighted
+                    most[1, i] = weighted if weighted > most[1, i] else most[1, i]
+                if sums:
+                    for q in range(tiles.many):
+                        width = tiles.end[i * _TOGETHER + q] - centre[q]
+                        values[i * _TOGETHER + q] = utilisation_of(width, half[q])
+                        values[(n + i) * _TOGETHER + q] = width
+                        sum_of[0, i] += values[i * _TOGETHER + q]
+                        sum_of[1, i] += width
+                    for q in range(tiles.many, tiles.whole):
+                        values[i * _TOGETHER + q] = values[(n + i) * _TOGETHER + q] = 0.0
+                    for q in range(tiles.many if tiles.corners else 0):
+                        c = tiles.places[main_corner(tiles, q)]
+                        width = 2.0 * half[q]
+                        of_block[0, c, i] += width
+                        of_block[1, c, i] = width if width > of_block[1, c, i] else of_block[1, c, i]
+            if sums:
+                for k in range(2):
+                    for i in range(n):
+                        for j in range(i, n):
+                            product_of[k, i, j] += dot(
+                                values + (k * n + i) * _TOGETHER, values + (k * n + j) * _TOGETHER, tiles.whole
+                            )
+    free(psi)
+    if not each:
+        largest[1] = largest[0] * roots[:, 0]
+    return outside, largest[0], largest[1], total, np.stack([mirrored(part) for part in products]), *widths
+
+
+def normalised_columns(values, steady, scale, out):
+    """Recorded values (K, n), normalised, into columns (n, K); the sum of their squares."""
+    cdef const double[:, :] rows = values
+    cdef double[:, :] columns = out
+    cdef Py_ssize_t j, k, begin, end, n = rows.shape[1], count = rows.shape[0]
+    cdef arrays.array low = doubles(steady), unit = doubles(scale)
+    cdef double value, total = 0.0
+    if not (columns.shape[0] == n == len(steady) == len(scale) and columns.shape[1] == count):
+        raise ValueError("the rows do not fit the columns")
+    with nogil:
+        for begin from 0 <= begin < count by _TOGETHER:  # so many rows stay in the cache while they become columns
+            end = begin + _TOGETHER if begin + _TOGETHER < count else count
+            for j in range(n):
+                for k in range(begin, end):
+                    value = normalised(rows[k, j], low.data.as_doubles[j], unit.data.as_doubles[j])
+                    columns[j, k] = value
+                    total += value * value
+    return total
+
+
+def changes(before, after):
+    """Of rows (K, n): in which of them some number stays the same (K,), and the largest change of each number (n,)."""
+    cdef const double[:, :] one = before
+    cdef const double[:, :] other = after
+    cdef Py_ssize_t i, k, n = one.shape[1]
+    cdef double change
+    if not before.shape == after.shape:
+        raise ValueError("the rows do not fit one another")
+    same, largest = np.zeros(one.shape[0], dtype=bool), np.zeros(n)
+    cdef unsigned char[::1] still = same.view(np.uint8)
+    cdef double[::1] most = largest
+    with nogil:
+        for k in range(one.shape[0]):
+            for i in range(n):
+                change = fabs(other[k, i] - one[k, i])
+                still[k] |= other[k, i] == one[k, i]
+                most[i] = change if change > most[i] else most[i]
+    return same, largest

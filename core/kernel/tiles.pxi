@@ -1,0 +1,232 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Many transitions at once: tiles of them side by side, and the sums over a tile."""
+
+cdef enum:
+    _LANES = 8  # transitions that one sum goes over at a time: as many as registers hold
+    _SORTED = 2048  # transitions of a schedule that are sorted by the blocks that hold
+
+
+@cython.final
+cdef class Tiles:
+    """Transitions in columns, walked in tiles: at most _TOGETHER side by side, at which the same blocks hold.
+
+    `z` (p, K): [x; u]; `dt` (K,): s; `base` (n, K): what the rates are added to, default the states; `after` (n, K):
+    next states, default none; `blocks`, `s` (axes, K): schedule and scheduling vectors. Past the last transition a tile
+    is filled with zeros, and with ones the regressors beyond z.
+    """
+
+    cdef const double[:, :] z, base, after, s
+    cdef const double[:] dt
+    cdef Blocks blocks
+    cdef Py_ssize_t n, p, count, corners
+    cdef Py_ssize_t at, sorted, gone  # next transition to look at; of those sorted: how many, and how many were taken
+    cdef list _keep
+    cdef Py_ssize_t* order  # (_SORTED,): transitions, those of the same blocks side by side
+    cdef Py_ssize_t* first  # (_SORTED,): the first block that holds, of each transition
+    cdef Py_ssize_t* held  # (_SORTED, _CORNERS): all of them
+    cdef Py_ssize_t* ends  # (blocks + 2,)
+    cdef double* shares  # (_SORTED, _CORNERS): their weights
+    # of this tile:
+    cdef Py_ssize_t many, whole  # transitions, and with what it is filled up
+    cdef Py_ssize_t* index  # (_TOGETHER,): positions of its transitions
+    cdef Py_ssize_t places[_CORNERS]
+    cdef double* weights  # (_CORNERS, _TOGETHER)
+    cdef double* phi  # (columns, _TOGETHER): z, then 1
+    cdef double* step  # (_TOGETHER,)
+    cdef double* start  # (n, _TOGETHER)
+    cdef double* end  # (n, _TOGETHER)
+
+    def __init__(self, Py_ssize_t n, Py_ssize_t columns, z, dt, base=None, after=None, Blocks blocks=None, s=None):
+        self.z, self.dt, self.base = z, dt, z[:n] if base is None else base
+        self.after, self.s = z[:0] if after is None else after, z[:0] if s is None else s
+        self.blocks = Blocks() if blocks is None else blocks
+        self.n, self.p, self.count = n, self.z.shape[0], self.dt.shape[0]
+        self.corners = self.blocks.corners
+        fits = self.p <= columns and self.z.shape[1] == self.base.shape[1] == self.count and self.base.shape[0] == n
+        if not fits or (after is not None and not (self.after.shape[0] == n and self.after.shape[1] == self.count)):
+            raise ValueError("the samples do not fit the terms")
+        if self.corners and not (self.s.shape[0] == self.blocks.axes and self.s.shape[1] == self.count):
+            raise ValueError("the scheduling vectors do not fit the samples")
+        cdef arrays.array numbers = doubles(
+            np.ones((columns + 2 * n + _CORNERS + 1) * _TOGETHER + (_SORTED * _CORNERS if self.corners else 0))
+        )
+        cdef Py_ssize_t places = (_SORTED * (2 + _CORNERS) if self.corners else 0) + self.blocks.count + 2
+        cdef arrays.array positions = array("q", bytes(8 * (_TOGETHER + places)))
+        self._keep = [numbers, positions]
+        self.phi = numbers.data.as_doubles
+        self.step = self.phi + columns * _TOGETHER
+        self.start = self.step + _TOGETHER
+        self.end = self.start + n * _TOGETHER
+        self.weights = self.end + n * _TOGETHER
+        self.shares = self.weights + _CORNERS * _TOGETHER
+        self.index = <Py_ssize_t*>positions.data.as_longlongs
+        self.ends = self.index + _TOGETHER
+        self.order = self.ends + self.blocks.count + 2
+        self.first, self.held = self.order + _SORTED, self.order + 2 * _SORTED
+
+    cdef bint take(self) noexcept nogil:
+        """Fill in the next tile; False at the end."""
+        cdef Py_ssize_t i, k, q, a
+        if not self.corners:
+            self.many = self.count - self.at if self.count - self.at < _TOGETHER else _TOGETHER
+            for q in range(self.many):
+                self.index[q] = self.at + q
+            self.at += self.many
+        else:
+            if self.gone == self.sorted:
+                self.sort()
+            a, self.many = self.gone, 0
+            while self.many < _TOGETHER and self.gone < self.sorted and (
+                self.first[self.order[self.gone]] == self.first[self.order[a]]
+            ):
+                self.gone += 1
+                self.many += 1
+            for q in range(self.many):
+                k = self.order[a + q]
+                self.index[q] = self.at - self.sorted + k
+                for i in range(self.corners):
+                    self.places[i] = self.held[k * _CORNERS + i]
+                    self.weights[i * _TOGETHER + q] = self.shares[k * _CORNERS + i]
+        if not self.many:
+            return False
+        self.whole = (self.many + _LANES - 1) // _LANES * _LANES
+        self.gather(self.z, self.p, self.phi)
+        self.gather(self.base, self.n, self.start)
+        self.gather(self.after, self.after.shape[0], self.end)
+        for q in range(self.many):
+            self.step[q] = self.dt[self.index[q]]
+        for q in range(self.many, self.whole):
+            self.step[q] = 0.0
+            for i in range(self.corners):
+                self.weights[i * _TOGETHER + q] = 0.0
+        return True
+
+    cdef void sort(self) noexcept nogil:
+        """Find the blocks that hold at the next transitions, and sort them by the first: it tells the others."""
+        cdef Py_ssize_t k, axis, r, count = self.blocks.count
+        cdef double here[2]
+        self.sorted = self.count - self.at if self.count - self.at < _SORTED else _SORTED
+        self.gone = 0
+        for r in range(count + 2):
+            self.ends[r] = 0
+        for k in range(self.sorted):
+            for axis in range(self.blocks.axes):
+                here[axis] = self.s[axis, self.at + k]
+            if self.blocks.find(here, self.held + k * _CORNERS, self.shares + k * _CORNERS) < 0:
+                for r in range(self.corners):  # a mode that is not listed: nothing is known
+                    self.held[k * _CORNERS + r], self.shares[k * _CORNERS + r] = 0, NAN
+                self.first[k] = count
+            else:
+                self.first[k] = self.held[k * _CORNERS]
+            self.ends[self.first[k] + 1] += 1
+        for r in range(count + 1):
+            self.ends[r + 1] += self.ends[r]
+        for k in range(self.sorted):
+            self.order[self.ends[self.first[k]]] = k
+            self.ends[self.first[k]] += 1
+        self.at += self.sorted
+
+    cdef void gather(self, const double[:, :] rows, Py_ssize_t count, double* to) noexcept nogil:
+        """Some rows of the transitions of this tile."""
+        cdef Py_ssize_t i, q, first = self.index[0]
+        cdef double* into
+        for i in range(count):
+            into = to + i * _TOGETHER
+            if not self.corners:
+                for q in range(self.many):
+                    into[q] = rows[i, first + q]
+            else:
+                for q in range(self.many):
+                    into[q] = rows[i, self.index[q]]
+            for q in range(self.many, self.whole):
+                into[q] = 0.0
+
+    cdef void sum(
+        self, const double* table, Py_ssize_t i, Py_ssize_t n, Py_ssize_t columns, const double* values, double* total
+    ) noexcept nogil:
+        """total (_TOGETHER,) = row i of `add_columns` of each transition; table: (blocks, columns, n), blended."""
+        cdef Py_ssize_t c, j, l, q, size = n * columns
+        cdef double element
+        cdef double blended[_LANES]
+        cdef double lane[_LANES]
+        for q from 0 <= q < self.many by _LANES:
+            for j in range(columns):
+                if self.corners:
+                    element = table[self.places[0] * size + j * n + i]
+                    for l in range(_LANES):
+                        blended[l] = element * self.weights[q + l]
+                    for c in range(1, self.corners):
+                        element = table[self.places[c] * size + j * n + i]
+                        for l in range(_LANES):
+                            blended[l] += element * self.weights[c * _TOGETHER + q + l]
+                    if j == 0:
+                        for l in range(_LANES):
+                            lane[l] = blended[l] * values[q + l]
+                    else:
+                        for l in range(_LANES):
+                            lane[l] += blended[l] * values[j * _TOGETHER + q + l]
+                else:
+                    element = table[j * n + i]
+                    if j == 0:
+                        for l in range(_LANES):
+                            lane[l] = element * values[q + l]
+                    else:
+                        for l in range(_LANES):
+                            lane[l] += element * values[j * _TOGETHER + q + l]
+            for l in range(_LANES):
+                total[q + l] = lane[l]
+
+    cdef void bounds(
+        self, Elements elements, Py_ssize_t i, const double* psi, double* centre, double* half
+    ) noexcept nogil:
+        """Centre and half-width (_TOGETHER,) of a state at each transition; psi: |phi|."""
+        cdef Py_ssize_t c, q, n = self.n
+        cdef double still
+        self.sum(elements.theta, i, n, elements.p, self.phi, centre)
+        self.sum(elements.delta, i, n, elements.p, psi, half)
+        still = elements.v[i]
+        for q in range(self.many):
+            if self.corners:
+                still = elements.v[self.places[0] * n + i] * self.weights[q]
+                for c in range(1, self.corners):
+                    still += elements.v[self.places[c] * n + i] * self.weights[c * _TOGETHER + q]
+            centre[q] = centre_of(self.start[i * _TOGETHER + q], self.step[q], centre[q])
+            half[q] = half_of(self.step[q], half[q], still)
+
+    cdef void sizes(self, Py_ssize_t columns, double* psi) noexcept nogil:
+        """psi (columns, _TOGETHER) = |phi|."""
+        cdef Py_ssize_t j, q
+        for j in range(columns):
+            for q in range(self.many):
+                psi[j * _TOGETHER + q] = fabs(self.phi[j * _TOGETHER + q])
+
+
+cdef double dot(const double* a, const double* b, Py_ssize_t count) noexcept nogil:
+    """Σ_q a_q b_q of a tile, filled up with zeros: in lanes, and then these from the first to the last."""
+    cdef double lane[_LANES]
+    cdef double total = 0.0
+    cdef Py_ssize_t l, q
+    for l in range(_LANES):
+        lane[l] = 0.0
+    for q from 0 <= q < count by _LANES:
+        for l in range(_LANES):
+            lane[l] += a[q + l] * b[q + l]
+    for l in range(_LANES):
+        total += lane[l]
+    return total
+
+
+cdef double* room_for(Py_ssize_t rows) except NULL:
+    """So many rows of a tile, all 0."""
+    cdef double* room = <double*>calloc(rows * _TOGETHER or 1, sizeof(double))
+    if room == NULL:
+        raise MemoryError
+    return room
