@@ -54,10 +54,8 @@ class Signals:
 
     def recording(self, rows: Array, t: Array) -> Transient:
         """The rows at times t, s."""
-        u = rows[:, list(self.controls)]
-        if self.both_ends:
-            u = np.hstack([u, np.concatenate([u[1:], u[-1:]])])
-        return Transient(t, rows[:, list(self.states)], u)
+        at = "both" if self.both_ends else "departure"
+        return Transient(t, rows[:, list(self.states)], rows[:, list(self.controls)], at=at)
 
 
 def ours(healthy: Array, t: Array, signals: Signals) -> Callable[[Array, Array], Array]:

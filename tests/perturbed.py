@@ -83,6 +83,8 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
         states[1] = replace(states[1], ignore=(SENTINEL,))
     if may(0.4):
         controls[0] = replace(controls[0], valid=(-0.75, math.inf), ignore=(SENTINEL,))
+    if may(0.4):
+        controls[0] = replace(controls[0], at="arrival")
     knots, modes = may(0.6), may(0.5)
     gear = Signal("gear", GEAR, "data", type=FLOAT, max_hold=float(rng.choice([0.3, 5.0])))
     axes = [Axis("a", knots=(-0.05, 0.0, 0.08))] * knots + [Axis("gear", modes=(1.0, 2.0))] * modes

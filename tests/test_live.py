@@ -71,7 +71,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 def by_hand(
     time: str = "header", max_hold: float | None = 0.5, remembers: bool = False, **options: Any
 ) -> UncertainLTI:
-    """remembers: with lag, diff and rate, values that do not count, and a constant step."""
+    """remembers: with lag, diff and rate, values that do not count, a control at both ends, and a constant step."""
     """Two states on a JointState, controls on a Vector3Stamped (header time) or a Float64 (log time)."""
     if time == "header":
         state = [(STATE, JOINT_STATE, "position[a]"), (STATE, JOINT_STATE, "position[b]")]
@@ -98,7 +98,7 @@ def by_hand(
             replace(b, name="b_rate", field="rate(position[b])"),
             replace(q, name="q_change", field="diff(vector.y)"),
         ]
-        a, p = replace(a, valid=(0.24, 0.45)), replace(p, valid=(-0.7, math.inf))
+        a, p = replace(a, valid=(0.24, 0.45)), replace(p, valid=(-0.7, math.inf), at="both")
         signals = SignalMap((a, b), (p, q, *memories))
     n, m = len(signals.states), len(signals.controls)
     rng = np.random.default_rng(7)
@@ -326,7 +326,7 @@ def test_memories_limits_and_a_constant_step_give_live_what_they_give_offline(wo
     verdicts = offline(path, header_bag(by_hand(), tmp_path / "run.mcap", 300))
     assert sum(v.judged for v in verdicts) > 100 and {v.status for v in verdicts} >= {Status.OK, Status.MISSING}
     checked = EnvelopeMonitor(model).check(read_as_fitted(tmp_path / "run.mcap", UncertainLTI.load(path).signals))
-    assert checked.transient.counters.of("invalid").keys() == {"a", "a_before", "p"}
+    assert checked.transient.counters.of("invalid").keys() == {"a", "a_before", "p", "p at arrival"}
     assert bits(checked.lower[checked.judged]) == bits([v.lower for v in verdicts if v.judged])
     world.monitor(path)
     outputs = Outputs.of(world)

@@ -63,7 +63,7 @@ def plain(seed: int = 2) -> UncertainLTI:
     """A model of two states whose controls are p and q, without limits, with a horizon."""
     model = perturbed.armed_model(np.random.default_rng(seed), everything=True)
     signals = model.signals
-    controls = tuple(replace(s, valid=None, ignore=(), max_hold=None) for s in signals.controls[:2])
+    controls = tuple(replace(s, valid=None, ignore=(), max_hold=None, at="departure") for s in signals.controls[:2])
     time = dict.fromkeys((STATE, CONTROL), "header")
     kept = replace(signals, states=signals.states[:2], controls=controls, scheduling=(), time=time, step="recorded")
     n = 2

@@ -608,6 +608,26 @@ def test_a_still_stretch_ends_where_nobody_recorded(tmp_path: Path, seam: int) -
     assert (transient.signals.states[0].steady, transient.signals.states[0].scale) == (1.0, 3.0)
 
 
+@pytest.mark.parametrize("one_topic", [True, False])
+def test_controls_at_the_arrival_are_read_as_they_are_taken_of_a_recording(one_topic: bool, tmp_path: Path) -> None:
+    """What `Transient.controls_at` makes of a recording is what a signals file says, live and offline."""
+    if one_topic:
+        path = tmp_path / "run.csv"
+        path.write_text("t,x,u\n" + "".join(f"{0.1 * k:.1f},{k * k % 7},{k % 5}\n" for k in range(30)))
+        signals = SignalMap((Signal("x", "/table", "x"),), (Signal("u", "/table", "u"),))
+    else:
+        path = float_bag(tmp_path, "a.mcap", range(0, 3000 * MS, 100 * MS), range(0, 3000 * MS, 70 * MS))
+        signals = XU
+    (plain,) = read_transients(path, signals)
+    at_both = replace(signals, controls=tuple(replace(c, at="both") for c in signals.controls))
+    (read,) = read_transients(path, at_both)
+    taken = plain.controls_at("both")
+    assert taken.signals == read.signals and taken.control_names == read.control_names == ("u", "u at arrival")
+    for name in ("k", "dt", "x", "u", "x_next"):
+        assert getattr(taken.transitions(), name).tobytes() == getattr(read.transitions(), name).tobytes()
+    assert len(read.transitions().k) == (29 if one_topic else 28), "one more sample decides the last"
+
+
 def test_a_model_of_arrays_names_no_topics(tmp_path: Path) -> None:
     model = UncertainLTI(np.eye(1), np.zeros((1, 0)), np.eye(1), np.zeros((1, 0)))
     path = float_bag(tmp_path, "a.mcap", range(0, 100 * MS, 10 * MS), [0])

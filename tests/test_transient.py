@@ -22,7 +22,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti.base.errors import TransientError
+from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
+from uncertain_lti.base.errors import FitError, TransientError
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
@@ -160,6 +161,40 @@ def test_nothing_can_be_changed_afterwards_and_nothing_was_borrowed() -> None:
     for name in ("t_ns", "x", "u", "segment"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(transient, name)[0] = 1
+
+
+def test_a_control_acts_as_it_was_recorded_at_the_departure_or_at_the_arrival_of_a_step() -> None:
+    """Of the samples that are left once those too soon after another are dropped."""
+    t, x, u = [0.0, 1.0, 1.0, 2.0, 3.0], np.zeros((5, 1)), np.array([[0.0, 5], [1, 6], [9, 9], [2, 7], [3, 8]])
+    arrival, both = Transient(t, x, u, at="arrival"), Transient(t, x, u, at={"u2": "both"})
+    assert arrival.transitions().u.tolist() == [[1, 6], [2, 7], [3, 8]]
+    assert (arrival.control_names, arrival.ends) == (("u1", "u2"), ("arrival", "arrival"))
+    assert both.transitions().u.tolist() == [[0, 5, 6], [1, 6, 7], [2, 7, 8]]
+    assert both.control_names == ("u1", "u2", "u2 at arrival") and both.ends == ("departure", "departure", "arrival")
+    again = Transient(t, x, u).controls_at("both")
+    assert again.transitions().u.tolist() == [[0, 1, 5, 6], [1, 2, 6, 7], [2, 3, 7, 8]]
+    assert again.controls_at("both").ends == again.ends == again.replace(slice(0, 2)).ends
+    for at, words in (("end", "at is 'end'; it must be departure"), ({"v": "both"}, "there is no control 'v'")):
+        with pytest.raises(TransientError, match=words):
+            Transient(t, x, u, at=at)
+    with pytest.raises(TransientError, match="control 'u1' is at the arrival"):
+        arrival.controls_at({"u1": "both"})
+
+
+def test_a_model_takes_controls_from_the_ends_that_it_was_fitted_to(tmp_path: Path) -> None:
+    """x follows the mean of u over the step, so both ends of it are needed; the file of the model says so."""
+    rng = np.random.default_rng(3)
+    t, u = 0.1 * np.arange(200), rng.normal(size=(200, 1))
+    x = np.concatenate([[0.0], np.cumsum(0.05 * (u[1:, 0] + u[:-1, 0]))])
+    plain = Transient(t, x, u)
+    model = fit([plain.controls_at("both")], "lp", additive="noise", alarm="containment")
+    assert model.fit_summary["max_width"][0] < 1e-6 * np.ptp(x)
+    model.save(tmp_path / "both.model.json")
+    loaded = UncertainLTI.load(tmp_path / "both.model.json")
+    assert [(c.name, c.at) for c in loaded.signals.controls] == [("u1", "departure"), ("u1 at arrival", "arrival")]
+    assert EnvelopeMonitor(loaded).check(plain).judged[1:].all() and not np.isnan(loaded.free_run(plain).x).any()
+    with pytest.raises(FitError, match="controls u1, u1 at arrival"):
+        fit([plain, plain.controls_at("both")], "lp", additive="noise", alarm="containment")
 
 
 def test_columns_are_named() -> None:

@@ -354,13 +354,17 @@ def _common_signals(transients: Sequence[Transient]) -> SignalMap:
             )
         if other.step != first.step:
             raise FitError(f"{other.name} has step {other.step or 'recorded'}, {first.name} {first.step or 'recorded'}")
+        if other.ends != first.ends:
+            raise FitError(f"{other.name} has controls at other ends of steps than {first.name}; give all the same at")
         if other.signals != first.signals:
             raise FitError(f"{other.name} and {first.name} were read with different signals; read them together")
     if first.signals is not None:
         return first.signals
     return SignalMap(
         tuple(Signal(name, "", _field(name, f"x{i + 1}")) for i, name in enumerate(first.state_names)),
-        tuple(Signal(name, "", _field(name, f"u{j + 1}")) for j, name in enumerate(first.control_names)),
+        tuple(
+            Signal(name, "", _field(name, f"u{j + 1}"), at=first.ends[j]) for j, name in enumerate(first.control_names)
+        ),
         tuple(Signal(name, "", _field(name, f"s{j + 1}")) for j, name in enumerate(first.scheduling_names)),
         max_gap=None if np.isinf(first.max_gap) else first.max_gap,
         min_step=first.min_step,

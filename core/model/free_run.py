@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.kernel.arithmetic import blended
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, controls_as
 from uncertain_lti.signals.signal_map import Recalled
 
 LONGEST_RECURSION = 400
@@ -70,7 +70,7 @@ def free_run(model: Any, transient: Transient) -> Array:
     Returns (N+1, n): normalised; NaN where there is no run.
     """
     refuse_other(transient, Transient, "the recording", "give a Transient", ModelError)
-    transient = transient.scheduled_on([s.name for s in model.signals.scheduling])
+    transient = controls_as(transient.scheduled_on([s.name for s in model.signals.scheduling]), model.signals.controls)
     given = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
     if given != (model.n, model.m, model.q):
         raise ModelError(

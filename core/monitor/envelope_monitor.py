@@ -37,7 +37,7 @@ from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.sampling.sampler import Step, all_finite
 from uncertain_lti.sampling.status import Status
-from uncertain_lti.sampling.transient import Transient, Transitions
+from uncertain_lti.sampling.transient import Transient, Transitions, controls_as
 
 
 def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int, int]]:
@@ -386,6 +386,7 @@ class EnvelopeMonitor:
         instead = "read a recording with read_transients first, and give one after the other"
         refuse_other(transient, Transient, "the recording", instead, ModelError)
         model, point = self.model, self.model.operating_point
+        transient = controls_as(transient, model.signals.controls)
         if transient.x.shape[1] != model.n or transient.u.shape[1] != model.m:
             raise ModelError(
                 f"{transient.name}: {plural(transient.x.shape[1], 'state')} and "

@@ -28,7 +28,7 @@ from uncertain_lti.sampling.counters import INVALID, LATE, TOO_OLD
 from uncertain_lti.sampling.reading_processes import processes_for, read_streams
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.sampler import Sampler
-from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, sample_arrays
+from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, known_of_the_last, sample_arrays
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.sampling.streams import Stream, check_paths, read_stream
@@ -129,6 +129,10 @@ def sample_by_message(stream: Stream, signals: SignalMap, progress: Progress | N
             t.append(step.t_ns)
             x.append(step.x_next)
             held.append(unknown)
+    if (latest := sampler.latest()) is not None and held:
+        held[-1] = unknown.copy()
+        for position in known_of_the_last(signals):
+            held[-1][position - len(signals.states)] = latest[1][position]
     return Samples(
         np.array(t, dtype=np.int64),
         np.array(x).reshape(len(t), len(signals.states)),

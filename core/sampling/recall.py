@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,7 @@ from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.memory import Memory
-from uncertain_lti.signals.signal_map import Signal
+from uncertain_lti.signals.signal_map import Signal, with_rules
 
 Values = Array
 Mask = NDArray[np.bool_]
@@ -68,7 +67,9 @@ def with_memories(transient: Transient, memories: Mapping[str, tuple[str, Memory
     u = np.column_stack([transient.u, *columns])
     if transient.signals is not None:
         signals = replace(transient.signals, controls=(*transient.signals.controls, *added))
-        signals = replace(signals, structure=_with_rules(signals.structure, memories))
+        signals = replace(
+            signals, structure=with_rules(signals.structure, {name: of for name, (of, _) in memories.items()})
+        )
         return transient.replace(u=u, signals=signals)
     return transient.replace(u=u, control_names=(*transient.control_names, *memories))
 
@@ -89,15 +90,6 @@ def with_delays(transient: Transient, delays: Mapping[str, int]) -> Transient:
     if transient.signals is not None:
         return transient.replace(u=u, signals=replace(transient.signals, controls=tuple(controls)))
     return transient.replace(u=u)
-
-
-def _with_rules(structure: Any, memories: Mapping[str, tuple[str, Memory]]) -> Any:
-    """Rules of a signals file, with those that a signal has no effect said of its memories, too."""
-    if not isinstance(structure, list):
-        return structure
-    nothing = [r for r in structure if isinstance(r, dict) and (r.get("nominal"), r.get("half_width")) == (0, 0)]
-    more = [{**r, "from": name} for name, (of, _) in memories.items() for r in nothing if r.get("from") == of]
-    return [*structure, *more] if more else structure
 
 
 def recalled(transient: Transient) -> Transient:

@@ -296,7 +296,7 @@ class Sampler:
     A clock message opens sample k at its instant; the next accepted clock message closes it, and only then are
     u(t_k) and the states of other topics fixed: the message with the greatest stamp <= t_k among those arrived,
     ties to the latest arrival. A step is decided when its second sample opens, or, where states come from more
-    than one topic, when that sample closes. Nothing is resampled.
+    than one topic or a control at the arrival from another one, when that sample closes. Nothing is resampled.
 
     `signals`: with clock, max_gap and a time source for every topic resolved (`reading.read_transients` and the model
     file do that); `counters`: samples, gaps, resets and missing; dropped messages by status value; `late <topic>` for
@@ -313,7 +313,8 @@ class Sampler:
     _topics: dict[str, _Topic]
     _clock: _Topic
     _others: list[_Topic]
-    _one_topic: cython.bint  # all states are on the clock topic
+    _at_once: cython.bint  # the clock message carries all that the step to it needs
+    _arrivals: list[int]  # places of the controls that act as they are at the end of a step
     _clock_is_x: cython.bint
     _unknown: list[float]
     _no_state: list[float]
@@ -340,7 +341,7 @@ class Sampler:
         self._topics = {topic: _Topic(signals, topic, max_age) for topic in signals.topics}
         self._clock = self._topics[signals.clock]
         self._others = [topic for topic in self._topics.values() if topic is not self._clock]
-        self._one_topic = all(signal.topic == signals.clock for signal in signals.states)
+        self._at_once, self._arrivals = signals.decided_at_once, list(signals.arrivals)
         self._clock_is_x = self._clock.where == list(range(n))
         self._unknown, self._no_state = [math.nan] * len(signals), [math.nan] * n
         self._memories = []
@@ -413,14 +414,19 @@ class Sampler:
             state.unwrapped(message.values)
         if closing is not None:
             z = self._fix(closing, True, status is _RESET)
-            if not self._one_topic:
-                steps.append(self._step(self._open_status, closing, self._open_dt, z[: self._n]))
+            if not self._at_once:
+                at_end = self._unknown if status is _RESET else z
+                steps.append(self._step(self._open_status, closing, self._open_dt, at_end, z[: self._n]))
             self._before = z
         if opens:
             self._history = {}
-        if self._one_topic:
-            x_next = message.values if self._clock_is_x else self._states_of(message)
-            steps.append(self._step(status, message, dt, x_next))
+        if self._at_once:
+            x_next, at_end = message.values, self._unknown
+            if not self._clock_is_x:
+                at_end = self._unknown.copy()
+                self._put(state, message, at_end)
+                x_next = at_end[: self._n]
+            steps.append(self._step(status, message, dt, at_end, x_next))
         self._open, self._open_status, self._open_dt = message, status, dt
         self.counters["samples"] += 1
         if status is _GAP:
@@ -430,24 +436,22 @@ class Sampler:
         return steps
 
     @cython.cfunc
-    def _states_of(self, message: _Message) -> list[float]:
-        """States that a clock message carries (n,), NaN for the others."""
-        x = self._no_state.copy()
-        for i, value in zip(self._clock.where, message.values, strict=True):
-            if i < self._n:
-                x[i] = value
-        return x
-
-    @cython.cfunc
     def _dropped(self, status: Status, instant: cython.longlong, message: _Message) -> Step:
         self.counters[status.value] += 1
         return Step(status, instant, message.arrival, math.nan, self._unknown, self._no_state)
 
     @cython.cfunc
-    def _step(self, status: Status, message: _Message, dt: cython.double, x_next: list[float]) -> Step:
+    def _step(
+        self, status: Status, message: _Message, dt: cython.double, at_end: list[float], x_next: list[float]
+    ) -> Step:
+        """The step to a sample; at_end: z there, as far as it is known when the step is decided."""
         before = self._before
         if before is None or status is _FIRST or status is _RESET:
             before = self._unknown
+        elif self._arrivals:
+            before = list(before)
+            for i in self._arrivals:
+                before[i] = at_end[i]
         if status is _OK and not (all_finite(before) and all_finite(x_next)):
             status = _MISSING
             self.counters["missing"] += 1

@@ -45,7 +45,8 @@ class Samples:
     """Samples of one recording.
 
     `t_ns` (N,): instants, ns; `x` (N, n): states; NaN for what is missing; `held` (N, m + q): controls, then further
-    scheduling signals; those of sample k act from t[k] on, and are NaN where nothing follows that they lead to;
+    scheduling signals; those of sample k act from t[k] on, and are NaN where nothing follows that they lead to; of a
+    control at the arrival it is the value of sample k+1;
     `counters`: those of the `Sampler`.
     """
 
@@ -96,8 +97,9 @@ def decided(
 ) -> Decisions:
     """When the `Sampler` decides each clock message.
 
-    A sample is decided by its own message, or, where states span several topics, by the next one that opens a sample;
-    without a next one it is not decided. A message that is dropped is decided at once.
+    A sample is decided by its own message, or, where that lacks states or controls of its instant
+    (`SignalMap.decided_at_once`), by the next one that opens a sample; without a next one it is not decided. A message
+    that is dropped is decided at once.
 
     `topic` (messages,): as for `sample_arrays`, in any order of time; `arrival` (messages,): as for `sample_arrays`;
     `stamp` (messages,): as for `sample_arrays`; `values` (messages of the topic, signals on it): as for
@@ -112,7 +114,7 @@ def decided(
     dropped = np.ones(len(instants), dtype=bool)
     dropped[kept] = False
     by = np.arange(len(instants))  # position of the message that decides
-    if any(s.topic != signals.clock for s in signals.states):
+    if not signals.decided_at_once:
         by[kept[:-1]] = kept[1:]
         by[kept[-1:]] = len(instants)
     order = np.lexsort((np.arange(len(by)), ~dropped, by))
@@ -281,23 +283,34 @@ class _Sampling:
                 z[:, position] = recall(z[:, position], memory, dt, opens[: len(z)])
 
     def _samples(self, instants: Integers, z: Values, own: Values, opens: Mask, back: Mask) -> Samples:
-        clock, m = self.signals.clock, len(self.signals.held)
-        finite: Mask = np.asarray(np.isfinite(z).all(axis=1))
-        if all(s.topic == clock for s in self.signals.states):  # decided when the sample opens
-            count = len(instants)
-            x = np.full((count, self.n), math.nan)
-            for column, position in enumerate(self.signals.on(clock or "")):
-                if position < self.n:
-                    x[:, position] = own[:, column]
+        n, on_clock = self.n, self.signals.on(self.signals.clock or "")
+        if self.signals.decided_at_once:  # when the sample opens
+            at_end = np.full((len(instants), len(self.signals)), math.nan)
+            at_end[:, on_clock] = own
         else:
-            count = len(z)
-            x = z[:, : self.n].copy()
-        judged = ~opens[1:count]
-        self._count("missing", judged & ~(finite[: count - 1] & np.isfinite(x[1:]).all(axis=1)))
-        held = np.full((count, m), math.nan)
-        held[:-1] = z[: max(count - 1, 0), self.n :]
+            at_end = z.copy()
+            for position in self.signals.arrivals:
+                at_end[back[1 : len(z) + 1], position] = math.nan
+        count = len(at_end)
+        x, held = at_end[:, :n].copy(), np.full((count, len(self.signals.held)), math.nan)
+        held[:-1] = z[: max(count - 1, 0), n:]
+        for position in self.signals.arrivals:
+            held[:-1, position - n] = at_end[1:, position]
         held[:-1][back[1:count]] = math.nan
+        for position in known_of_the_last(self.signals):
+            held[-1:, position - n] = at_end[-1:, position]
+        finite: Mask = np.asarray(np.isfinite(x).all(axis=1))
+        known: Mask = finite[:-1] & np.isfinite(held[:-1]).all(axis=1)
+        self._count("missing", ~opens[1:count] & ~(known & finite[1:]))
         return Samples(instants[:count].copy(), x, held, self.counters)
+
+
+def known_of_the_last(signals: SignalMap) -> list[int]:
+    """Positions of the controls that the last sample of a recording has, although it is not closed."""
+    if not signals.decided_at_once:
+        return []
+    held = [i for i in signals.on(signals.clock or "") if i >= len(signals.states)]
+    return [i for i in held if signals[i].at == "departure" and not signals[i].delay and not signals[i].memory]
 
 
 def _latest(time: Integers, at: Integers, arrived: Integers) -> Integers:

@@ -16,21 +16,22 @@ import math
 import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LONGEST_S
 from uncertain_lti.sampling.counters import Counters
 from uncertain_lti.sampling.instants import median_step_ns, to_ns
 from uncertain_lti.sampling.status import Status
-from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.signal import AT, At
+from uncertain_lti.signals.signal_map import ARRIVAL, Signal, SignalMap
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,15 @@ class Transient:
     x : array (N+1, n)
         States in recorded units; NaN where a sample has none.
     u : array (N+1, m)
-        Controls in recorded units, u[k] acting from t[k] to t[k+1]; the last row is never used.
+        Controls in recorded units, u[k] recorded at t[k]. At the departure, u[k] acts from t[k] to t[k+1], and the last
+        row is never used.
     s : array (N+1, q), optional
         Further scheduling signals in recorded units, which are neither state nor control; s[k] is known at t[k], and
         the last row is never used. Default none.
+    at : {"departure", "arrival", "both"} or mapping, optional
+        Which recorded value of a control acts during the step from t[k] to t[k+1]: u[k], u[k+1], or each of them by a
+        column of its own, the second named "NAME at arrival"; for all controls, or by name. Default that of `signals`,
+        whose recordings are read so, else departure.
     name : str, default "transient"
         What messages call this run (the bag or file).
     signals : SignalMap, optional
@@ -123,6 +129,7 @@ class Transient:
         u: ArrayLike,
         *,
         s: ArrayLike | None = None,
+        at: At | Mapping[str, At] = "departure",
         name: str = "transient",
         signals: SignalMap | None = None,
         state_names: Sequence[str] | None = None,
@@ -146,6 +153,9 @@ class Transient:
         self.state_names = _names(state_names, signals.states if signals else None, "x", self.x, name)
         self.control_names = _names(control_names, signals.controls if signals else None, "u", self.u, name)
         self.scheduling_names = _names(scheduling_names, signals.scheduling if signals else None, "s", self.s, name)
+        self.ends: tuple[At, ...] = (
+            tuple(c.at for c in signals.controls) if signals else ("departure",) * self.u.shape[1]
+        )
         self.counters = Counters(counters or {})
         self.sources = tuple(os.fspath(s) for s in sources)
         self.notes = tuple(notes)
@@ -169,8 +179,50 @@ class Transient:
         self.t_ns = t_ns
         if len(kept) < len(t_ns):
             self.t_ns, self.x, self.u, self.s = t_ns[kept], self.x[kept], self.u[kept], self.s[kept]
+        self._take_controls(_ends_of(at, self))
         for array in (self.t_ns, self.x, self.u, self.s, self.segment):
             array.flags.writeable = False
+
+    def _take_controls(self, wanted: Sequence[At]) -> None:
+        """Form u, its names and ends from controls at the departure, one end of each."""
+        if tuple(wanted) == self.ends:
+            return
+        columns, names, ends = list[Array](), list[str](), list[At]()
+        for column, name, end, asked in zip(self.u.T, self.control_names, self.ends, wanted, strict=True):
+            for one in ("departure", "arrival") if asked == "both" else (asked,):
+                later = one == "arrival" != end
+                columns.append(np.append(column[1:], math.nan) if later else column)
+                names.append(name + ARRIVAL if asked == "both" and later else name)
+                ends.append(one)
+        self.u, self.control_names, self.ends = np.column_stack(columns), tuple(names), tuple(ends)
+
+    def controls_at(self, at: At | Mapping[str, At]) -> Transient:
+        """The same run with controls at the departure of each step taken at its arrival, or at both ends.
+
+        Parameters
+        ----------
+        at : {"departure", "arrival", "both"} or mapping
+            For all controls for which that can be, which are neither delayed nor memories nor at the arrival already;
+            or by name.
+
+        Returns
+        -------
+        Transient
+            Its `signals`, if it has some, say the same.
+
+        Raises
+        ------
+        TransientError
+            There is no such control, or it cannot be taken there.
+        """
+        wanted = _ends_of(at, self)
+        changed = self.replace()
+        if self.signals is not None:
+            controls = [replace(c, at=end) for c, end in zip(self.signals.controls, wanted, strict=True)]
+            changed.signals = replace(self.signals, controls=tuple(controls))
+        changed._take_controls(wanted)
+        changed.u.flags.writeable = False
+        return changed
 
     def replace(self, part: slice = slice(None), **changes: Any) -> Transient:
         """The same run, or a part of it, with some constructor arguments replaced.
@@ -205,7 +257,12 @@ class Transient:
         if changes.get("signals") is not None:  # it has the names
             for which in ("state_names", "control_names", "scheduling_names"):
                 arguments[which] = changes.get(which)
-        return Transient(self.t_ns[part], x, u, **arguments)
+        changed = Transient(self.t_ns[part], x, u, **arguments)
+        if changed.signals is None:
+            changed.ends = tuple(
+                dict(zip(self.control_names, self.ends, strict=True)).get(n, "departure") for n in changed.control_names
+            )
+        return changed
 
     def scheduled_on(self, names: Collection[str]) -> Transient:
         """The same run without the further scheduling signals that are not named.
@@ -461,6 +518,42 @@ class Transient:
         z = np.column_stack(chosen)
         split = 1 + len(states)
         return cls(z[:, 0], z[:, 1:split], z[:, split:], state_names=states, control_names=controls, **options)
+
+
+def _ends_of(at: At | Mapping[str, At], transient: Transient) -> tuple[At, ...]:
+    """For each control of a run at which end it is to be taken; one that is at the arrival stays there."""
+    names, listed = transient.control_names, transient.signals.controls if transient.signals else ()
+    chosen = at if isinstance(at, Mapping) else {}
+    for name, end in chosen.items() if isinstance(at, Mapping) else [("", at)]:
+        if end not in AT:
+            raise TransientError(f"{transient.name}: at is {end!r}; it must be departure, arrival or both")
+        if name and name not in names:
+            there = ", ".join(names) or "none"
+            raise TransientError(
+                f"{transient.name}: there is no control '{name}'{meant(name, names)}; there are {there}"
+            )
+    found = list(transient.ends)
+    for j, name in enumerate(names):
+        bound = listed[j].delay or listed[j].memory if listed else None
+        if name in chosen and chosen[name] != found[j] and (bound or found[j] == "arrival"):
+            why = "is delayed, or taken from earlier samples" if bound else "is at the arrival"
+            raise TransientError(f"{transient.name}: control '{name}' {why}; read it at the departure")
+        if name in chosen or not (isinstance(at, Mapping) or bound or found[j] == "arrival" or name + ARRIVAL in names):
+            found[j] = chosen[name] if isinstance(at, Mapping) else at
+    return tuple(found)
+
+
+def controls_as(transient: Transient, controls: Sequence[Signal]) -> Transient:
+    """A run with its controls at the ends at which a model takes them, if it has each of them at the departure."""
+    wanted = list[At]()
+    for control in controls:
+        if wanted and control.at == "arrival" and control.name.endswith(ARRIVAL) and wanted[-1] == "departure":
+            wanted[-1] = "both"
+        else:
+            wanted.append(control.at)
+    if transient.ends == tuple(c.at for c in controls) or len(wanted) != len(transient.ends):
+        return transient
+    return transient.controls_at(dict(zip(transient.control_names, wanted, strict=True)))
 
 
 def listed_transients(given: Transient | Iterable[Transient]) -> list[Transient]:

@@ -25,7 +25,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.transient import Transient, listed_transients
+from uncertain_lti.sampling.transient import Transient, controls_as, listed_transients
 from uncertain_lti.validation.blocks import BLOCKS, block_spans, cut, guard_interval, remaining_spans
 from uncertain_lti.validation.extrapolation import Reach
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
@@ -60,7 +60,8 @@ def validate(
         full = fit(transients, weights=weights, operating_point=operating_point, alarm_rule=alarm_rule, **options)
     elif alarm_rule is not None:
         full = full.replace(alarm_rule=alarm_rule)
-    transients = [t.scheduled_on([s.name for s in full.signals.scheduling]) for t in transients]
+    further = [s.name for s in full.signals.scheduling]
+    transients = [controls_as(t.scheduled_on(further), full.signals.controls) for t in transients]
     options["schedule"] = full.schedule or {}  # none, even where the signals file asks for one
     options["horizons"] = [horizon.steps for horizon in full.horizons]
     options["widths"] = {horizon.steps: horizon.widths for horizon in full.horizons}
