@@ -205,11 +205,11 @@ def test_what_cannot_be_deployed_is_refused(machine, command, options, words, ca
 
 
 def test_a_looped_recording_starts_the_grace_over():
-    """Of arrays: the alarm may count again after the grace, in each pass."""
+    """Of arrays: in each pass the alarm may count again after the grace, from the pass's second sample on."""
     t_ns = np.array([0, 1, 2, 3, 0, 1, 2, 3], dtype=np.int64) * 10**9
     armed = Arming(None, 2 * 10**9).over(t_ns)
-    assert armed.counts.tolist() == [False, False, True, True, False, False, True, True]
-    assert armed.cleared.tolist() == [True, True, False, False, True, True, False, False]
+    assert armed.counts.tolist() == [False, False, True, True, True, False, True, True]
+    assert armed.cleared.tolist() == [True, True, False, False, False, True, False, False]
     condition = Condition.parse("/mode data == 1")
     armed = Arming(condition, 0).over(t_ns[:4], [1, 3, 3], [1.0, 0.0, 1.0])
     assert armed.counts.tolist() == [False, True, True, True]

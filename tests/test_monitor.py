@@ -194,8 +194,9 @@ def test_verdicts_are_those_of_the_rules_worked_out_naively(case: tuple[Uncertai
     recent: deque[bool] = deque(maxlen=rule.window)
     alarm = False
     for k, status in enumerate(transient.statuses()):
-        if status is Status.RESET:
-            recent.clear()
+        t = [-(2**63), *transient.t_ns.tolist()]  # before the first sample nothing steps back
+        if k >= 2 and t[k] < t[k - 1] and t[k + 1] <= t[k - 1] and (k == 2 or t[k] <= t[k - 2]):
+            recent.clear()  # the two last samples lie before the one that came before them
             alarm = False
         assert verdicts.judged[k] == (status is Status.OK)
         if status is Status.OK:
@@ -257,8 +258,8 @@ def test_silence_is_never_contained_and_ends_no_alarm() -> None:
         verdict = monitor.judge(a_step(0.0, 0.0, status))
         assert verdict.alarm and not verdict.judged
         assert all(np.isnan(part).all() for part in (verdict.flags, verdict.lower, verdict.upper, verdict.utilisation))
-    assert not monitor.judge(Step(Status.RESET, -(10**10), 0, 1.0, [0.0], [0.0])).alarm
-    assert not monitor.judge(a_step(0.0, 0.5)).alarm
+    assert monitor.judge(Step(Status.RESET, -(10**10), 0, 1.0, [0.0], [0.0])).alarm
+    assert not monitor.judge(Step(Status.OK, 1 - 10**10, 0, 1.0, [0.0], [0.5])).alarm
 
 
 def test_outside_the_fitted_domain_is_said_and_suppresses_nothing() -> None:

@@ -23,7 +23,7 @@ from perturbed import CONTROL, EPOCH_NS, STATE, STEP_NS, Message, joint_state, s
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.model.alarm_rule import KINDS, AlarmRule
 from uncertain_lti.model.horizon import Horizon
-from uncertain_lti.monitor.session import Rule
+from uncertain_lti.monitor.session import ERROR, Rule
 from uncertain_lti.sampling.status import Status
 
 COUNTS = {perturbed.in_disorder: 40, perturbed.of_a_swapped_model: 20, perturbed.held_up_on_the_way: 8}
@@ -118,20 +118,40 @@ def test_a_rule_over_a_horizon_stays_quiet_in_a_segment_without_a_verdict() -> N
     assert verdicts.alarm.tolist() == [False] * 8 + [True] * 2
 
 
+@pytest.mark.parametrize("off", [2, -2])
 @pytest.mark.parametrize("every", [13, 45, 90])
-def test_single_stamps_ahead_neither_clear_an_alarm_nor_restart_the_grace(every: int, tmp_path: Path) -> None:
-    """A fault that lasts, with one stamp 2 s ahead now and then: live and offline the alarm stays on."""
-    model = plain()
-    rule = Rule(grace=0.5, violations=2, window=5)
-    messages = []
+def test_single_stamps_far_off_neither_clear_an_alarm_nor_restart_the_grace(
+    every: int, off: int, tmp_path: Path
+) -> None:
+    """A fault that lasts, with one stamp 2 s ahead or behind now and then: the alarm stays on, and is told as one."""
+    model, rule, messages = plain(), Rule(grace=0.5, violations=2, window=5), list[Message]()
     for k in range(400):
         t = EPOCH_NS + k * STEP_NS
-        stamp = t + 2 * 10**9 if k % every == every - 1 else t
+        stamp = t + off * 10**9 if k % every == every - 1 else t
         messages.append(Message(CONTROL, t - 1000, vector(t, 0.0, 0.0, 0.0)))
         messages.append(Message(STATE, t, joint_state(stamp, [0.3 + 0.4 * (-1) ** k, -0.2])))
-    ours = perturbed.live(session_of(model, rule), messages)
+    session = session_of(model, rule)
+    ours = perturbed.live(session, messages[:120])
+    for one in messages[120:]:
+        ours += perturbed.live(session, [one])
+        assert session.report(0.0, 1.0)[0].level == ERROR and session.reason(0.0, 1.0).startswith("alarm: ")
     theirs = perturbed.offline(model, rule, messages, tmp_path / "run.mcap")
     assert not perturbed.difference(ours, theirs)
     alarm = [row["alarm"] for row in ours]
     assert not any(alarm[:50]) and all(alarm[60:]), sum(alarm)
-    assert sum(row["status"] is Status.RESET for row in ours) == 400 // every - (400 % every == 0)
+    assert sum(row["status"] is Status.RESET for row in ours) == 400 // every
+
+
+def test_a_loop_starts_alarm_and_grace_over_from_its_first_sample(tmp_path: Path) -> None:
+    """Known at the second: until then the step back may be one stamp that lay behind."""
+    model, rule = plain(), Rule(grace=0.5, violations=1, window=1)
+    messages = [
+        replace(m, log_time=m.log_time + 10**9 * i)
+        for i in range(2)
+        for k in range(80)
+        for m in both(k, 0.3 + 0.4 * (-1) ** k)
+    ]
+    ours = perturbed.live(session_of(model, rule), messages)
+    assert not perturbed.difference(ours, perturbed.offline(model, rule, messages, tmp_path / "run.mcap"))
+    alarm = [row["alarm"] for row in ours]
+    assert alarm == [False] * 50 + [True] * 31 + [False] * 49 + [True] * 30

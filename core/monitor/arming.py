@@ -74,18 +74,21 @@ class Condition:
 
 
 def steps_back(instant: int, last: int, before: int) -> bool:
-    """Whether time steps back at an instant, from the last one and the one before it.
+    """Whether an instant lies before the last one and not after the one before it.
 
-    A step back to later than that returns from one stamp that lay ahead: a single outlier, and no time stepped back.
+    A step back to later than that returns from one stamp that lay ahead. Time has stepped back once the next instant
+    is not after the last one either; otherwise this was one stamp that lay behind. Neither outlier ends anything.
     """
     return instant < last and instant <= before
 
 
-def restarts(t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """`steps_back` at each sample (N+1,)."""
+def back_and_restarts(t_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """`steps_back` at each sample (N+1,), and whether time has stepped back to the one before and stays there."""
     back = np.diff(t_ns, prepend=t_ns[:1]) < 0
     back[2:] &= t_ns[2:] <= t_ns[:-2]
-    return back
+    restarts = np.zeros(len(t_ns), dtype=bool)
+    restarts[2:] = back[1:-1] & (t_ns[2:] <= t_ns[:-2])
+    return back, restarts
 
 
 class Armed(NamedTuple):
@@ -117,6 +120,7 @@ class Arming:
             self.on = condition.holds(value)
         self._grace = grace_ns
         self._from: int | None = None  # the first instant that counts
+        self._counted = False  # whether the last instant did
 
     def learn(self, value: float) -> None:
         """Take a value of the condition's field."""
@@ -133,17 +137,22 @@ class Arming:
         )  # fmt: skip
         return self.value if same else None
 
-    def restart(self) -> None:
-        """The next sample is the first."""
-        self._from = None
-
-    def at(self, t_ns: int) -> bool:
-        """Whether a verdict at this instant counts."""
-        if not self.on:
-            return False
-        if self._from is None:
+    def restart(self, t_ns: int | None = None) -> None:
+        """The sample at this instant was the first; None for the next."""
+        if t_ns is None:
+            self._from = None
+        elif self._from is not None:
             self._from = t_ns + self._grace
-        return t_ns >= self._from
+
+    def at(self, t_ns: int, steps_back: bool = False) -> bool:
+        """Whether a verdict at this instant counts; as the last one if it steps back, perhaps alone."""
+        if not self.on:
+            self._counted = False
+        elif not steps_back:
+            if self._from is None:
+                self._from = t_ns + self._grace
+            self._counted = not self._grace or t_ns >= self._from
+        return self._counted
 
     def over(
         self,
@@ -162,15 +171,15 @@ class Arming:
         counts, cleared = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         arrived = zip(np.asarray(before).tolist(), np.asarray(values, dtype=np.float64).tolist(), strict=True)
         due, value = next(arrived, (count, 0.0))
-        back = restarts(t_ns).tolist()
+        back, restarts = (marks.tolist() for marks in back_and_restarts(t_ns))
         for k, instant in enumerate(t_ns.tolist()):
             while due <= k:
                 self.learn(value)
                 cleared[k] |= not self.on
                 due, value = next(arrived, (count, 0.0))
-            if back[k]:
-                self.restart()
-            counts[k] = self.at(instant)
+            if restarts[k]:
+                self.restart(int(t_ns[k - 1]))
+            counts[k] = self.at(instant, back[k])
         return Armed(counts, cleared | ~counts)
 
     def why_off(self) -> str:

@@ -30,7 +30,7 @@ from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.repeats import walk
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, residual_row
-from uncertain_lti.monitor.arming import Armed, restarts, steps_back
+from uncertain_lti.monitor.arming import Armed, back_and_restarts, steps_back
 from uncertain_lti.monitor.foreseen import Foreseen
 from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Partly, needs
 from uncertain_lti.monitor.verdict import Verdict
@@ -43,7 +43,7 @@ from uncertain_lti.sampling.transient import Transient, Transitions, controls_as
 def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int, int]]:
     """[start, stop) of samples over which the alarm goes on from a cleared one; others raise none."""
     count = len(t_ns)
-    cleared = restarts(t_ns)
+    _, cleared = back_and_restarts(t_ns)
     counts = np.ones(count, dtype=bool)
     if armed is not None:
         counts, cleared = armed.counts, cleared | armed.cleared
@@ -54,6 +54,7 @@ def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int
 
 
 _OK, _RESET = Status.OK, Status.RESET  # an enum looks its members up at each use
+_BEYOND_NS = 2**63 - 1  # later than any instant
 
 
 @cython.cfunc
@@ -117,8 +118,9 @@ class EnvelopeMonitor:
     _nothing: Any
     _own: Any
     _frozen_alarm: cython.bint
-    _last_ns: cython.longlong  # instants of the last two samples; at first beyond any
+    last_ns: int = cython.declare(cython.longlong, visibility="readonly")
     _before_ns: cython.longlong
+    _back_from_ns: cython.longlong
     _shortest: cython.double
     _longest: cython.double
 
@@ -157,7 +159,8 @@ class EnvelopeMonitor:
         self._runs = model.runs_of(self._judge)
         self._nothing = None if self._runs is None else np.full(model.n * len(model.horizons), np.nan)
         self.frozen_watch = self._watch()
-        self._last_ns = self._before_ns = 2**63 - 1
+        self.last_ns = self._before_ns = _BEYOND_NS  # instants of the last two samples
+        self._back_from_ns = -_BEYOND_NS  # the one before these, if the last one stepped back from it
         self._frozen_alarm = False
         self._own = np.diagonal(model.A).tolist() if model.schedule is None else None
         self._shortest, self._longest = model.sampling.step_range
@@ -285,8 +288,8 @@ class EnvelopeMonitor:
         """
         return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
-    def starts_over(self, step: Step) -> bool:
-        """Whether the alarm starts over with a step: time stepped back, and not from a single stamp ahead.
+    def steps_back(self, step: Step) -> bool:
+        """Whether time steps back with a sample that `judge` has not taken yet.
 
         Parameters
         ----------
@@ -296,9 +299,24 @@ class EnvelopeMonitor:
         Returns
         -------
         bool
-            Before `judge` has taken the step.
+            Perhaps with this one alone, an outlier.
         """
-        return step.status is _RESET and steps_back(step.t_ns, self._last_ns, self._before_ns)
+        return step.status is _RESET and steps_back(step.t_ns, self.last_ns, self._before_ns)
+
+    def starts_over(self, step: Step) -> bool:
+        """Whether the alarm starts over at a sample that `judge` has not taken yet.
+
+        Parameters
+        ----------
+        step : Step
+            Of the sampler.
+
+        Returns
+        -------
+        bool
+            Time stepped back before it, and stays there.
+        """
+        return self._back_from_ns > -_BEYOND_NS and not step.status.dropped and step.t_ns <= self._back_from_ns
 
     def judge(self, step: Step, armed: bool = True) -> Verdict:
         """Verdict on one step of the sampler.
@@ -321,7 +339,8 @@ class EnvelopeMonitor:
             self._frozen_alarm = False
         withheld: tuple[int, ...] = ()
         if step.status is _OK or not step.status.dropped:
-            self._before_ns, self._last_ns = self._last_ns, step.t_ns
+            self._back_from_ns = self.last_ns if self.steps_back(step) else -_BEYOND_NS
+            self._before_ns, self.last_ns = self.last_ns, step.t_ns
         judgement, status, looked = None, step.status, None
         if status is _OK:
             if not self._shortest <= step.dt <= self._longest:

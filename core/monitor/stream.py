@@ -43,7 +43,7 @@ SHOWN = 5
 FUTURE = 1.0
 """s that a stamp may be ahead of the clock before it is reported."""
 
-_OK, _RESET = Status.OK, Status.RESET  # looking up one of an enumeration is slow
+_OK = Status.OK  # looking up one of an enumeration is slow
 _FUTURE_NS = to_ns(FUTURE)
 _NOTHING: tuple[Verdict, ...] = ()
 
@@ -417,10 +417,13 @@ class Stream:
         verdicts = []
         for step in sampler.push(topic, arrival_ns, stamp_ns, values):
             before = self.alarm
-            if step.status is _RESET and self.monitor.starts_over(step):
-                self.arming.restart()
+            if self.monitor.starts_over(step):
+                self.arming.restart(self.monitor.last_ns)
             # a dropped message is no sample and changes nothing; asking every status for that would cost more
-            armed = (step.status is not _OK and step.status.dropped) or self.arming.at(step.t_ns)
+            if step.status is _OK:
+                armed = self.arming.at(step.t_ns)
+            else:
+                armed = step.status.dropped or self.arming.at(step.t_ns, self.monitor.steps_back(step))
             verdict = self.monitor.judge(step, armed)
             self.latched = self.latched or (self.rule.latch and verdict.alarm)
             verdicts.append(verdict)
