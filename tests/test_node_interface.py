@@ -429,6 +429,25 @@ def test_messages_that_are_lost_on_the_way_are_counted_and_never_bridged(world: 
             assert values[f"lost {topic}"] == str(status["lost"][topic]) == str(told(topic))
 
 
+def test_messages_that_full_queues_push_out_are_counted(world: World, tmp_path: Path) -> None:
+    model = by_hand()
+    process = world.monitor(saved(model, tmp_path), **{"qos.depth": 5})
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    plant = Plant(world, model).subscribed()
+    plant.send(20)
+    flags.count(20)
+    process.signal(signal.SIGSTOP)
+    try:
+        plant.send(100)
+    finally:
+        process.signal(signal.SIGCONT)
+    plant.send(5)
+    until(lambda: flags.messages and stamp_of(flags.messages[-1]) == plant.t_ns - STEP_NS, "the last verdict")
+    status = world.status()
+    for topic in (STATE, CONTROL):
+        assert status["lost"][topic] > 50 and status["received"][topic] + status["lost"][topic] == 125
+
+
 # --- what a user gives --------------------------------------------------------------------------------------
 
 

@@ -52,9 +52,7 @@ def _load(file: Path) -> UncertainLTI:
     try:
         return loaded.result(_PATIENCE)
     except TimeoutError:
-        raise ModelError(
-            f"{file}: cannot be read within {_PATIENCE:g} s; copy it to a disk of this machine"
-        ) from None
+        raise ModelError(f"{file}: cannot be read within {_PATIENCE:g} s; copy it to a disk of this machine") from None
 
 
 def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | None = None) -> Session:

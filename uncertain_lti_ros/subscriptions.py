@@ -89,8 +89,12 @@ class MatchedSubscription:
     `node`: the node; `topic`: as in the model or on the command line; expanded and remapped by the node; `type_name`:
     `pkg/msg/Type`; `message_class`: class of the type; `callback`: takes the message, or its bytes when raw;
     `requested`: what the user requests; `raw`: whether the callback takes bytes; `received, lost, late`: messages
-    received, those that the middleware reports as lost, and deadlines missed by publishers; `publishers`: publishers of
-    this type that the graph knows; `problems`: publishers that cannot be heard and why, one sentence each.
+    received, those lost on the way or in the queue, and deadlines missed by publishers; `last`: the last message;
+    `publishers`: publishers of this type that the graph knows; `problems`: publishers that cannot be heard and why, one
+    sentence each.
+
+    The middleware reports what its writer gives up, and not what full queues of this reader push out; the numbers that
+    a publisher gives its messages show both, as long as it is the only one.
     """
 
     def __init__(
@@ -106,7 +110,11 @@ class MatchedSubscription:
         self._node, self._asked_topic, self.type_name = node, topic, full_name(type_name)
         self._class, self._callback, self._requested, self._raw = message_class, callback, requested, raw
         self.topic: str = node.resolve_topic_name(topic)
-        self.received = self.lost = self.late = self.publishers = 0
+        self.received = self.late = self.publishers = 0
+        self.last: Any = None
+        self._reported_lost = self._skipped = 0  # as the middleware has it, and by the numbers of the messages
+        self._number: int | None = None  # of the last message
+        self._alone = False  # one publisher sends all messages since that one
         self.problems: list[str] = []
         self.look_soon = False
         self._published: float | None = None  # since when there are publishers, steady time in s
@@ -119,6 +127,11 @@ class MatchedSubscription:
         return 0.0 if self.received or self._published is None else time.monotonic() - self._published
 
     @property
+    def lost(self) -> int:
+        """Messages lost on the way or in the queue; those that both ways of counting show count once."""
+        return max(self._reported_lost, self._skipped)
+
+    @property
     def qos(self) -> QoSProfile:
         """What is asked of publishers now."""
         return self._qos
@@ -129,6 +142,9 @@ class MatchedSubscription:
         infos = self._node.get_publishers_info_by_topic(self._asked_topic)
         offers = [i.qos_profile for i in infos if i.topic_type == self.type_name]
         self.publishers = len(offers)
+        if not self._alone:
+            self._number = None
+        self._alone = len(offers) == 1
         if not offers:
             self._published = None
         elif self._published is None:
@@ -170,20 +186,35 @@ class MatchedSubscription:
             message_lost=self._lost,
             deadline=self._missed,
         )
+        self._number = None
         self._subscription = self._node.create_subscription(
             self._class, self._asked_topic, self._take, qos, event_callbacks=events, raw=self._raw
         )
+        # so that the message comes with its number; the events executor of Jazzy then gives both as one argument
+        self._subscription._callback_type = Subscription.CallbackType.WithMessageInfo
         self._events = PolledEvents(self._node, self._subscription)
 
-    def _take(self, message: Any) -> None:
-        self.received += 1
+    def _take(self, *given: Any) -> None:
+        message, info = given if len(given) == 2 else given[0]
+        self.received, self.last = self.received + 1, message
+        number, before = info["publication_sequence_number"], self._number
+        if before is not None and number is not None and number != before + 1:
+            self._count_skipped(number - before - 1)
+        self._number = number
         self._callback(message)
 
+    def _count_skipped(self, skipped: int) -> None:
+        """Take a jump in the numbers of messages; it says nothing if they fall, or come from several publishers."""
+        if skipped < 0:
+            self._alone = False
+        elif self._alone:
+            self._skipped += skipped
+
     def _changed(self, _: Any) -> None:
-        self.look_soon = True
+        self.look_soon, self._alone = True, False
 
     def _missed(self, event: Any) -> None:
         self.late += event.total_count_change
 
     def _lost(self, event: Any) -> None:
-        self.lost += event.total_count_change
+        self._reported_lost += event.total_count_change
