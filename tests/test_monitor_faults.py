@@ -892,15 +892,37 @@ def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_i
     diagnostics = world.diagnostics()
     first = world.start("first", "-c", _LEAVES)
     first.says("publishes")
-    assert world.set(enable="/machine/mode data == 3") == (True, "")
+    assert world.set(enable="/machine/mode data == 3")[0]
     first.succeed()
     mode = world.publisher(UInt8, "/machine/mode", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
     mode.publish(UInt8(data=3))
     until(lambda: world.status()["armed"], "the mode of another type", patience=30.0)
     before = diagnostics.count
-    assert world.set(enable="/machine/mod data == 3") == (True, "")
-    diagnostics.reaches(STALE, saying="nobody publishes /machine/mod, which parameter enable names", since=before)
+    nobody = "nobody publishes /machine/mod, which parameter enable names"
+    assert world.set(enable="/machine/mod data == 3") == (True, nobody)
+    diagnostics.reaches(STALE, saying=nobody, since=before)
     process.says("nobody publishes /machine/mod,")
+    assert world.set(enable="/machine/mod data == 3", enable_type="std_msgs/msg/UInt8") == (True, nobody)
+    Plant(world, model).subscribed().send(3)
+    until(lambda: world.status()["received"][STATE] == 3, "the samples")
+    accepted = world.set(enable=f"{STATE} position[c] > 0", enable_type="")
+    assert accepted == (True, f"parameter enable: {STATE} comes without a number in position[c]")
+    assert world.set(enable=f"{STATE} position[b] > -9") == (True, "")
+
+
+def test_a_monitor_that_comes_back_and_hears_nothing_says_so_while_it_lasts(world: World, tmp_path: Path) -> None:
+    """After kill -9 the middleware may deliver nothing for a while: each time there are verdicts or a word on it."""
+    model = by_hand()
+    path = saved(model, tmp_path)
+    plant, diagnostics = Plant(world, model), world.diagnostics()
+    for _ in range(4):
+        process = world.monitor(path, diagnostics_period=0.1)
+        before, until_s = diagnostics.count, time.monotonic() + 8.0
+        while time.monotonic() < until_s and not world.status()["verdicts"]:
+            plant.send(20)
+        if not world.status()["verdicts"]:
+            diagnostics.reaches(STALE, saying="nothing", since=before)  # received in 5 s, or ever received
+        process.kill()
 
 
 def test_publishers_that_nothing_comes_from_are_told(world: World, tmp_path: Path) -> None:

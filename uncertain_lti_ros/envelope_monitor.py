@@ -177,6 +177,13 @@ class EnvelopeMonitorNode(LifecycleNode):
             return SetParametersResult(successful=False, reason=f"unexpected: {error!r}")
         return SetParametersResult(successful=True)
 
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """As of `Node`; what is accepted and may keep alarms off is the reason of the answer."""
+        result = super().set_parameters_atomically(parameter_list)
+        if result.successful and any(parameter.name == "enable" for parameter in parameter_list):
+            result.reason = self._enable_problem
+        return result
+
     def _on_have_set(self, parameters: Sequence[Parameter]) -> None:
         self.settings.changed()
         self._look_at_clock()
@@ -405,14 +412,14 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _find_enable_type(self) -> None:
         session = self.session
         self._enable_problem = ""
-        if session is None or not self.active or not session.enable_topic or session.enable_type_is_given:
+        if session is None or not self.active or not session.enable_topic:
             return
         infos = self.get_publishers_info_by_topic(self._there(session.enable_topic))
         found = [info.topic_type for info in infos]
         if not infos:
-            if not session.enable_type:
+            if session.heard(session.enable_topic) is None:
                 self._enable_problem = f"nobody publishes {session.enable_topic}, which parameter enable names"
-        elif session.enable_type not in found:
+        elif session.enable_type not in found and not session.enable_type_is_given:
             try:
                 session.found_enable_type(found[0])
             except UncertainLTIError as error:
@@ -423,6 +430,9 @@ class EnvelopeMonitorNode(LifecycleNode):
                 return  # the middleware takes no other type before it has let go of the former subscription
         if session.enable_type and session.enable_topic not in self.inputs:
             self.subscribe()
+        heard = self.inputs.get(session.enable_topic)
+        if heard is not None and heard.last is not None and (why := session.why_no_condition(heard.last)):
+            self._enable_problem = f"parameter enable: {why}"
 
     def _keep_reason(self) -> None:
         """Publish ~/reason also while nobody subscribes, for whoever will, and where nothing comes any more."""

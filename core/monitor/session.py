@@ -26,6 +26,7 @@ from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.monitor.reason import WHY
 from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream
 from uncertain_lti.monitor.stream import topic_types as topic_types
+from uncertain_lti.recordings.message_reader import UnreadableError
 from uncertain_lti.sampling.counters import MISSING, TOO_OLD, Counters
 from uncertain_lti.sampling.status import Status
 
@@ -131,6 +132,16 @@ class Session(Stream):
         why = f"no message on {self.sampler.clock}" if silent else "no sample could be judged"
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
+
+    def why_no_condition(self, data: bytes) -> str:
+        """Why a message of the enable condition's topic says nothing on it, in words; empty if it does."""
+        condition = self.arming.condition
+        assert condition is not None
+        try:
+            (value,) = self._condition_reader(condition, self.enable_type).read(data)[1]
+        except UnreadableError as error:
+            return f"{condition.topic}: a message {error}"
+        return "" if value == value else f"{condition.topic} comes without a number in {condition.field.text}"
 
     def likeness(self) -> Likeness | None:
         """What the alarm that is on, or was on last, looks like."""
