@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -37,10 +36,7 @@ from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.horizon_rule import HorizonRule, WidthChoice
 from uncertain_lti.signals.signal_map import SignalMap
-from uncertain_lti.validation.monitor_fit import fit_monitored
-
-NARROWER = 0.75
-"""A drift that nobody asks for is fitted if the mean width shrinks to this share, the geometric mean over states."""
+from uncertain_lti.validation.monitor_fit import choose_monitored
 
 
 def fit(
@@ -82,15 +78,17 @@ def fit(
     transients : Transient or sequence of Transient
         Recordings, of any lengths, of the same states and controls; never joined to one another.
     criterion : {"qp", "lp"}, optional
-        Eq. (10) or eq. (11). Default: the one whose panel sees the smaller jumps on what was left out.
+        Eq. (10) or eq. (11). Default: (11), or (10) if its panel sees clearly smaller jumps (0.9 of the size, geometric
+        mean over the states, on what was fitted and on what was left out).
     weights : array (n,), (N, n), (N, n, n), or a list with one of the latter two per transient, optional
         W(t_{k+1}) for step k of N; positive; full matrices symmetric positive definite. Off-diagonal elements
         couple the rows in (10); (11) uses the diagonal. Default ones.
     additive : {"none", "disturbance", "noise", "both"}, optional
         Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise). Default:
-        that of the signals file, else noise, and the drift where it narrows the envelope clearly.
+        that of the signals file, else noise, or both chosen in the same way.
     operating_point : OperatingPoint, optional
-        Steady state and scales; default: those of the transients' signals, or values used as they are.
+        Steady state and scales; default: those of the transients' signals, or values used as they are; where criterion
+        and additive are left open too, the medians are tried as steady state with (10) and both terms.
     transient_weights : sequence of float, optional
         One factor per transient on the weights of all its samples.
     count : {"sample", "transient"}
@@ -231,15 +229,22 @@ def fit(
     shape["transient_weights"] = transient_weights
     said: dict[str, Any] = {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
     if alarm == "panel" and method == "working-set":
-        if additive is None and not asked:
-            options["additive"] = _terms(transients, {**options, **shape})
-        tried = [
-            fit_monitored(
-                transients, groups=groups, false_alarms=false_alarms, **{**options, **shape, "criterion": one}, **said
-            )
+        ways: list[dict[str, Any]] = [
+            {"criterion": one, "additive": terms}
+            for terms in ((additive,) if additive else ("noise",) if asked else ("noise", "both"))
             for one in ((criterion,) if criterion else ("lp", "qp"))
         ]
-        model = min(tried, key=lambda way: math.inf if way.panel is None else way.panel.figure).finished()
+        if len(ways) > 2 and operating_point is None:
+            ways.append({"criterion": "qp", "additive": "both", "centred": True})
+        taken = choose_monitored(
+            transients, ways, groups=groups, false_alarms=false_alarms, **{**options, **shape}, **said
+        )
+        model = taken.finished()
+        if taken.centred:
+            messages.append(
+                "deviations are measured from the medians of the recordings, where the alarm sees clearly smaller "
+                "jumps; an operating point, criterion or additive term given by hand keeps the steady state"
+            )
     else:
         model = fitting.fit(transients, **options, **shape, **said)
         if not isinstance(alarm, str):
@@ -259,18 +264,6 @@ def fit(
         there = model.fit_summary.get("messages", [])
         model = model.replace(fit_summary={**model.fit_summary, **added, "messages": [*there, *messages]})
     return model
-
-
-def _terms(transients: Sequence[Transient], options: Mapping[str, Any]) -> Additive:
-    """Noise; or both, where a drift narrows the envelope clearly."""
-    widths = []
-    for additive in ("noise", "both"):
-        try:
-            model = fitting.fit(transients, **{**options, "additive": additive}, describe_data=False)
-        except FitError:
-            return "noise"  # what is wrong with the recordings is said of the fit itself
-        widths.append(np.log(np.maximum(model.fit_summary["mean_width"], 1e-300)).mean())
-    return "both" if widths[1] < widths[0] + math.log(NARROWER) else "noise"
 
 
 def asked_for(

@@ -27,11 +27,9 @@ from uncertain_lti.proposal import ways
 from uncertain_lti.proposal.fitting import fit
 from uncertain_lti.proposal.ways import Setting
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.validation.monitor_fit import fit_monitored
+from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored
 from uncertain_lti.validation.panel import worth
 
-CLEARLY = 0.9
-"""Jumps that a way must see, over those of what it is tried beside, to be taken: the geometric mean over states."""
 WITHIN = 1.0
 """Time of the longest horizon tried, s."""
 
@@ -119,7 +117,9 @@ def tune(
     if "biases" not in alarm:
         raise FitError(f"fit alone cannot learn an alarm, so nothing can be compared: {alarm['not_learnt']}")
     options = {"criterion": model.fit_summary["criterion"], "additive": model.fit_summary["additive"]}
-    best, least = Setting("as fit does", options), _figure(alarm["biases"])
+    if alarm.get("centred"):
+        options["centred"] = True
+    best, least = Setting("as fit does", options), alarm["figure"]
     base, trials = least, [_row(best.words, least, least, model)]
     missed = _missed(model, best, faulty or {})
     reason = "no way sees clearly smaller jumps on left-out data than fit alone"
@@ -176,11 +176,6 @@ def tune(
         reason += "; the time ran out before every way was tried"
     tuned = Tuned(model, reason, tuple(trials))
     return Tuned(model.replace(fit_summary={**model.fit_summary, "tune": tuned.to_dict()}), reason, tuned.trials)
-
-
-def _figure(biases: Sequence[float]) -> float:
-    """Geometric mean of the smallest jumps that a panel sees."""
-    return float(np.exp(np.mean(np.log(np.maximum(biases, 1e-300)))))
 
 
 def _missed(model: UncertainLTI, setting: Setting, faulty: Mapping[str, Sequence[Transient]]) -> set[tuple[str, int]]:

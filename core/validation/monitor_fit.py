@@ -11,12 +11,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification import fit
+from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.groups import resolve_groups
@@ -25,6 +28,10 @@ from uncertain_lti.validation.panel import Panel, learn, promises, worth
 from uncertain_lti.validation.part import judge
 from uncertain_lti.validation.result import Validation
 
+CLEARLY = 0.9
+"""Largest size of the jumps that a better way to fit sees, over those that a simpler one sees."""
+ALONE = 1 / 3
+"""Share of recordings, groups or blocks not covered by the others beyond which only the simplest way is tried."""
 FOLDS = 5
 """Fits without a part of the recordings, groups or, of a single recording, blocks."""
 LIMIT = 1e9
@@ -35,12 +42,13 @@ _SHOWN = 1_000_000  # transitions that a panel is learnt from where nothing is l
 @dataclass(frozen=True)
 class Monitored:
     """One way to fit: `model` with its alarm, `panel` with what it promises (None if none could be learnt: `why`),
-    `validation` of what was left out (None if nothing was)."""
+    `validation` of what was left out (None if nothing was); `centred`: deviations are from the medians."""
 
     model: UncertainLTI
     panel: Panel | None
     validation: Validation | None = None
     why: str = ""
+    centred: bool = False
 
     def finished(self) -> UncertainLTI:
         """The model with what the panel promises in its summary, and what was left out in its validation."""
@@ -52,6 +60,8 @@ class Monitored:
             alarm = {**panel.to_dict(), "worth": kind, "headline": headline, "promises": promises(model, panel)}
             if self.why:
                 alarm["note"] = self.why
+        if self.centred:
+            alarm["centred"] = True
         left = {"not_done": self.why} if self.validation is None else replace(self.validation, model=model).to_dict()
         return model.replace(fit_summary={**model.fit_summary, "alarm": alarm}, validation=left)
 
@@ -64,9 +74,15 @@ def fit_monitored(
     progress: Callable[[str], None] | None = None,
     describe_data: bool = True,
     seek_carriers: bool = False,
+    centred: bool = False,
     **options: Any,
 ) -> Monitored:
-    """Fit, leave out, and learn the panel; `options` as `identification.fit` takes them."""
+    """Fit, leave out, and learn the panel; `options` as `identification.fit` takes them.
+
+    `centred`: deviations are measured from the medians of the recordings.
+    """
+    if centred:
+        options["operating_point"] = _medians(transients)
     model = fit(
         transients, describe_data=describe_data, seek_carriers=seek_carriers, progress=progress, **options
     )  # fmt: skip
@@ -75,13 +91,13 @@ def fit_monitored(
     left = {k: v for k, v in options.items() if k not in ("schedule", "horizons", "widths", "operating_point")}
     size = float(model.fit_summary["transitions"]) * model.n * (model.n + model.m)
     if options.get("transient_weights") is not None:
-        return Monitored(model, None, why="transient_weights are for all recordings, so none can be left out")
+        return Monitored(
+            model, None, why="transient_weights are for all recordings, so none can be left out", centred=centred
+        )
     left.pop("transient_weights", None)
     if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT:
         why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
-        runs = _some(transients, model)
-        seen = Validation(model, tuple(judge(model, model, run, run.name) for run in runs), "transients", 0.0, 0.9)
-        return Monitored(*_armed(model, seen, runs, false_alarms), None, why)
+        return Monitored(*_armed(model, *_seen(model, transients), false_alarms), None, why, centred)
     try:
         validation = validate(
             transients,
@@ -94,11 +110,11 @@ def fit_monitored(
             **left,
         )
         runs = [t.scheduled_on([s.name for s in model.signals.scheduling]) for t in transients]
-        return Monitored(*_armed(model, validation, runs, false_alarms), validation)
+        return Monitored(*_armed(model, validation, runs, false_alarms), validation, "", centred)
     except (FitError, ModelError) as error:  # too little is left to fit to: the fit itself is valid
         if false_alarms is not None:
             raise FitError(f"no alarm can be learnt for a rate: {error}") from None
-        return Monitored(model, None, why=str(error))
+        return Monitored(model, None, None, str(error), centred)
 
 
 def _armed(
@@ -106,6 +122,54 @@ def _armed(
 ) -> tuple[UncertainLTI, Panel]:
     panel = learn(validation, runs, rate)
     return model.replace(alarm=panel.rules), panel
+
+
+def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], **options: Any) -> Monitored:
+    """The first of some ways to fit, or the one whose panel sees clearly smaller jumps.
+
+    `ways`: options of `fit_monitored`, from the simplest on; `options`: further ones, for all. Where the recordings do
+    not repeat one another the simplest is kept: nothing shows there that another holds. The others are compared on what
+    was fitted, and the best of them with the first on what was left out.
+    """
+    first = fit_monitored(transients, **{**options, **ways[0]})
+    if len(ways) == 1 or first.panel is None or len(first.panel.unlike) > ALONE * first.panel.units:
+        return first
+    named = ("describe_data", "seek_carriers", "groups", "false_alarms")
+    shared = {name: value for name, value in options.items() if name not in named}
+    best, least = ways[0], learn(*_seen(first.model, transients)).figure
+    for way in ways[1:]:
+        asked = {**shared, **way}
+        if asked.pop("centred", False):
+            asked["operating_point"] = _medians(transients)
+        try:
+            figure = learn(*_seen(fit(transients, describe_data=False, **asked), transients)).figure
+        except (FitError, ModelError):
+            continue
+        if figure < CLEARLY * least:
+            best, least = way, figure
+    if best is ways[0]:
+        return first
+    taken = fit_monitored(transients, **{**options, **best})
+    return taken if taken.panel is not None and taken.panel.figure < CLEARLY * first.panel.figure else first
+
+
+def _medians(transients: Sequence[Transient]) -> OperatingPoint:
+    """The medians of all samples, with the scales of the signals."""
+    x, u, s = (
+        np.nan_to_num(np.nanmedian(np.concatenate([getattr(t, name) for t in transients]), axis=0)) for name in "xus"
+    )
+    signals = transients[0].signals
+    if signals is None:
+        return replace(OperatingPoint.identity(len(x), len(u)), x_s=x, u_s=u, s_s=s, S=np.ones(len(s)))
+    point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
+    return replace(point, x_s=x, u_s=u, s_s=s)
+
+
+def _seen(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[Validation, list[Transient]]:
+    """What was fitted, or a stretch of each recording, judged by the fit."""
+    runs = _some(transients, model)
+    parts = tuple(judge(model, model, run, run.name) for run in runs)
+    return Validation(model, parts, "transients", 0.0, 0.9), runs
 
 
 def _some(transients: Sequence[Transient], model: UncertainLTI) -> list[Transient]:

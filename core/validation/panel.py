@@ -41,7 +41,7 @@ from uncertain_lti.validation.intervals import cluster_size, rate_interval
 from uncertain_lti.validation.part import Part, by_unit, judge, rising, unit_numbers
 from uncertain_lti.validation.result import Validation
 
-PANEL = (("energy", 1, 1), ("energy", 10, 10), ("mean", 30, 3), ("chi2", 10, 10))
+PANEL = (("energy", 1, 1), ("energy", 10, 10), ("mean", 30, 3), ("chi2", 30, 3))
 """Kind and window of each rule, in verdicts, and how many such windows a typical left-out stretch must hold."""
 FEW = 30
 """Windows of the left-out data below which the states share how far peaks go."""
@@ -65,8 +65,10 @@ class Panel:
 
     `rules`: the panel; `limit`: false alarms per hour at most, with CONFIDENCE; `alarms`: those on what was left out;
     `hours`: under verdict there; `units`: independent recordings, groups or blocks; `what`: which of them;
-    `biases` (n,): smallest jump of each state that the energy over a window sees, recorded units; `within`: in this
-    time, s; `unlike`: names of left-out stretches that the others do not cover; `asked`: rate that was asked for.
+    `biases` (n,): smallest jump of each state that the energy over a window sees at nine of ten times, recorded units;
+    `within`: in this time, s; `figure`: geometric mean over the states of the jumps seen half of the time, which ways
+    to fit are compared by; `unlike`: names of left-out stretches that the others do not cover; `asked`: rate that was
+    asked for.
     """
 
     rules: tuple[Rule, ...]
@@ -77,13 +79,9 @@ class Panel:
     what: str
     biases: Array
     within: float
+    figure: float
     unlike: tuple[str, ...] = ()
     asked: float | None = None
-
-    @property
-    def figure(self) -> float:
-        """Geometric mean of the smallest biases: what criteria, additive terms and widths are compared by."""
-        return float(np.exp(np.mean(np.log(np.maximum(self.biases, 1e-300)))))
 
     @property
     def needed_hours(self) -> float:
@@ -103,6 +101,7 @@ class Panel:
             "what": self.what,
             "biases": self.biases.tolist(),
             "within": self.within,
+            "figure": self.figure,
             "unlike": list(self.unlike),
             **({} if self.asked is None else {"asked": self.asked, "needed_hours": self.needed_hours}),
         }
@@ -181,12 +180,15 @@ def learn(validation: Validation, transients: Sequence[Transient], rate: float |
     ]
     factor, limit, alarms = _factor(shown, levels, hours, len(rules), rate)
     thresholds = [factor * t for t in thresholds]
-    half = np.average([p.usual_width for p in parts], axis=0, weights=[p.judged for p in parts]) / 2.0
+    usual, median = np.average(
+        [(p.usual_width, p.median_width) for p in parts], axis=0, weights=[p.judged for p in parts]
+    ) / 2.0  # fmt: skip
     at = max(i for i, rule in enumerate(rules) if rule.kind == "energy" and rule.horizon == 1)
     return Panel(
         tuple(_with_threshold(rule, t) for rule, t in zip(rules, thresholds, strict=True)),
-        limit, alarms, hours, int(units.max()) + 1, validation.what, half * thresholds[at],
-        max(rules[at].window_s, dt), tuple(unlike), rate,
+        limit, alarms, hours, int(units.max()) + 1, validation.what, usual * thresholds[at],
+        max(rules[at].window_s, dt), float(np.exp(np.log(np.maximum(median * thresholds[at], 1e-300)).mean())),
+        tuple(unlike), rate,
     )  # fmt: skip
 
 

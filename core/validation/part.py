@@ -47,8 +47,9 @@ class Part:
     horizon on this part, recorded units; NaN likewise; `residual` (K, n): x_next - centre of every judged transition,
     normalised; `longer_residual` (K, H, n): the same of each horizon; NaN as in `longer`; `judged_by`: the full model
     with the residuals of the left-out one: what a statistic on this part takes; `extrapolated` (K,): `Reach.level` of
-    each judged transition; `usual_width` (n,): width that USUAL of them have at most, recorded units; `outside`
-    (K, n): left its bounds at margin 1, which rounding decides where `utilisation` is about 1.
+    each judged transition; `usual_width`, `median_width` (n,): width that USUAL of them, and half of them, have at
+    most, recorded units; `outside` (K, n): left its bounds at margin 1, which rounding decides where `utilisation` is
+    about 1.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Part:
     judged_by: UncertainLTI | None = None
     extrapolated: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     usual_width: Array = field(default_factory=lambda: np.zeros(0))
+    median_width: Array = field(default_factory=lambda: np.zeros(0))
     outside: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
     def __repr__(self) -> str:
@@ -115,6 +117,7 @@ class Part:
         """(K, rows, n), for `Alarm.over`: utilisation for one step and for each horizon, then the residuals."""
         rows = [self.utilisation[:, None], self.longer, self.residual[:, None], self.longer_residual]
         return np.concatenate([row for row in rows if row.size or not self.judged], axis=1)
+
 
 def judge(
     model: UncertainLTI,
@@ -166,6 +169,7 @@ def judge(
         extrapolated=np.zeros(len(steps.dt), dtype=np.intp) if reach is None else reach.level(steps),
         outside=flags,
         usual_width=np.full(n, np.nan) if empty else np.quantile(width, USUAL, axis=0),
+        median_width=np.full(n, np.nan) if empty else np.median(width, axis=0),
     )
 
 
