@@ -178,7 +178,7 @@ def test_alarms_are_those_of_the_monitor_at_any_margin(validation, runs, m, n):
     assert len(part.starts) == 2
     for margin in (0.2, 0.4, 0.77, 1.0, 1.5):
         verdicts = EnvelopeMonitor(validation.model, m, n, margin).check(looped)
-        alarm, reset = verdicts.alarm, np.concatenate([[False], np.diff(looped.t_ns) < 0])
+        alarm, reset = verdicts.alarm, back_and_restarts(looped.t_ns)[1]
         edges = alarm & ~np.concatenate([[False], alarm[:-1]]) | alarm & reset
         assert rising(raised_on([AlarmRule(m, n, margin)], part), part.starts) == np.count_nonzero(edges)
 

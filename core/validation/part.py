@@ -22,6 +22,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.arming import back_and_restarts
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.validation.extrapolation import Reach
@@ -140,7 +141,7 @@ def judge(
     )
     whole = (high - low) * point.X
     flags = verdicts.flags[judged] == 1.0
-    resets = np.flatnonzero(np.diff(transient.t_ns) < 0) + 1
+    resets = np.flatnonzero(back_and_restarts(transient.t_ns)[1])
     starts = sorted({0, *(int(np.count_nonzero(judged[:r])) for r in resets)})
     n = model.n
     empty = not len(width)
