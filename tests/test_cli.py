@@ -26,7 +26,6 @@ from engine_bag import SIGNALS, engine_bag
 from uncertain_lti import EnvelopeMonitor, UncertainLTI
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli.main import main
-from uncertain_lti.identification import fit
 from uncertain_lti.plants.leibov import STATE_TOPIC
 
 
@@ -95,7 +94,7 @@ def test_check_tells_when_and_how_long(folder, capsys):
 
 
 def test_commands_say_what_the_library_says(folder, capsys):
-    from uncertain_lti import read_transients
+    from uncertain_lti import fit, read_transients
 
     transients = read_transients(folder / "run.mcap", folder / "signals.yaml")
     model = fit(transients, additive="noise")

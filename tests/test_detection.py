@@ -90,7 +90,7 @@ def test_blocks_partition_the_healthy_rows_and_the_limit_is_the_largest_left_out
 def test_controls_at_both_ends_of_a_step_are_those_at_its_departure_and_its_arrival():
     rows = np.arange(12.0).reshape(4, 3)
     found = Signals([0], [1, 2], both_ends=True).recording(rows, np.arange(4.0))
-    assert found.u[1].tolist() == [4.0, 5.0, 7.0, 8.0] and found.x[:, 0].tolist() == [0.0, 3.0, 6.0, 9.0]
+    assert found.u[1].tolist() == [4.0, 7.0, 5.0, 8.0] and found.x[:, 0].tolist() == [0.0, 3.0, 6.0, 9.0]
 
 
 def test_a_leak_is_judged_from_its_onset_and_others_alarm_as_often_as_ours():
