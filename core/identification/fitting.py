@@ -250,9 +250,8 @@ def fit_fleet(
         },
         "versions": dict(_versions()),
     }
-    residuals, widths, largest = fleet.envelope(model)
     if fleet.columns.regimes is not None:
-        facts["blocks"] = _block_facts(model, sums, widths, largest, dt_median)
+        facts["blocks"] = _block_facts(model, sums, judged.widths, judged.widest, dt_median)
     if describe_on is not None:
         whole = describe_on.N == sums.count and method == "working-set"
         few = carriers(describe_on, structure) if seek_carriers and whole else None
@@ -260,7 +259,7 @@ def fit_fleet(
             model, describe_on, sums, mean_width, max_width, transients, few, discarded if criterion == "qp" else None
         )
         facts["messages"] += _distance(gap)
-    return model.replace(fit_summary=facts, residuals=residuals)
+    return model.replace(fit_summary=facts, residuals=fleet.residuals(model, judged))
 
 
 def _block_facts(

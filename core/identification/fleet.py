@@ -110,26 +110,21 @@ class Fleet:
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
 
-    def envelope(self, model: Envelope) -> tuple[Residuals, Array, Array]:
-        """Mean and covariance of the utilisation, or of the residual, and widths at the transitions of each block.
+    def residuals(self, model: Envelope, judged: Judged) -> Residuals:
+        """Mean and covariance of the utilisation, or of the residual; `judged`: of all transitions by the same model.
 
         With one covariance of the residual its spread is the same in all regimes, with one of the utilisation it is as
         the half-width; the form by which the transitions are likelier is taken.
-
-        Returns (R, n): of each block the sum of the widths; Returns (R, n): of each block the largest width.
         """
-        results = self.map(passes.envelope_sums, self._same(model, max(1, self.N // _COMPARED)))
-        left, half = (np.concatenate([r[i] for r in results]) for i in (4, 5))
-        relative = not likelier_alone(left, half)
+        some = self.map(passes.some_residuals, self._same(model, max(1, self.N // _COMPARED)))
+        relative = not likelier_alone(*(np.concatenate(each) for each in zip(*some, strict=True)))
         form = 0 if relative else 1
-        mean = np.sum([r[0][form] for r in results], axis=0) / self.N
-        products = np.sum([r[1][form] for r in results], axis=0) / self.N
+        mean, products = judged.total[form] / self.N, judged.products[form] / self.N
         covariance = products - np.outer(mean, mean)
         values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
         if values[0] < 0.0:  # by rounding
             covariance = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        residuals = Residuals(mean, 0.5 * (covariance + covariance.T), relative)
-        return residuals, np.sum([r[2] for r in results], axis=0), np.max([r[3] for r in results], axis=0)
+        return Residuals(mean, 0.5 * (covariance + covariance.T), relative)
 
     def moving_from_rest(self) -> tuple[int, int, float]:
         """Samples with x = u = 0 and a successor that is not 0."""

@@ -237,7 +237,8 @@ def _fitted(
     mean_width = 2.0 * (sums.width_sum @ d) / sums.count
     X = model.operating_point.X
     some = part if part.N <= 2 * _LOOKED_AT else part.subset(slice(None, None, part.N // _LOOKED_AT))
-    return envelope.with_residuals(Fleet.of(some).envelope(envelope)[0]), {
+    fleet = Fleet.of(some)
+    return envelope.with_residuals(fleet.residuals(envelope, fleet.judge(envelope))), {
         "steps": steps,
         "seconds": float(np.median(part.dt)),
         "widths": widths,

@@ -386,18 +386,28 @@ class Judged:
     """What the bounds of a model are on transitions.
 
     `outside` (n,): transitions outside, by row; `largest` (n,): largest width per step, normalised; `weighted` (n,):
-    largest √w_ii x width, normalised.
+    largest √w_ii x width, normalised; `total` (2, n): Σ r of the utilisation r = (x_next - centre) / half, then of the
+    residual r = x_next - centre; `products` (2, n, n): Σ r rᵀ of the same; `widths` (R, n): of each block of a schedule
+    the sum of the widths at transitions of which it has the largest weight; `widest` (R, n): the largest of these.
     """
 
     outside: NDArray[np.intp]
     largest: Array
     weighted: Array
+    total: Array
+    products: Array
+    widths: Array
+    widest: Array
 
     def __add__(self, other: Judged) -> Judged:
         return Judged(
             self.outside + other.outside,
             np.maximum(self.largest, other.largest),
             np.maximum(self.weighted, other.weighted),
+            self.total + other.total,
+            self.products + other.products,
+            self.widths + other.widths,
+            np.maximum(self.widest, other.widest),
         )
 
 
@@ -412,36 +422,21 @@ class Envelope(Protocol):
 
 def judge(part: Partition, model: Envelope) -> Judged:
     """Bounds (6)(7) of all transitions, by the arithmetic of `UncertainLTI.bounds`."""
-    zeros = np.zeros(part.n)
-    total = Judged(np.zeros(part.n, dtype=np.intp), zeros, zeros)
+    given = ((*_given(block, part.columns), block.root_weights()) for block in part.blocks())
+    first, *others = (Judged(*verdicts(model.tables, *some)) for some in given)
+    return sum(others, first)
+
+
+def some_residuals(part: Partition, model: Envelope, stride: int) -> tuple[Array, Array]:
+    """Residuals x_next - centre of some transitions, and their half-widths, (K, n) each."""
+    left, halves = [], []
     for block in part.blocks():
-        total = total + Judged(*verdicts(model.tables, *_given(block, part.columns), block.root_weights())[:3])
-    return total
-
-
-def envelope_sums(part: Partition, model: Envelope, stride: int) -> tuple[Array, ...]:
-    """Sums over all transitions of what the envelope is there.
-
-    That is the residual x_next - centre of every transition, the utilisation (x_next - centre) / half, their products,
-    and the widths per step at the transitions of each block, those of which it has the largest weight.
-
-    Returns (2, n): Σ r of the utilisation, then of the residual; Returns (2, n, n): Σ r rᵀ of the same; Returns (R, n):
-    of each block of a schedule the sum of the widths, normalised; Returns (R, n): of each block of a schedule the
-    largest width; Returns (K, n): some residuals; Returns (K, n): their half-widths.
-    """
-    found: list[tuple[Array, ...]] = []
-    some: list[list[Array]] = [[], []]
-    for block in part.blocks():
-        found.append(verdicts(model.tables, *_given(block, part.columns), block.root_weights(), True)[3:])
-        few = block.every(0, stride)
-        z, dt, x_next, base, blocks, s = _given(few, part.columns)
+        z, dt, x_next, base, blocks, s = _given(block.every(0, stride), part.columns)
         centre, half = np.empty(x_next.shape), np.empty(x_next.shape)
         centre_and_half(model.tables, z, dt, centre, half, blocks, s, base)
-        some[0].append((x_next - centre).T)
-        some[1].append(half.T)
-    total, products, widths, largest = (np.stack(each) for each in zip(*found, strict=True))
-    sums = total.sum(axis=0), products.sum(axis=0), widths.sum(axis=0), largest.max(axis=0)
-    return *sums, np.concatenate(some[0]), np.concatenate(some[1])
+        left.append((x_next - centre).T)
+        halves.append(half.T)
+    return np.concatenate(left), np.concatenate(halves)
 
 
 def moving_from_rest(part: Partition) -> tuple[int, int, float]:

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.columns import Columns
 
-BLOCK = 16384
-"""Transitions per pass block: their regressors stay in the cache."""
+BLOCK = 32768
+"""Transitions that a pass takes at a time, and that are read from disk together."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class Partition(Protocol):
         ...
 
     def blocks(self) -> Iterator[Block]:
-        """All transitions, in blocks that stay in the cache."""
+        """All transitions, in blocks."""
         ...
 
 
@@ -219,7 +219,7 @@ class Problem:
         )
 
     def blocks(self) -> Iterator[Block]:
-        """All transitions, in blocks that stay in the cache."""
+        """All transitions, in blocks."""
         for start in range(0, self.N, BLOCK):
             yield self.block(slice(start, min(start + BLOCK, self.N)))
 

@@ -46,6 +46,6 @@ def _log_likelihood(values: Array) -> float:
         sign, logarithm = np.linalg.slogdet(scatter)
         if sign <= 0.0 or not np.isfinite(logarithm):
             return -np.inf
-        distance = np.einsum("ki,ij,kj->k", centred, np.linalg.inv(scatter), centred, optimize=True)
+        distance = ((centred @ np.linalg.inv(scatter)) * centred).sum(axis=1)
         weights = (_FREEDOM + n) / (_FREEDOM + distance)
     return float(-0.5 * logarithm - 0.5 * (_FREEDOM + n) * np.log1p(distance / _FREEDOM).mean())

@@ -18,6 +18,7 @@ cimport cython
 from cpython cimport array as arrays
 from libc.math cimport INFINITY, NAN, fabs
 from libc.stdlib cimport calloc, free
+from libc.string cimport memcpy
 
 include "equations.pxi"
 include "elements.pxi"

@@ -87,15 +87,12 @@ def sums_of(Py_ssize_t n, z, dt, after, base, Blocks blocks, s, Py_ssize_t ones,
     cdef double[:, ::1] of_sizes = total
     cdef double[:, :, ::1] weighted = grams
     cdef Py_ssize_t[::1] visited = visits
-    cdef double* phi = room_for(r + size + n + 2 + _CORNERS * (r + size) + 1)
+    cdef double* phi = room_for(r + size + n + 1 + _CORNERS * (r + size) + 1)
     cdef double* psi = phi + r * _TOGETHER
     cdef double* moved = psi + size * _TOGETHER
     cdef double* factor = moved + n * _TOGETHER
-    cdef double* all_ones = factor + _TOGETHER
-    cdef double* room = all_ones + _TOGETHER
+    cdef double* room = factor + _TOGETHER
     with nogil:
-        for q in range(_TOGETHER):
-            all_ones[q] = 1.0
         while tiles.take():
             for j in range(r):
                 for q in range(tiles.whole):
@@ -112,7 +109,7 @@ def sums_of(Py_ssize_t n, z, dt, after, base, Blocks blocks, s, Py_ssize_t ones,
             add_products(psi, size, NULL, 0, NULL, tiles, room, of_psi)
             add_products(phi, r, NULL, 0, NULL, tiles, room, of_phi)
             add_products(phi, r, moved, n, NULL, tiles, room, to_moved)
-            add_products(psi, size, all_ones, 1, NULL, tiles, room, of_sizes)
+            add_products(psi, size, tiles.ones, 1, NULL, tiles, room, of_sizes)
             for f in range(by.shape[0]):
                 for q in range(tiles.whole):
                     factor[q] = by[f, tiles.index[q]] if q < tiles.many else 0.0
@@ -137,54 +134,59 @@ def near_bounds(
     cdef Py_ssize_t i, j, k, q, kept = 0, held = tiles.blocks.count
     cdef const unsigned char[::1] by_dt = np.array([*times_dt, 0], dtype=np.uint8)
     cdef const Py_ssize_t[::1] which = np.ascontiguousarray(rows, dtype=np.intp)
-    cdef arrays.array nominal = doubles(theta), within = doubles(inner), beyond = doubles(inner if outer is None else outer)
+    cdef arrays.array nominal = doubles(theta), within = doubles(inner)
+    cdef arrays.array wider = doubles(inner if outer is None else outer)
     cdef bint limited = limit is not None
     cdef const double[:, :] most = np.zeros((1, 1)) if limit is None else np.reshape(limit, (count, -1))
     cdef bint each = limited and most.shape[1] > 1
-    if not (len(nominal) >= held * r * count and len(within) >= held * size * count <= len(beyond)):
+    if not (len(nominal) >= held * r * count and len(within) >= held * size * count <= len(wider)):
         raise ValueError("the candidate does not fit the terms")
     found, distances = np.empty(count * tiles.count, dtype=np.intp), np.empty(count * tiles.count)
     cdef Py_ssize_t[::1] position = found
     cdef double[::1] distance = distances
-    cdef double* psi = room_for(size + 3)
+    cdef double* psi = room_for(size + 4)
     cdef double* left = psi + size * _TOGETHER
     cdef double* half = left + _TOGETHER
     cdef double* wide = half + _TOGETHER
+    cdef double* beyond = wide + _TOGETHER
+    cdef const double* step = tiles.step
+    cdef const double* start
+    cdef const double* end
     with nogil:
         while tiles.take():
             tiles.sizes(p, psi)
             for j in range(p, size):
                 for q in range(tiles.many):
-                    psi[j * _TOGETHER + q] = 1.0 if by_dt[j - p] else 1.0 / tiles.step[q]
+                    psi[j * _TOGETHER + q] = 1.0 if by_dt[j - p] else 1.0 / step[q]
             for i in range(count):
+                start, end = tiles.start + which[i] * _TOGETHER, tiles.end + which[i] * _TOGETHER
                 tiles.sum(nominal.data.as_doubles, i, count, r, tiles.phi, left)
                 tiles.sum(within.data.as_doubles, i, count, size, psi, half)
+                for q in range(tiles.whole):
+                    left[q] = fabs(left[q] * step[q] - (end[q] - start[q]))
+                    beyond[q] = left[q] - half[q] * step[q]
                 if limited:
-                    tiles.sum(beyond.data.as_doubles, i, count, size, psi, wide)
-                k = which[i] * _TOGETHER
-                for q in range(tiles.many):
-                    left[q] = fabs(left[q] * tiles.step[q] - (tiles.end[k + q] - tiles.start[k + q]))
-                    half[q] = left[q] > half[q] * tiles.step[q]
-                if limited:
+                    tiles.sum(wider.data.as_doubles, i, count, size, psi, wide)
                     for q in range(tiles.many):
-                        if 2.0 * wide[q] * tiles.step[q] > most[i, tiles.index[q] if each else 0]:
-                            half[q] = 1.0
-                for q in range(tiles.many):
-                    if half[q] != 0.0:
-                        position[kept] = i * tiles.count + tiles.index[q]
-                        distance[kept] = left[q] / tiles.step[q]
-                        kept += 1
+                        if 2.0 * wide[q] * step[q] > most[i, tiles.index[q] if each else 0]:
+                            beyond[q] = 1.0
+                if greatest_of(beyond, tiles.many) > 0.0:
+                    for q in range(tiles.many):
+                        if beyond[q] > 0.0:
+                            position[kept] = i * tiles.count + tiles.index[q]
+                            distance[kept] = left[q] / step[q]
+                            kept += 1
     free(psi)
     order = np.argsort(found[:kept])
     return found[order], distances[order]
 
 
-def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots, bint sums=False):
+def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
     """The verdict on all transitions, by the arithmetic of every other verdict.
 
     `tables`: as of `centre_and_half`; `roots` (n, K) or (n, 1): √w. Returns of each state the transitions outside, the
-    largest width and the largest √w x width; and with `sums` Σ of the utilisation and of the residual (2, n), their
-    products (2, n, n), and of each block the sum and the largest of the widths where it is the main one (R, n).
+    largest width and the largest √w x width; Σ of the utilisation and of the residual (2, n), their products (2, n, n);
+    and of each block of a schedule the sum and the largest of the widths where it is the main one (R, n).
     """
     cdef Elements elements = Elements(*tables)
     cdef Tiles tiles = Tiles(elements.n, elements.p, z, dt, base, after, blocks, s)
@@ -203,7 +205,10 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots, bint sums=Fals
     cdef double* centre = psi + elements.p * _TOGETHER
     cdef double* half = centre + _TOGETHER
     cdef double* values = half + _TOGETHER  # utilisations, then residuals
-    cdef double width, x_next, high, weighted
+    cdef double* utilised
+    cdef double* left
+    cdef const double* end
+    cdef double width, weighted
     if not (root.shape[0] == n and root.shape[1] in (1, tiles.count)):
         raise ValueError("the weights do not fit the transitions")
     with nogil:
@@ -211,40 +216,38 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots, bint sums=Fals
             tiles.sizes(elements.p, psi)
             for i in range(n):
                 tiles.bounds(elements, i, psi, centre, half)
-                high = weighted = 0.0
-                k = 0
+                end, k = tiles.end + i * _TOGETHER, 0
                 for q in range(tiles.many):
-                    x_next = tiles.end[i * _TOGETHER + q]
-                    k += not is_contained(lower_of(centre[q], half[q], 1.0), x_next, upper_of(centre[q], half[q], 1.0))
-                    high = half[q] if half[q] > high else high
+                    k += not is_contained(lower_of(centre[q], half[q], 1.0), end[q], upper_of(centre[q], half[q], 1.0))
                 left_out[i] += k
-                most[0, i] = 2.0 * high if 2.0 * high > most[0, i] else most[0, i]
+                for q in range(tiles.many, tiles.whole):
+                    half[q] = 0.0
+                width, weighted = 2.0 * greatest_of(half, tiles.whole), 0.0
+                most[0, i] = width if width > most[0, i] else most[0, i]
                 if each:
                     for q in range(tiles.many):
                         width = 2.0 * (half[q] * root[i, tiles.index[q]])
                         weighted = width if width > weighted else weighted
                     most[1, i] = weighted if weighted > most[1, i] else most[1, i]
-                if sums:
-                    for q in range(tiles.many):
-                        width = tiles.end[i * _TOGETHER + q] - centre[q]
-                        values[i * _TOGETHER + q] = utilisation_of(width, half[q])
-                        values[(n + i) * _TOGETHER + q] = width
-                        sum_of[0, i] += values[i * _TOGETHER + q]
-                        sum_of[1, i] += width
-                    for q in range(tiles.many, tiles.whole):
-                        values[i * _TOGETHER + q] = values[(n + i) * _TOGETHER + q] = 0.0
-                    for q in range(tiles.many if tiles.corners else 0):
-                        c = tiles.places[main_corner(tiles, q)]
-                        width = 2.0 * half[q]
-                        of_block[0, c, i] += width
-                        of_block[1, c, i] = width if width > of_block[1, c, i] else of_block[1, c, i]
-            if sums:
-                for k in range(2):
-                    for i in range(n):
-                        for j in range(i, n):
-                            product_of[k, i, j] += dot(
-                                values + (k * n + i) * _TOGETHER, values + (k * n + j) * _TOGETHER, tiles.whole
-                            )
+                utilised, left = values + i * _TOGETHER, values + (n + i) * _TOGETHER
+                for q in range(tiles.whole):
+                    left[q] = end[q] - centre[q]
+                    utilised[q] = utilisation_of(left[q], half[q])
+                for q in range(tiles.many, tiles.whole):
+                    utilised[q] = left[q] = 0.0
+                sum_of[0, i] += dot(utilised, tiles.ones, tiles.whole)
+                sum_of[1, i] += dot(left, tiles.ones, tiles.whole)
+                for q in range(tiles.many if tiles.corners else 0):
+                    c = tiles.places[main_corner(tiles, q)]
+                    width = 2.0 * half[q]
+                    of_block[0, c, i] += width
+                    of_block[1, c, i] = width if width > of_block[1, c, i] else of_block[1, c, i]
+            for k in range(2):
+                for i in range(n):
+                    for j in range(i, n):
+                        product_of[k, i, j] += dot(
+                            values + (k * n + i) * _TOGETHER, values + (k * n + j) * _TOGETHER, tiles.whole
+                        )
     free(psi)
     if not each:
         largest[1] = largest[0] * roots[:, 0]

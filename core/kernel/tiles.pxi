@@ -43,6 +43,8 @@ cdef class Tiles:
     cdef double* step  # (_TOGETHER,)
     cdef double* start  # (n, _TOGETHER)
     cdef double* end  # (n, _TOGETHER)
+    cdef double* ones  # (_TOGETHER,)
+    cdef double* still  # (_TOGETHER,): what dt does not multiply
 
     def __init__(self, Py_ssize_t n, Py_ssize_t columns, z, dt, base=None, after=None, Blocks blocks=None, s=None):
         self.z, self.dt, self.base = z, dt, z[:n] if base is None else base
@@ -56,7 +58,7 @@ cdef class Tiles:
         if self.corners and not (self.s.shape[0] == self.blocks.axes and self.s.shape[1] == self.count):
             raise ValueError("the scheduling vectors do not fit the samples")
         cdef arrays.array numbers = doubles(
-            np.ones((columns + 2 * n + _CORNERS + 1) * _TOGETHER + (_SORTED * _CORNERS if self.corners else 0))
+            np.ones((columns + 2 * n + _CORNERS + 3) * _TOGETHER + (_SORTED * _CORNERS if self.corners else 0))
         )
         cdef Py_ssize_t places = (_SORTED * (2 + _CORNERS) if self.corners else 0) + self.blocks.count + 2
         cdef arrays.array positions = array("q", bytes(8 * (_TOGETHER + places)))
@@ -66,7 +68,8 @@ cdef class Tiles:
         self.start = self.step + _TOGETHER
         self.end = self.start + n * _TOGETHER
         self.weights = self.end + n * _TOGETHER
-        self.shares = self.weights + _CORNERS * _TOGETHER
+        self.ones = self.weights + _CORNERS * _TOGETHER
+        self.still, self.shares = self.ones + _TOGETHER, self.ones + 2 * _TOGETHER
         self.index = <Py_ssize_t*>positions.data.as_longlongs
         self.ends = self.index + _TOGETHER
         self.order = self.ends + self.blocks.count + 2
@@ -140,9 +143,8 @@ cdef class Tiles:
         cdef double* into
         for i in range(count):
             into = to + i * _TOGETHER
-            if not self.corners:
-                for q in range(self.many):
-                    into[q] = rows[i, first + q]
+            if not self.corners and rows.strides[1] == sizeof(double):
+                memcpy(into, &rows[i, first], self.many * sizeof(double))
             else:
                 for q in range(self.many):
                     into[q] = rows[i, self.index[q]]
@@ -157,30 +159,26 @@ cdef class Tiles:
         cdef double element
         cdef double blended[_LANES]
         cdef double lane[_LANES]
+        cdef const double* value
         for q from 0 <= q < self.many by _LANES:
-            for j in range(columns):
-                if self.corners:
-                    element = table[self.places[0] * size + j * n + i]
+            if not self.corners:
+                value, element = values + q, table[i]
+                for l in range(_LANES):
+                    lane[l] = element * value[l]
+                for j in range(1, columns):
+                    value, element = values + j * _TOGETHER + q, table[j * n + i]
                     for l in range(_LANES):
-                        blended[l] = element * self.weights[q + l]
-                    for c in range(1, self.corners):
-                        element = table[self.places[c] * size + j * n + i]
-                        for l in range(_LANES):
-                            blended[l] += element * self.weights[c * _TOGETHER + q + l]
-                    if j == 0:
-                        for l in range(_LANES):
-                            lane[l] = blended[l] * values[q + l]
-                    else:
-                        for l in range(_LANES):
-                            lane[l] += blended[l] * values[j * _TOGETHER + q + l]
-                else:
-                    element = table[j * n + i]
-                    if j == 0:
-                        for l in range(_LANES):
-                            lane[l] = element * values[q + l]
-                    else:
-                        for l in range(_LANES):
-                            lane[l] += element * values[j * _TOGETHER + q + l]
+                        lane[l] += element * value[l]
+            for j in range(columns if self.corners else 0):
+                value, element = values + j * _TOGETHER + q, table[self.places[0] * size + j * n + i]
+                for l in range(_LANES):
+                    blended[l] = element * self.weights[q + l]
+                for c in range(1, self.corners):
+                    element = table[self.places[c] * size + j * n + i]
+                    for l in range(_LANES):
+                        blended[l] += element * self.weights[c * _TOGETHER + q + l]
+                for l in range(_LANES):
+                    lane[l] = blended[l] * value[l] + (lane[l] if j else -0.0)  # -0 + a = a, to the sign of 0
             for l in range(_LANES):
                 total[q + l] = lane[l]
 
@@ -188,18 +186,21 @@ cdef class Tiles:
         self, Elements elements, Py_ssize_t i, const double* psi, double* centre, double* half
     ) noexcept nogil:
         """Centre and half-width (_TOGETHER,) of a state at each transition; psi: |phi|."""
-        cdef Py_ssize_t c, q, n = self.n
-        cdef double still
+        cdef Py_ssize_t q, n = self.n
+        cdef double still = elements.v[i]
+        cdef const double* step = self.step
+        cdef const double* start = self.start + i * _TOGETHER
         self.sum(elements.theta, i, n, elements.p, self.phi, centre)
         self.sum(elements.delta, i, n, elements.p, psi, half)
-        still = elements.v[i]
-        for q in range(self.many):
-            if self.corners:
-                still = elements.v[self.places[0] * n + i] * self.weights[q]
-                for c in range(1, self.corners):
-                    still += elements.v[self.places[c] * n + i] * self.weights[c * _TOGETHER + q]
-            centre[q] = centre_of(self.start[i * _TOGETHER + q], self.step[q], centre[q])
-            half[q] = half_of(self.step[q], half[q], still)
+        for q in range(self.whole):
+            centre[q] = centre_of(start[q], step[q], centre[q])
+        if not self.corners:
+            for q in range(self.whole):
+                half[q] = half_of(step[q], half[q], still)
+            return
+        self.sum(elements.v, i, n, 1, self.ones, self.still)
+        for q in range(self.whole):
+            half[q] = half_of(step[q], half[q], self.still[q])
 
     cdef void sizes(self, Py_ssize_t columns, double* psi) noexcept nogil:
         """psi (columns, _TOGETHER) = |phi|."""
@@ -222,6 +223,21 @@ cdef double dot(const double* a, const double* b, Py_ssize_t count) noexcept nog
     for l in range(_LANES):
         total += lane[l]
     return total
+
+
+cdef double greatest_of(const double* a, Py_ssize_t count) noexcept nogil:
+    """The greatest number of a tile, 0 at least."""
+    cdef double lane[_LANES]
+    cdef double most = 0.0
+    cdef Py_ssize_t l, q
+    for l in range(_LANES):
+        lane[l] = 0.0
+    for q from 0 <= q < count by _LANES:
+        for l in range(_LANES):
+            lane[l] = a[q + l] if a[q + l] > lane[l] else lane[l]
+    for l in range(_LANES):
+        most = lane[l] if lane[l] > most else most
+    return most
 
 
 cdef double* room_for(Py_ssize_t rows) except NULL:
