@@ -90,14 +90,11 @@ def assemble(
         stop = start + len(s.dt)
         part = slice(start, stop)
         start = stop
-        square += _normalise(s.x, point.x_s, point.X, z[:n, part])
-        square += _normalise(s.u, point.u_s, point.U, z[n:, part])
-        if s.consecutive:  # computed once
-            if not shared:
-                x_next[:, part][:, :-1] = z[:n, part][:, 1:]
-            square += _normalise(s.x_next[-1:], point.x_s, point.X, x_next[:, stop - 1 : stop])
-        else:
-            square += _normalise(s.x_next, point.x_s, point.X, x_next[:, part])
+        square += _normalise(s, s.transient.x, point.x_s, point.X, z[:n, part])
+        square += _normalise(s, s.transient.u, point.u_s, point.U, z[n:, part])
+        if shared:
+            s = s.take(slice(-1, None))
+        square += _normalise(s, s.transient.x, point.x_s, point.X, x_next[:, stop - len(s.k) : stop], 1)
     further, more = _scheduling(steps, point)
     if not square + more <= LARGEST**2:
         raise _too_large(transients)
@@ -135,7 +132,7 @@ def _scheduling(steps: Sequence[Transitions], point: OperatingPoint) -> tuple[Ar
     s = np.empty((len(point.s_s), sum(len(step.dt) for step in steps)))
     start, square = 0, 0.0
     for step in steps:
-        square += _normalise(step.s, point.s_s, point.S, s[:, start : start + len(step.dt)])
+        square += _normalise(step, step.transient.s, point.s_s, point.S, s[:, start : start + len(step.k)])
         start += len(step.dt)
     return s, square
 
@@ -199,11 +196,15 @@ def _factors(
     return None if (factors == 1.0).all() else factors
 
 
-def _normalise(recorded: Array, steady: Array, scale: Array, out: Array) -> float:
-    """(recorded - steady) / scale as `OperatingPoint` does it, into columns; (K, n) to (n, K). The sum of squares."""
-    edges = np.linspace(0, len(recorded), max(len(recorded) // _PIECE, 1) + 1).astype(int).tolist()
+def _normalise(steps: Transitions, values: Array, steady: Array, scale: Array, out: Array, after: int = 0) -> float:
+    """(values - steady) / scale of an array of a transient, as `OperatingPoint` does it, into columns (n, K).
+
+    Returns the sum of squares.
+    """
+    values = values[after : after + len(values) - 1]
+    edges = np.linspace(0, len(steps.k), max(len(steps.k) // _PIECE, 1) + 1).astype(int).tolist()
     pieces = [slice(a, b) for a, b in itertools.pairwise(edges)]
-    return sum(on_cores(normalised_columns, [(recorded[piece], steady, scale, out[:, piece]) for piece in pieces]))
+    return sum(on_cores(normalised_columns, [(values, steps.k[p], steady, scale, out[:, p]) for p in pieces]))
 
 
 def scaled_eigenvalues(weights: Array) -> Array:

@@ -254,41 +254,45 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
     return outside, largest[0], largest[1], total, np.stack([mirrored(part) for part in products]), *widths
 
 
-def normalised_columns(values, steady, scale, out):
-    """Recorded values (K, n), normalised, into columns (n, K); the sum of their squares."""
+def normalised_columns(values, k, steady, scale, out):
+    """Rows k (K,) of recorded values (N, n), normalised, into columns (n, K); the sum of their squares."""
     cdef const double[:, :] rows = values
+    cdef const Py_ssize_t[:] chosen = k
     cdef double[:, :] columns = out
-    cdef Py_ssize_t j, k, begin, end, n = rows.shape[1], count = rows.shape[0]
+    cdef Py_ssize_t j, q, begin, end, n = rows.shape[1], count = chosen.shape[0]
     cdef arrays.array low = doubles(steady), unit = doubles(scale)
     cdef double value, total = 0.0
     if not (columns.shape[0] == n == len(steady) == len(scale) and columns.shape[1] == count):
         raise ValueError("the rows do not fit the columns")
+    if count and not (0 <= chosen[0] and chosen[count - 1] < rows.shape[0]):
+        raise ValueError("there are no such rows")
     with nogil:
         for begin from 0 <= begin < count by _TOGETHER:  # so many rows stay in the cache while they become columns
             end = begin + _TOGETHER if begin + _TOGETHER < count else count
             for j in range(n):
-                for k in range(begin, end):
-                    value = normalised(rows[k, j], low.data.as_doubles[j], unit.data.as_doubles[j])
-                    columns[j, k] = value
+                for q in range(begin, end):
+                    value = normalised(rows[chosen[q], j], low.data.as_doubles[j], unit.data.as_doubles[j])
+                    columns[j, q] = value
                     total += value * value
     return total
 
 
-def changes(before, after):
-    """Of rows (K, n): in which of them some number stays the same (K,), and the largest change of each number (n,)."""
-    cdef const double[:, :] one = before
-    cdef const double[:, :] other = after
-    cdef Py_ssize_t i, k, n = one.shape[1]
+def changes(values, k):
+    """From rows k (K,) of values (N, n) to the next: where some number stays the same (K,), and the largest changes (n,).
+    """
+    cdef const double[:, :] rows = values
+    cdef const Py_ssize_t[:] chosen = k
+    cdef Py_ssize_t i, q, n = rows.shape[1], count = chosen.shape[0]
     cdef double change
-    if not before.shape == after.shape:
-        raise ValueError("the rows do not fit one another")
-    same, largest = np.zeros(one.shape[0], dtype=bool), np.zeros(n)
+    if count and not (0 <= chosen[0] and chosen[count - 1] + 1 < rows.shape[0]):
+        raise ValueError("there are no such rows")
+    same, largest = np.zeros(count, dtype=bool), np.zeros(n)
     cdef unsigned char[::1] still = same.view(np.uint8)
     cdef double[::1] most = largest
     with nogil:
-        for k in range(one.shape[0]):
+        for q in range(count):
             for i in range(n):
-                change = fabs(other[k, i] - one[k, i])
-                still[k] |= other[k, i] == one[k, i]
+                change = fabs(rows[chosen[q] + 1, i] - rows[chosen[q], i])
+                still[q] |= rows[chosen[q] + 1, i] == rows[chosen[q], i]
                 most[i] = change if change > most[i] else most[i]
     return same, largest

@@ -274,7 +274,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
     """What one recording has of them."""
     most, point, steps = np.zeros((4, model.n)), model.operating_point, transient.transitions()
     windows, noisy = _activity(model, transient, steps)
-    some, largest = changes(steps.x, steps.x_next)
+    some, largest = changes(transient.x, steps.k)
     steps = steps.take(some)
     with np.errstate(over="ignore", invalid="ignore"):
         z = model.normalised_columns(steps)

@@ -17,6 +17,7 @@ import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -38,30 +39,54 @@ from uncertain_lti.signals.signal_map import ARRIVAL, Signal, SignalMap
 class Transitions:
     """The usable transitions k -> k+1 of one transient, in recorded units; all numbers are finite.
 
-    `k` (N,): position of sample k in the transient; `dt` (N,): Δt_k, s; `x` (N, n): states at t_k; `u` (N, m): controls
-    at t_k; `x_next` (N, n): states at t_{k+1}; `s` (N, q): further scheduling signals at t_k.
+    `transient`: whose arrays they take, without a copy where none is missing between the first and the last; `k` (N,):
+    position of sample k in it.
     """
 
+    transient: Transient
     k: NDArray[np.intp]
-    dt: Array
-    x: Array
-    u: Array
-    x_next: Array
-    s: Array
 
     def take(self, which: NDArray[np.bool_] | slice) -> Transitions:
-        """Some of them.
-
-        `which` (N,): those that are wanted; a slice is no copy.
-        """
-        return Transitions(
-            self.k[which], self.dt[which], self.x[which], self.u[which], self.x_next[which], self.s[which]
-        )
+        """Some of them, `which` (N,)."""
+        return Transitions(self.transient, self.k[which])
 
     @property
     def consecutive(self) -> bool:
         """None is missing between the first and the last, so x_next of one is x of the next."""
         return len(self.k) > 0 and int(self.k[-1] - self.k[0]) + 1 == len(self.k)
+
+    def rows(self, values: NDArray[Any], after: int = 0) -> NDArray[Any]:
+        """What an array of the transient, samples first, holds so many samples after each t_k."""
+        if self.consecutive:
+            return values[int(self.k[0]) + after : int(self.k[-1]) + 1 + after]
+        return values[self.k + after]
+
+    @cached_property
+    def dt(self) -> Array:
+        """Δt_k, (N,), s."""
+        if self.transient.step is not None:
+            return np.full(len(self.k), self.transient.step)
+        return np.asarray((self.rows(self.transient.t_ns, 1) - self.rows(self.transient.t_ns)) * 1e-9)
+
+    @cached_property
+    def x(self) -> Array:
+        """States at t_k, (N, n)."""
+        return self.rows(self.transient.x)
+
+    @cached_property
+    def u(self) -> Array:
+        """Controls at t_k, (N, m)."""
+        return self.rows(self.transient.u)
+
+    @cached_property
+    def x_next(self) -> Array:
+        """States at t_{k+1}, (N, n)."""
+        return self.rows(self.transient.x, 1)
+
+    @cached_property
+    def s(self) -> Array:
+        """Further scheduling signals at t_k, (N, q)."""
+        return self.rows(self.transient.s)
 
 
 class Transient:
@@ -315,14 +340,9 @@ class Transient:
         Returns
         -------
         Transitions
-            N of them; views of the transient where all are usable.
+            N of them.
         """
-        usable = self.usable
-        if usable.all():  # the usual clean case: views, no copies
-            k = np.arange(len(usable))
-            return Transitions(k, self.dt, self.x[:-1], self.u[:-1], self.x[1:], self.s[:-1])
-        k = np.flatnonzero(usable)
-        return Transitions(k, self.dt[k], self.x[k], self.u[k], self.x[k + 1], self.s[k])
+        return Transitions(self, np.flatnonzero(self.usable))
 
     def statuses(self) -> list[Status]:
         """What the `Sampler` says of each sample, (N+1,).
