@@ -633,9 +633,7 @@ def test_reports_name_what_is_frozen(model: UncertainLTI, tmp_path: Path) -> Non
     assert frozen["told_after"] < 1.0 and frozen["longest_in_fit"] == pytest.approx(0.99)
     assert any(said.endswith(" frozen") for said in data["no_verdict"])
     assert data["verdict_per_sample"][340]["status"] == "frozen" and data["verdict_per_sample"][340]["alarm"]
-    line = (
-        "FROZEN: position repeats exactly for 1.49 s (at most 0.99 s in the fit) from 2.0000 s, told after "
-    )
+    line = "FROZEN: position repeats exactly for 1.49 s (at most 0.99 s in the fit) from 2.0000 s, told after "
     assert line in check_text(data)
     facts = findings(model, "m", checked)
     assert facts["alarm"] and facts["happened"][0]["text"].startswith("frozen: position repeats exactly for 1.49 s")

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, Transient
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification import fit, horizons
@@ -225,14 +226,24 @@ def test_weights_are_those_of_the_arrival() -> None:
     assert width_at(model, 41) < width_at(plain, 41)
 
 
+def test_a_horizon_that_is_asked_for_by_its_number_is_there_or_refused() -> None:
+    for widths in ("growing", "auto"):
+        with pytest.raises(FitError, match="no horizon of 39 steps: 3 windows"):
+            uncertain_lti.fit(
+                runs(length=40), "qp", additive="noise", alarm="containment", horizons=[4, 39], widths=widths
+            )
+    with pytest.raises(FitError, match="no horizon of 39 steps: 3 windows"):
+        fit(runs(length=40), additive="noise", horizons=[4, 39])
+
+
 def test_horizons_without_windows_or_numbers_are_dropped_by_name() -> None:
     transients = runs(length=40)
-    model = fit(transients, additive="noise", horizons=[4, 39])
+    model = fit(transients, additive="noise", horizons=[4, 39], drop_horizons=True)
     assert [h.steps for h in model.horizons] == [4]
     assert any("no horizon of 39 steps: 3 windows" in text for text in model.fit_summary["messages"])
     away = model.replace(A=1e4 * np.eye(2), run=None)
     problem = assemble(runs(), model.operating_point, None, "noise")
-    found, _, messages = fit_horizons(away, problem, [2, 140])
+    found, _, messages, _ = fit_horizons(away, problem, [2, 140])
     assert [h.steps for h in found] == [2] and "'x1' beyond all numbers" in messages[0]
 
 
@@ -291,11 +302,11 @@ def test_a_horizon_whose_run_blows_up_is_dropped_and_said() -> None:
     problem = assemble(transients, fit(transients).operating_point, None, "noise")
     model = fit(transients, additive="noise")
     away = model.replace(run=Run(model.A + 30.0 * np.eye(2), model.B, model.c))
-    found, facts, messages = fit_horizons(away, problem, [2, 60], "constant")
+    found, facts, messages, _ = fit_horizons(away, problem, [2, 60], "constant")
     assert [h.steps for h in found] == [2] == [f["steps"] for f in facts]
     assert len(messages) == 1
     assert messages[0].startswith(
         "no horizon of 60 steps: its envelope is wider than if every state stayed where it was"
     )
-    kept, _, none = fit_horizons(model, problem, [2, 60], "constant")
+    kept, _, none, _ = fit_horizons(model, problem, [2, 60], "constant")
     assert [h.steps for h in kept] == [2, 60] and not none

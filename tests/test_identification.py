@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI
-from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.errors import FitError, ModelError, TransientError
 from uncertain_lti.identification import fit, fleet, formulation, passes, row, solvers
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Columns, Regimes
@@ -385,7 +385,8 @@ def test_wrong_options_are_refused():
         (dict(weights=np.tile([[1.0, 2.0], [2.0, 1.0]], (50, 1, 1))), "not positive definite"),
         (dict(weights=np.tile([[1.0, 0.5], [0.0, 1.0]], (50, 1, 1))), "not symmetric"),
         (dict(weights=[np.ones((49, 2))]), r"must be \(50, 2\)"),
-        (dict(weights="heavy"), "not arrays of numbers"),
+        (dict(weights="heavy"), "not arrays of real numbers"),
+        (dict(weights=np.array([1.0, 1j])), "not arrays of real numbers"),
         (dict(operating_point=OperatingPoint.identity(3, 1)), "3 states"),
     ]
     for options, words in cases:
@@ -396,6 +397,43 @@ def test_wrong_options_are_refused():
     other = Transient(transient.t_ns, transient.x, transient.u, state_names=["a", "b"])
     with pytest.raises(FitError, match="read all recordings with one signals file"):
         fit([transient, other])
+
+
+@pytest.mark.parametrize("size", [1e-60, 1e-158, 1e-200])
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_what_is_too_small_for_the_arithmetic_is_named(size, criterion):
+    whole = drawn(small_plant(2), 50, 2)
+    tiny = Transient(whole.t_ns, whole.x * [size, 1.0], whole.u)
+    for options in ({}, {"discard": 2}):
+        with pytest.raises(FitError, match="'x1' never exceeds .* over its scale, .* give it a smaller scale"):
+            fit(tiny, criterion, additive="noise", **options)
+    fit(Transient(whole.t_ns, whole.x * [1e-40, 1.0], whole.u), criterion, additive="noise")
+
+
+def test_infinite_and_complex_numbers_are_refused():
+    whole = drawn(small_plant(2), 50, 2)
+    for wrong in ({"fixed": {"A": np.full((2, 2), np.inf)}}, {"upper": {"A": np.full((2, 2), -np.inf)}}):
+        with pytest.raises(FitError, match="A is to be infinite; give finite numbers, NaN for a free element"):
+            Structure(2, 1, **wrong)
+    with pytest.raises(FitError, match="A is not an array of real numbers"):
+        Structure(2, 1, fixed={"A": np.full((2, 2), 1j)})
+    with pytest.raises(TransientError, match="x is not numeric; give real numbers"):
+        Transient(whole.t_ns, whole.x + 1j, whole.u)
+    with pytest.raises(TransientError, match="X must be a vector of real numbers"):
+        OperatingPoint(np.zeros(2), np.zeros(1), np.ones(2) + 1j, np.ones(1))
+    with pytest.raises(ModelError, match="field 'A' is not an array of numbers"):
+        UncertainLTI(np.eye(2) * 1j, np.eye(2, 1), np.eye(2), np.eye(2, 1))
+
+
+def test_versions_are_those_of_what_solved():
+    transient = drawn(small_plant(1), 60, 1)
+    for options, packages in (
+        ({"criterion": "qp"}, {"daqp"}),
+        ({"criterion": "qp", "method": "cvxpy"}, {"cvxpy", "osqp"}),
+        ({"criterion": "lp", "method": "cvxpy"}, {"cvxpy", "highspy"}),
+    ):
+        found = fit(transient, additive="noise", **options).fit_summary["versions"]
+        assert set(found) == {"uncertain-lti", "python", "numpy", *packages}
 
 
 def test_nothing_usable_is_said():
@@ -771,6 +809,11 @@ def test_discards_are_the_best_single_ones(criterion, seed):
         assert chosen["effect"] == pytest.approx(max(effects), rel=1e-5)
 
 
+def test_discards_leave_as_many_transitions_as_unknowns():
+    with pytest.raises(FitError, match="which leaves 6 transitions for 7 unknowns per row; discard 1 at most"):
+        fit(drawn(small_plant(1), 8, 1), additive="noise", discard=2)
+
+
 def test_discards_out_of_range_are_refused():
     transient = drawn(small_plant(1), 50, 1)
     for budget in (-1, 1.5, np.nan, True):
@@ -801,6 +844,6 @@ def test_a_weight_beside_the_largest_width_that_is_too_large_is_seen(monkeypatch
     expected = fit(transient, "lp", additive="noise")
     monkeypatch.setattr(row, "REGULARISATION", 100.0)
     model = fit(transient, "lp", additive="noise")
-    np.testing.assert_allclose(model.fit_summary["objective"], expected.fit_summary["objective"], rtol=1e-8)
+    np.testing.assert_allclose(model.fit_summary["objective"], expected.fit_summary["objective"], rtol=1e-7)
     np.testing.assert_allclose(model.fit_summary["mean_width"], expected.fit_summary["mean_width"], rtol=1e-3)
     assert model.fit_summary["optimality_gap"] < 1e-6 and count_outside(model, [transient]) == 0

@@ -7,7 +7,9 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Names of the array types in annotations."""
+"""The types of arrays, and what becomes one of real numbers."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,3 +22,10 @@ Index = NDArray[np.intp]
 """Positions in another array."""
 Mask = NDArray[np.bool_]
 """True or false for each entry of another array."""
+
+
+def real(values: Any) -> Array:
+    """A copy as real numbers; TypeError for complex ones, whose imaginary part numpy would drop."""
+    if np.iscomplexobj(values):
+        raise TypeError("complex numbers")
+    return np.array(values, dtype=np.float64)

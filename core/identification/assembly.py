@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, real
 from uncertain_lti.base.cores import on_cores
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
@@ -242,11 +242,11 @@ def _weights(
                     )
             if len({np.ndim(w) for w in weights}) > 1:
                 raise FitError("weights: some transients have diagonals and some full matrices; give one kind")
-            stacked = np.concatenate([np.asarray(w, dtype=np.float64) for w in weights])
+            stacked = np.concatenate([real(w) for w in weights])
         else:
-            stacked = np.asarray(weights, dtype=np.float64)
+            stacked = real(weights)
     except (TypeError, ValueError):
-        raise FitError("weights are not arrays of numbers; give (n,), (N, n) or (N, n, n)") from None
+        raise FitError("weights are not arrays of real numbers; give (n,), (N, n) or (N, n, n)") from None
     total = sum(lengths)
     if stacked.shape == (n,):
         chosen = stacked

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any, Literal
@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.identification.assembly import assemble, median_step
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.diagnosis import check_solvable, describe
@@ -66,6 +67,7 @@ def fit(
     schedule: Schedule | Mapping[str, Knots] | None = None,
     horizons: Sequence[int] = (),
     widths: Widths | Mapping[int, Widths] = "growing",
+    drop_horizons: bool = False,
     discard: float = 0,
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
@@ -73,7 +75,10 @@ def fit(
     alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> UncertainLTI:
-    """`uncertain_lti.fit` with a schedule that is known: nothing is chosen here by what is left out."""
+    """`uncertain_lti.fit` with a schedule that is known: nothing is chosen here by what is left out.
+
+    `drop_horizons`: a horizon that the recordings cannot carry is left out with a message, not refused.
+    """
     transients = listed_transients(transients)
     if criterion not in ("qp", "lp"):
         raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
@@ -137,8 +142,13 @@ def fit(
 
     discarded: list[dict[str, Any]] = []
     if budget := _budget(discard, problem.N):
-        chosen = choose_discards(problem, criterion, structure, budget, progress)
+        if (left := problem.N - budget) < (unknowns := problem.columns.unknowns(problem.p)):
+            raise FitError(
+                f"discard is {discard!r}, which leaves {plural(left, 'transition')} for {unknowns} unknowns per row; "
+                f"discard {problem.N - unknowns} at most, or record more"
+            )
         before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure, describe_on=None)
+        chosen = choose_discards(problem, criterion, structure, budget, progress)
         for index, effect in chosen:
             transient, k = transients[problem.source[index]], int(problem.k[index])
             discarded.append(
@@ -195,9 +205,14 @@ def fit(
     lengths = [int(h) for h in horizons]
     run, corrected = better_run(model, problem, lengths, structure)
     model = model.replace(run=run)
-    over, facts["horizons"], dropped = fit_horizons(model, problem, lengths, widths, criterion, progress, corrected)
+    over, facts["horizons"], dropped, solvers = fit_horizons(
+        model, problem, lengths, widths, criterion, progress, corrected
+    )
+    if dropped and not drop_horizons:
+        raise FitError(dropped[0])
     if "messages" in facts or dropped:
         facts["messages"] = [*facts.get("messages", []), *dropped]
+    facts["versions"] = versions({*facts["solver"]["names"], *solvers})
     return model.replace(fit_summary=facts, horizons=over, run=model.run if over else None)
 
 
@@ -217,9 +232,17 @@ def fit_fleet(
     seek_carriers: bool = False,
 ) -> UncertainLTI:
     """`fit` on transitions that are already normalised, wherever they lie."""
-    engine = WorkingSet(fleet, structure, progress=progress)
+    with np.errstate(over="ignore", invalid="ignore"):  # of what is refused next
+        engine = WorkingSet(fleet, structure, progress=progress)
     sums = engine.sums
     n, low, high = fleet.n, sums.low, sums.high
+    largest_values = np.maximum(-low, high)
+    for signal, largest in zip(signals.signals, largest_values.tolist(), strict=False):
+        if 0.0 < largest < 1.0 / LARGEST:
+            raise FitError(
+                f"'{signal.name}' never exceeds {largest:.3g} over its scale, less than the arithmetic can carry "
+                f"({1.0 / LARGEST:g}); give it a smaller scale or another unit, or leave it out"
+            )
     domain = Domain(low[:n], high[:n], low[n:], high[n:], fleet.occupancy(low, high))
 
     def build(theta: Array, d: Array) -> UncertainLTI:
@@ -248,7 +271,7 @@ def fit_fleet(
             "passes": solution.passes,
             "working_set": solution.working,
         },
-        "versions": dict(_versions()),
+        "versions": versions(solution.solvers),
     }
     if fleet.columns.regimes is not None:
         facts["blocks"] = _block_facts(model, sums, judged.widths, judged.widest, dt_median)
@@ -431,16 +454,27 @@ def _model(
     )
 
 
-@cache
-def _versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
+_PACKAGES = {
+    "DAQP": ("daqp",),
+    "PIQP": ("piqp",),
+    "HiGHS simplex": ("highspy",),
+    "cvxpy with OSQP": ("cvxpy", "osqp"),
+    "cvxpy with HiGHS": ("cvxpy", "highspy"),
+}
+"""Of each solver, as a fit names it, what has to be the same for the same answer."""
 
+
+@cache
+def _version(package: str) -> str:
+    from importlib.metadata import version
+
+    return version(package)
+
+
+def versions(solvers: Collection[str]) -> dict[str, str]:
+    """Versions of what a fit was computed with: this package, Python, numpy and these solvers."""
     from uncertain_lti import __version__
 
-    found = {"uncertain-lti": __version__, "python": platform.python_version()}
-    for name in ("numpy", "daqp", "highspy", "cvxpy", "osqp"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
+    packages = ["numpy", *sorted({package for name in solvers for package in _PACKAGES[name]})]
+    own = {"uncertain-lti": __version__, "python": platform.python_version()}
+    return own | {package: _version(package) for package in packages}

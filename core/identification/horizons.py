@@ -141,8 +141,9 @@ def fit_horizons(
     criterion: str = "qp",
     progress: Callable[[str], None] | None = None,
     corrected: bool = True,
-) -> tuple[tuple[Horizon, ...], list[dict[str, Any]], list[str]]:
-    """Envelopes of a fitted model over several steps."""
+) -> tuple[tuple[Horizon, ...], list[dict[str, Any]], list[str], set[str]]:
+    """Envelopes of a fitted model over several steps: with facts of each, what was left out, and solvers."""
+    solvers: set[str] = set()
     found: list[Horizon] = []
     facts: list[dict[str, Any]] = []
     messages: list[str] = []
@@ -189,6 +190,7 @@ def fit_horizons(
         fixed = centre | (halves if kind == "constant" else {})
         structure = Structure(n, p - n, fixed=fixed) if fixed else None
         horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
+        solvers |= fact.pop("solvers")
         move = np.max([np.abs(block.x_next - block.z[:n]).max(axis=1) for block in part.blocks()], axis=0)
         if (0.5 * fact["mean_width"] > WIDER * move).all():
             messages.append(
@@ -199,7 +201,7 @@ def fit_horizons(
             continue
         found.append(horizon)
         facts.append(fact)
-    return tuple(found), facts, messages
+    return tuple(found), facts, messages, solvers
 
 
 def _fitted(
@@ -231,7 +233,8 @@ def _fitted(
         return Horizon(steps, **arrays, widths=widths)
 
     try:
-        envelope, d, judged, objective, gap, _ = optimum(engine, criterion, build, model.state_names, sizes=largest)
+        found = optimum(engine, criterion, build, model.state_names, sizes=largest)
+        envelope, d, judged, objective, gap, solution = found
     except FitError as error:
         raise FitError(f"horizon of {steps} steps: {error}") from None
     mean_width = 2.0 * (sums.width_sum @ d) / sums.count
@@ -239,6 +242,7 @@ def _fitted(
     some = part if part.N <= 2 * _LOOKED_AT else part.subset(slice(None, None, part.N // _LOOKED_AT))
     fleet = Fleet.of(some)
     return envelope.with_residuals(fleet.residuals(envelope, fleet.judge(envelope))), {
+        "solvers": solution.solvers,
         "steps": steps,
         "seconds": float(np.median(part.dt)),
         "widths": widths,

@@ -20,8 +20,8 @@ from uncertain_lti.identification import formulation
 from uncertain_lti.identification.passes import Judged, Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.repair import E, repair
-from uncertain_lti.identification.row import LEAST
-from uncertain_lti.identification.working_set import GOOD, Solution, WorkingSet
+from uncertain_lti.identification.row import GOOD, LEAST
+from uncertain_lti.identification.working_set import Solution, WorkingSet
 
 
 def optimum(
@@ -89,7 +89,8 @@ def _as_written(engine: WorkingSet, criterion: str) -> Solution:
     (problem,) = engine.fleet.partitions
     assert isinstance(problem, Problem)
     theta, d, objective = formulation.solve(problem, criterion)
-    return Solution(theta, d, engine.violation(theta, d), objective if criterion == "lp" else None, solvers={"cvxpy"})
+    solver = "cvxpy with OSQP" if criterion == "qp" else "cvxpy with HiGHS"
+    return Solution(theta, d, engine.violation(theta, d), objective if criterion == "lp" else None, solvers={solver})
 
 
 def _objective(sums: Moments, d: Array, weights: Array | None) -> float:

@@ -40,8 +40,11 @@ LEAST = 1e-9
 COLLINEAR = 1e-11
 """Relative singular value of the columns below which the effect of a direction is lost in rounding."""
 _EPS = float(np.finfo(np.float64).eps)
-WIDTH_SLACK = 1e-9
-"""Relative room above δ of (11) in which its ties are broken; a solver needs some."""
+GOOD = 1e-7
+"""Relative distance from the optimum, what the repair will add included, above which a row is solved once more, in
+coordinates of its residual."""
+WIDTH_SLACK = 2e-8
+"""Relative room above δ of (11) in which its ties are broken: closer to δ, what they are is rounding."""
 BOUNDED_TIE_BREAK = 1e-5
 """The same as TIE_BREAK among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
 REGULARISATION = 1e-4
@@ -54,18 +57,10 @@ it seldom is small enough, so they are left to the simplex method at once.
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
 _HELD = 12
 """Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
-_RIDGE = 1e-9
-"""Share of the largest weight with which the ties of (11) hold on to the vertex where nothing else decides."""
-_TIES = (
-    (_ATTEMPTS[0], 2e-11),
-    (_ATTEMPTS[0], 1e-10),
-    (_ATTEMPTS[0], 4e-10),
-    (_ATTEMPTS[0], 1e-9),
-    (_ATTEMPTS[1], 3e-9),
-    (_ATTEMPTS[2], 3e-8),
-)
-"""Attempts at the ties of (11), and the violation, in scaled units, that each may leave: the set of optima can be as
-thin as that. Half-widths below 0 become 0, so what is left makes the others wider than δ allows."""
+_HOLD = (1e-2, 1e-4, 1e-6)
+"""Shares of the largest weight with which the ties of (11) are held back to where they were, one after the other."""
+_ROOM = (1e-10, 1e-9, 1e-8)
+"""Violation, in scaled units, that they may leave, tried in turn: the set of optima can be as thin as that."""
 JOIN = 48  # samples that join a working set per round, at least; more if there are many unknowns
 
 
@@ -799,91 +794,47 @@ class Row:
         )
 
     def solve_bounded(self) -> str:
-        """Least squared widths, then the centre, among the optima of (11)."""
+        """Least squared widths, then the centre, among what is as good by (11), sought from an optimum of it.
+
+        The set is so thin that a solver finds its way only if the step is held back at first; and if it finds none,
+        containment gets some room, which the repair covers.
+        """
         assert self.limit is not None and self._simplex is not None
-        point, along = self._optima
-        pool = self.pool
+        (point, box), pool = (self._simplex.solution(), self.box), self.pool
+        point = point[:-1] if box is None else np.concatenate([point[:-1], box * (point[-1] * self._unit)])
         G, h = self.containment(pool)
         width = self.width[pool]
         unit = np.minimum(1.0, 1.0 / width)
         rows = np.hstack([np.zeros((len(pool), self.r)), -(width * unit)[:, None] * self.psi[pool]])
         limits = (width * self.half[pool] - self.allowed) * unit
-        low, high = np.isfinite(self.lower), np.isfinite(self.upper)
-        every = np.eye(len(point))
-        h = np.concatenate([h, limits, self.lower[low], -self.upper[high]])
-        G, h = self._asked(np.vstack([G, rows, every[low], -every[high]]), h)
+        G, h = self._asked(np.vstack([G, rows]), np.concatenate([h, limits]))
         h = np.minimum(h - G @ point, 0.0)  # the point satisfies them, but for rounding
-        count = len(h) - 3 * len(pool)
-        anywhere = np.full(along.shape[1], np.inf)
-        some = np.zeros(len(h))  # containment, and half-widths that may be 0; the limit has some room already
-        some[: 2 * len(pool)] = 1.0
-        some[3 * len(pool) :][: np.count_nonzero(low)] = np.flatnonzero(low) >= self.r
-        G, size = G @ along, np.linalg.norm(G, axis=1)
-        moved = np.linalg.norm(G, axis=1) > 1e-9 * size  # the others are as they are in every optimum
-        G, h, some = G[moved], h[moved], some[moved]
-        start = np.zeros(len(anywhere) + len(moved), dtype=np.int32)  # what was active among the rows last time
-        if "ties" in self._active:
-            known = self._active["ties"]
-            then = (len(known) - count) // 3
-            both = min(then, len(pool))  # the pool grows, but for discards
-            start[len(anywhere) :][: 3 * len(pool)].reshape(3, -1)[:, :both] = known[: 3 * then].reshape(3, -1)[
-                :, :both
-            ]
-            start[len(anywhere) + 3 * len(pool) :] = known[3 * then :]
-        start = start[np.concatenate([np.ones(len(anywhere), dtype=bool), moved])]
-        for (factor, ridge), room in _TIES if len(anywhere) else ():
-            h = np.minimum(h, -room * some)
-            H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
-            f, H = along.T @ (f + H @ point), along.T @ H @ along
-            H += _RIDGE * float(np.diagonal(H).max()) * np.eye(len(f))
-            try:
-                answer = solve_qp(H, f, G, h, -anywhere, anywhere, start, any_solver=False)
-            except FitError:
-                continue
-            if answer.active is not None:
-                self._active["ties"] = np.zeros(len(moved), dtype=np.int32)
-                self._active["ties"][moved] = answer.active[len(anywhere) :]
-            self.attempt = factor, ridge
-            self._store_limited(np.append(point + along @ answer.xi, self.allowed))
-            return answer.solver
-        self.store(point)  # one optimum, or rounding leaves no room to choose
-        return "HiGHS simplex"
-
-    @property
-    def _optima(self) -> tuple[Array, Array]:
-        """Where the optima of (11) are: one of them, and orthonormal directions to all others.
-
-        What carries the optimum keeps its value, so the directions leave it as it is.
-        """
-        assert self._simplex is not None
-        point, box = self._simplex.solution(), self.box
-        if box is None:
-            point, carrying = point[:-1], self._simplex.carrying()[:, :-1]
-        else:
-            point = np.concatenate([point[:-1], box * (point[-1] * self._unit)])
-            carrying = self._carrying_box()
-        norm = np.linalg.norm(carrying, axis=1)
-        _, values, right = np.linalg.svd(carrying[norm > 0.0] / norm[norm > 0.0, None])
-        return point, right[np.count_nonzero(values > 1e-10) :].T
-
-    def _carrying_box(self) -> Array:
-        """As `Simplex.carrying`: the samples that keep δ from being less keep their centre and their width."""
-        assert self._simplex is not None
-        rows, unknowns = self._simplex.priced()
-        fixed = np.zeros((len(unknowns), self.r + self.q))
-        fixed[np.arange(len(unknowns)), unknowns] = 1.0
-        before = rows < len(self.asked)
-        asked = self.asked[rows[before]]
-        samples = np.searchsorted(self.samples.index, self._known[rows[~before] - len(self.asked)] // 2)
-        phi, psi = self.phi[samples], self.psi[samples]
-        return np.vstack(
-            [
-                np.hstack([asked, np.zeros((len(asked), self.q))]),
-                np.hstack([phi, np.zeros_like(psi)]),
-                np.hstack([np.zeros_like(phi), psi]),
-                fixed[unknowns < self.r],
-            ]
-        )
+        H, f = self.hessian(self.plain, self.plain_linear, BOUNDED_TIE_BREAK)
+        f, largest = f + H @ point, float(np.diagonal(H).max())
+        step, solver, contained = np.zeros(len(point)), "HiGHS simplex", 2 * len(pool)
+        around = h[:contained].copy()
+        for room in _ROOM:
+            h[:contained] -= room
+            for share in _HOLD:
+                hold = share * largest
+                try:
+                    held = H + hold * np.eye(len(step)), f - hold * step
+                    low, high = self.lower - point, self.upper - point
+                    answer = solve_qp(*held, G, h, low, high, feasible=_ROOM[-1] if self.refined else FEASIBLE)
+                except FitError:
+                    break
+                left = max(0.0, -float((G[:contained] @ answer.xi - around).min(initial=0.0)))  # the repair covers it
+                d = (point + answer.xi)[self.r :]
+                if (width * (self.psi[pool] @ d + self.half[pool] + left)).max(initial=0.0) > (
+                    1.0 + GOOD
+                ) * self.allowed:
+                    break
+                step, solver = answer.xi, answer.solver
+            if step.any():
+                break
+        self.attempt = _ATTEMPTS[0]
+        self._store_limited(np.append(point + step, self.allowed))
+        return solver
 
     def polish(self) -> None:
         """Solve for the centre again, with the half-widths as they are: the tie-break on its own.

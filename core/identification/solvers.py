@@ -156,8 +156,6 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
 
 _ITERATIONS = 50
 """Steps of the simplex method per variable: on degenerate programmes it may go round for ever; most take under 5."""
-_PRICE = 1e-7
-"""Share of the largest price above which a price is none of rounding."""
 _REMEDIES: tuple[dict[str, Any], ...] = (
     {"simplex_scale_strategy": 2},
     {"presolve": "off"},
@@ -253,26 +251,6 @@ class Simplex:
         Returns (variables,): ξ.
         """
         return np.asarray(self._highs.getSolution().col_value, dtype=np.float64)
-
-    def priced(self) -> tuple[Index, Index]:
-        """What the optimum found last rests on: rows and unknowns that keep their value in every optimum.
-
-        A row with a price, or an unknown with one, is at its limit in all of them.
-
-        Returns (k,): numbers of rows; Returns (l,): numbers of unknowns.
-        """
-        prices = np.abs(self.duals())
-        reduced = np.abs(np.asarray(self._highs.getSolution().col_dual, dtype=np.float64))
-        least = _PRICE * max(prices.max(initial=0.0), reduced.max(initial=0.0))
-        return np.flatnonzero(prices > least), np.flatnonzero(reduced > least)
-
-    def carrying(self) -> Array:
-        """What the optimum found last rests on, as rows.
-
-        Returns (k, variables): rows as they were added, and unit vectors of unknowns.
-        """
-        rows, unknowns = self.priced()
-        return np.vstack([self._rows[rows], np.eye(self._size)[unknowns]])
 
     def solve(self) -> Array:
         """Minimise.

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, real
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.schedule import Schedule
@@ -91,15 +91,18 @@ class Structure:
                     said = self._read(name, values)
                     target[name] = np.where(np.isnan(said), target[name], said)
         for name in self._shapes:
-            wrong = np.argwhere(self.lower[name] > self.upper[name])
+            low, high = self.lower[name], self.upper[name]
+            if ((low == math.inf) | (high == -math.inf)).any():
+                raise FitError(f"structure: {name} is to be infinite; give finite numbers, NaN for a free element")
+            wrong = np.argwhere(low > high)
             if len(wrong):
                 at = tuple(wrong[0].tolist())
                 raise FitError(
-                    f"structure: {name}{list(at)} is to be at least {self.lower[name][at]:g} and at most "
-                    f"{self.upper[name][at]:g}; mend one of them"
+                    f"structure: {name}{list(at)} is to be at least {low[at]:g} and at most {high[at]:g}; "
+                    f"mend one of them"
                 )
-            if name in HALF_WIDTHS and (self.lower[name] < 0).any():
-                at = tuple(np.argwhere(self.lower[name] < 0)[0].tolist())
+            if name in HALF_WIDTHS and (low < 0).any():
+                at = tuple(np.argwhere(low < 0)[0].tolist())
                 raise FitError(f"structure: {name}{list(at)} is a half-width and cannot be below 0")
 
     def _known(self, name: str) -> None:
@@ -109,9 +112,9 @@ class Structure:
     def _read(self, name: str, values: ArrayLike) -> Array:
         self._known(name)
         try:
-            array = np.asarray(values, dtype=np.float64)
+            array = real(values)
         except (TypeError, ValueError):
-            raise FitError(f"structure: {name} is not an array of numbers; write NaN for a free element") from None
+            raise FitError(f"structure: {name} is not an array of real numbers; write NaN for a free element") from None
         if array.shape != self._shapes[name]:
             raise FitError(f"structure: {name} has shape {array.shape}; it must be {self._shapes[name]}")
         return array

@@ -23,6 +23,7 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Samples
 from uncertain_lti.identification.regimes import tied_blocks
 from uncertain_lti.identification.row import (
+    GOOD,
     JOIN,
     LEAST,
     ROUGH,
@@ -39,9 +40,6 @@ _FURTHER = 2.5
 """After the first pass, samples are held whose slack is up to this many times as large: few are left there."""
 SUBSAMPLE = 10_000
 """Transitions of the first solve; up to twice as many are held as a whole."""
-GOOD = 1e-7
-"""Relative distance from the optimum, what the repair will add included, above which a row is solved once more, in
-coordinates of its residual."""
 MAX_ROUNDS, FEW_ROUNDS = 200, 60
 _REMEDY = "a state may follow from the others exactly: leave it out, or fix its row by structure"
 

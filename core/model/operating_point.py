@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, real
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.signals.signal_map import Signal
 
@@ -70,7 +70,10 @@ class OperatingPoint:
 
     def __post_init__(self) -> None:
         for name in ("x_s", "u_s", "X", "U", "s_s", "S"):
-            value = np.array(getattr(self, name), dtype=np.float64, ndmin=1)
+            try:
+                value = np.atleast_1d(real(getattr(self, name)))
+            except TypeError:
+                raise TransientError(f"operating point: {name} must be a vector of real numbers") from None
             value.flags.writeable = False
             object.__setattr__(self, name, value)
             if value.ndim != 1 or not np.isfinite(value).all():

@@ -26,7 +26,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, real
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
@@ -114,7 +114,7 @@ def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_wid
     try:
         if isinstance(value, Sequence) and not _numbers_only(value):
             raise TypeError
-        array = np.array(value, dtype=np.float64)
+        array = real(value)
     except (TypeError, ValueError, OverflowError):
         raise ModelError(f"field '{name}' is not an array of numbers") from None
     if shape is not None and array.shape != shape:

@@ -227,6 +227,7 @@ def fit(
             messages.append(f"{listed}: {chosen_horizons.reason}")
     shape: dict[str, Any] = {"schedule": asked, "horizons": list(lengths), "widths": lengths}
     shape["transient_weights"] = transient_weights
+    shape["drop_horizons"] = not (rule and (rule.steps or rule.seconds))
     said: dict[str, Any] = {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
     if alarm == "panel" and method == "working-set":
         ways: list[dict[str, Any]] = [

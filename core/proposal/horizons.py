@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
@@ -154,10 +154,16 @@ def choose_horizons(
     base: HorizonCandidate | None = None
     found: dict[int, dict[str, HorizonCandidate]] = {}
     what, units = "recording", 0
+
+    def refuse_missing(there: Collection[int]) -> None:
+        if missing := [h for h in lengths if h not in there]:
+            if asked:
+                raise FitError(f"no horizon of {missing[0]} steps: {dropped[missing[0]]}")
+
     for kind in kinds:
         if progress is not None:
             progress(f"{kind} half-widths over {', '.join(map(str, lengths))} steps")
-        model = fit(transients, describe_data=False, horizons=lengths, widths=kind, **options)
+        model = fit(transients, describe_data=False, horizons=lengths, widths=kind, drop_horizons=True, **options)
         dropped |= _dropped(model, lengths)
         try:
             fold = fold_of(transients, groups, model, FOLDS)
@@ -167,6 +173,7 @@ def choose_horizons(
             )  # fmt: skip
         except FitError as error:
             text = f"nothing can be left out: {error}"
+            refuse_missing(model.steps)
             chosen: dict[int, Widths] = {h.steps: "constant" for h in model.horizons} if asked else {}
             return HorizonChoice(chosen, (), what, 0, text)
         what = fold.what
@@ -189,6 +196,7 @@ def choose_horizons(
                 float(np.mean(logs)) if logs else math.nan,
             )
     assert base is not None
+    refuse_missing(found)
     return _decided(found, base, asked, what, units, dropped)
 
 

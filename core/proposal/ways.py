@@ -32,6 +32,8 @@ PROMISING, SIGNALS = 0.9, 2
 """Largest least-squares residual with three knots, relative to one, up to which a signal is tried; and how many are."""
 LONGEST = 64
 """Steps of the longest horizon tried."""
+
+
 @dataclass(frozen=True)
 class Setting:
     """One way to fit.

@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, real
 from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
@@ -683,9 +683,9 @@ def _median_forward(t: NDArray[Any]) -> float:
 
 def _matrix(values: ArrayLike, rows: int, what: str, name: str) -> Array:
     try:
-        array = np.array(values, dtype=np.float64)
+        array = real(values)
     except (TypeError, ValueError):
-        raise TransientError(f"{name}: {what} is not numeric; give numbers, NaN where there is none") from None
+        raise TransientError(f"{name}: {what} is not numeric; give real numbers, NaN where there is none") from None
     if array.ndim == 1 and what == "u" and array.size == 0:
         array = array.reshape(rows, 0)
     elif array.ndim == 1:

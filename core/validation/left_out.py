@@ -65,6 +65,7 @@ def validate(
     options["schedule"] = full.schedule or {}  # none, even where the signals file asks for one
     options["horizons"] = [horizon.steps for horizon in full.horizons]
     options["widths"] = {horizon.steps: horizon.widths for horizon in full.horizons}
+    options["drop_horizons"] = True  # where a part is too short for one, the others are judged
     if groups is not None and blocks is not None:
         raise FitError("groups leave out whole recordings, and blocks cut them; choose one")
     names, grouping = resolve_groups(transients, groups)
