@@ -11,6 +11,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,7 @@ from engine_bag import SIGNALS, engine_bag
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import BagError, ModelError, SignalError, TransientError
+from uncertain_lti.base.packages import absent
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
@@ -91,7 +93,7 @@ def test_a_robot_that_only_monitors_is_told_what_recordings_need(folder, package
     assert "Traceback" not in done.stderr
     if done.returncode:
         assert done.returncode == 2, done.stderr
-        assert f"the Python package {package}" in done.stderr and "pip install uncertain-lti-ros" in done.stderr
+        assert f"the Python package {package}" in done.stderr and "in the checkout: pip install ." in done.stderr
     else:
         assert package not in ("lz4", "mcap")
 
@@ -127,6 +129,53 @@ def test_a_reader_that_goes_away_leaves_the_alarm_unknown(folder):
         done = run(commands(folder)[what], stdout=wrote, stderr=subprocess.PIPE)
         os.close(wrote)
         assert done.returncode == status and done.stderr == "", what
+
+
+@pytest.mark.parametrize("command", ["fit", "tune"])
+def test_a_model_is_written_whoever_reads_what_is_said(tmp_path, command):
+    """A reader that has read enough, as `| head` does, is no error and stops no work."""
+    words = {
+        "fit": ["fit", "bags/leibov_fit.mcap", "--signals", "config/signals/engine.yaml", "--output"],
+        "tune": ["tune", "bags/leibov_fit.mcap", "--signals", "config/signals/engine.yaml", "--output"],
+    }[command]
+    read, wrote = os.pipe()
+    os.close(read)
+    unbuffered = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    done = run([*words, str(tmp_path / "m.model.json")], stdout=wrote, stderr=subprocess.PIPE, cwd=ROOT, env=unbuffered)
+    os.close(wrote)
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    assert (tmp_path / "m.model.json").exists()
+
+
+SOLVERS = ("cvxpy", "daqp", "highspy", "osqp", "piqp", "scipy")
+
+
+def without(packages, words):
+    gone = f"import sys; sys.modules.update(dict.fromkeys({packages!r}))"
+    program = f"{gone}; from uncertain_lti.cli.main import main; sys.exit(main())"
+    return subprocess.run([sys.executable, "-c", program, *words], text=True, capture_output=True, timeout=1200)
+
+
+def test_init_needs_no_solver(tmp_path):
+    bags = [str(ROOT / f"bags/turbofan_{name}.mcap") for name in ("pulses_up", "pulses_down")]
+    done = without(SOLVERS, ["init", *bags, "--output", str(tmp_path / "signals.yaml")])
+    assert done.returncode == 0, done.stderr
+    assert "states:" in (tmp_path / "signals.yaml").read_text()
+    assert "not tried: the Python package" in done.stderr and "pip install '.[fit]'" in done.stderr
+
+
+def test_a_hint_names_an_extra_that_setup_py_has(folder):
+    """The distribution is on no index: what is missing is installed from the checkout."""
+    done = without(("jinja2",), commands(folder)["report"][:-1] + ["--output", str(folder / "page.html")])
+    assert done.returncode == 2 and done.stderr.endswith(
+        "the Python package jinja2 is not installed; in the checkout: pip install '.[plots]'\n"
+    )
+    assert "'.[plots]'" in absent("PIL.Image") and absent("nobody's") == ""
+    extras = dict(re.findall(r'^    "(\w+)": \[(.*?)\],', (ROOT / "setup.py").read_text(), re.M | re.S))
+    for package in (*SOLVERS, "jinja2", "matplotlib", "pyarrow", "control", "distributed", "shtab"):
+        extra = re.search(r"'\.\[(\w+)\]'", absent(package))[1]
+        assert f'"{package}' in extras[extra]
+    assert '"ros-rclpy' in extras["ros"] and "'.[ros]'" in absent("rclpy")
 
 
 def test_a_name_that_the_terminal_has_no_letters_for(tmp_path):

@@ -93,6 +93,9 @@ def test_the_page_answers_first(engine, tmp_path, capsys):
     text = " ".join(page.text)
     first = text.index("alarm score"), text.index("May I rely on it?"), text.index("What happened?")
     assert first == tuple(sorted(first)) and first[-1] < text.index("All recordings")
+    weights = [line.strip().partition(":")[0] for line in said.splitlines() if line.startswith("  ")]
+    listed = {weight for weight in weights if weight in ("no", "unknown", "with care", "yes")}
+    assert listed and all(f"{weight}:" in text for weight in listed), "the terminal and the page use the same words"
     assert "has not been validated" in text
     assert "bad.mcap" in text and "2.5" in text and "fan (" in text
     assert text.index("states (violations,") < text.index("last [s]"), "a phone shows the first columns"

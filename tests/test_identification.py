@@ -732,9 +732,12 @@ def test_structure_rules_of_a_signals_file():
             {"state": "p", "from": "v", "nominal": 1},
             {"state": "v", "from": "f", "nominal": {"min": "0.0e0"}, "half_width": {"max": 2.5}},  # YAML 1.1: text
             {"state": "*", "from": "noise", "half_width": 0.1},
+            {"state": "p", "from": "disturbance", "nominal": 0.5},
+            {"state": "v", "from": "drift", "nominal": 0.25},  # the older word
         ],
         *names,
     )
+    assert structure.lower["c"].tolist() == structure.upper["c"].tolist() == [0.5, 0.25]
     assert structure.lower["A"].tolist() == [[0, 1], [-np.inf, -np.inf]]
     assert structure.upper["dB"].tolist() == [[0], [2.5]] and structure.lower["B"].tolist() == [[0], [0]]
     assert structure.lower["v"].tolist() == structure.upper["v"].tolist() == [0.1, 0.1]

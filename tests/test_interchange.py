@@ -97,11 +97,18 @@ def test_what_is_no_model_is_refused():
         UncertainLTI.from_control(model.to_control(recorded=True), recorded=True)
     with pytest.raises(ModelError, match="dA"):
         UncertainLTI.from_control(model.to_control(), dA=[[1.0]])
-    with pytest.raises(ModelError, match="called 'drift'"):
+    with pytest.raises(ModelError, match="called 'disturbance'"):
         UncertainLTI(
             [[1.0]], [[1.0]], [[0.0]], [[0.0]], [1.0],
-            signals=SignalMap((Signal("x", "", "x"),), (Signal("drift", "", "u"),)),
+            signals=SignalMap((Signal("x", "", "x"),), (Signal("disturbance", "", "u"),)),
         ).to_control()  # fmt: skip
+
+
+def test_a_system_that_calls_the_disturbance_a_drift_still_reads():
+    model = some_model(drift=True)
+    older = model.to_control()
+    older.set_inputs([*older.input_labels[:-1], "drift"])
+    assert np.array_equal(UncertainLTI.from_control(older).c, model.c)
 
 
 # --- MATLAB -----------------------------------------------------------------------------------------------------
@@ -341,7 +348,8 @@ def test_a_scheduled_model_is_one_system_per_block_and_one_at_a_point():
     for r, system in enumerate(systems):
         one = model.to_control(0.02, knot=r)
         assert np.array_equal(one.A, system.A) and np.array_equal(one.B, system.B)
-        assert np.allclose(system.A, np.eye(2) + 0.02 * model.A[r]) and list(system.input_labels) == ["u0", "drift"]
+        assert np.allclose(system.A, np.eye(2) + 0.02 * model.A[r])
+        assert list(system.input_labels) == ["u0", "disturbance"]
         again = UncertainLTI.from_control(system, dA=model.dA[r], dB=model.dB[r], signals=model.signals)
         assert np.allclose(again.A, model.A[r]) and np.allclose(again.c, model.c[r])
     between = model.at(x0=1.0 + 2.3 * 0.44).to_control(0.02)  # half way from one knot to the next
@@ -350,7 +358,7 @@ def test_a_scheduled_model_is_one_system_per_block_and_one_at_a_point():
     assert np.allclose(np.hstack([middle.A, middle.B]), (low + high) / 2)
     assert not np.allclose(between.A, middle.A)
     calm = model.replace(c=np.where(np.arange(3)[:, None] == 1, model.c, 0.0))
-    assert [list(s.input_labels) for s in calm.to_control()] == [["u0", "drift"]] * 3
+    assert [list(s.input_labels) for s in calm.to_control()] == [["u0", "disturbance"]] * 3
     for knot in (-1, 3):
         with pytest.raises(ModelError, match="blocks 0 to 2"):
             model.to_control(knot=knot)

@@ -229,4 +229,4 @@ def test_without_rclpy_a_program_says_what_to_install(node: str) -> None:
         done = subprocess.run([sys.executable, "-c", f"{code}; sys.exit(run())"], capture_output=True, text=True)
         (line,) = done.stderr.splitlines()
         assert done.returncode == 2 and line.startswith(f"{node}: {says}")
-        assert line.endswith("; source a ROS 2 Jazzy installation, or pip install 'uncertain-lti-ros[ros]'")
+        assert line.endswith("; source a ROS 2 Jazzy installation, or in the checkout: pip install '.[ros]'")

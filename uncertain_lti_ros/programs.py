@@ -40,7 +40,7 @@ def _run(name: str) -> int:
         package = (error.name or "").partition(".")[0]
         absent = isinstance(error, ModuleNotFoundError) and package
         what = f"the Python package {package} is not installed" if absent else str(error).partition("\n")[0]
-        remedy = "source a ROS 2 Jazzy installation, or pip install 'uncertain-lti-ros[ros]'"
+        remedy = "source a ROS 2 Jazzy installation, or in the checkout: pip install '.[ros]'"
         print(f"{name}: {what}; {remedy}", file=sys.stderr)
         return _BAD_USAGE
     except KeyboardInterrupt:

@@ -67,9 +67,23 @@ class Command:
 
 
 def print_summary(options: argparse.Namespace, text: str) -> None:
-    """Print part of the summary for a person, unless JSON is asked for or nothing at all."""
+    """Print part of the summary for a person, unless JSON is asked for or nothing at all.
+
+    What is to be written is written also when `| head` has read enough; only a check has nothing more to do.
+    """
     if not options.json:
-        options.progress.say(text)
+        try:
+            options.progress.say(text)
+        except BrokenPipeError:
+            if options.command == "check":
+                raise
+            drop_output()
+
+
+def drop_output() -> None:
+    """Let the end of the process find nothing that it cannot write."""
+    with suppress(OSError, AttributeError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def complain(command: str, text: str) -> None:

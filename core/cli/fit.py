@@ -48,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--additive",
         choices=CHOICES,
-        help="further terms: drift with its half-width, measurement noise (default: the signals file's, else noise, "
-        "and the drift where it narrows the envelope clearly)",
+        help="further terms: disturbance c with its half-width, measurement noise (default: the signals file's, else "
+        "noise, and the disturbance where it narrows the envelope clearly)",
     )
     parser.add_argument(
         "--alarm",

@@ -25,6 +25,7 @@ from typing import Any, NoReturn
 
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import UncertainLTIError
+from uncertain_lti.base.packages import absent
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli import (
     check,
@@ -42,7 +43,7 @@ from uncertain_lti.cli import (
     tune,
     validate,
 )
-from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain
+from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output
 
 COMMANDS: tuple[Command, ...] = (
     topics.COMMAND,
@@ -64,19 +65,6 @@ COMMANDS: tuple[Command, ...] = (
 )
 """Every command, in the order of the help."""
 
-_FIT = "install what fitting needs: pip install 'uncertain-lti-ros[fit]'"
-_ROS = "source a ROS 2 Jazzy installation, or pip install 'uncertain-lti-ros[ros]'"
-_READ = "install what recordings need: pip install uncertain-lti-ros, or rosdep with the folder rosdep of its source"
-_FIGURES = "install what figures need: pip install 'uncertain-lti-ros[plots]'"
-_EXTRAS = {
-    **dict.fromkeys(("lz4", "mcap", "rosbags", "tqdm", "zstandard"), _READ),
-    **dict.fromkeys(("cvxpy", "osqp", "daqp", "piqp", "highspy", "scipy"), _FIT),
-    **dict.fromkeys(("rclpy", "std_msgs", "sensor_msgs", "rosgraph_msgs", "std_srvs", "uncertain_lti_ros"), _ROS),
-    "distributed": "install what a cluster needs: pip install 'uncertain-lti-ros[cluster]'",
-    "shtab": "install what completion needs: pip install 'uncertain-lti-ros[completion]'",
-    **dict.fromkeys(("jinja2", "markupsafe", "matplotlib"), _FIGURES),
-}
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command."""
@@ -93,10 +81,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if sys.stdout is not None:
                 sys.stdout.flush()  # what cannot be written is found while it can still be said
     except BrokenPipeError:  # `| head` has read enough
-        _drop_output()
+        drop_output()
         return NOT_READ if command in ("check", "report", "plot") else DONE
     except OSError as error:
-        _drop_output()
+        drop_output()
         return _refuse(
             command, f"the output cannot be written ({error.strerror or error}); make room, or send it elsewhere"
         )
@@ -119,10 +107,8 @@ def _run(command: str, given: Sequence[str]) -> int:
     except UncertainLTIError as error:
         return _refuse(command, str(error))
     except ModuleNotFoundError as error:
-        extra = _EXTRAS.get((error.name or "").partition(".")[0])
-        if extra is None:
-            return _fault(command)
-        return _refuse(command, f"the Python package {error.name} is not installed; {extra}")
+        text = absent(error.name)
+        return _refuse(command, text) if text else _fault(command)
     except BrokenPipeError:
         raise
     except OSError as error:
@@ -153,19 +139,13 @@ def _fault(command: str) -> int:
     return FAULT
 
 
-def _drop_output() -> None:
-    """Let the end of the process find nothing that it cannot write."""
-    with suppress(OSError, AttributeError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 def build_parser(chosen: str = "", every: bool = False) -> argparse.ArgumentParser:
     """Declare the arguments of every command; those that need rclpy, only of the chosen one."""
     parser = _Parser(
         prog="uncertain-lti",
         description="Fit an uncertain linear model to recorded transients, and report when a machine leaves it.",
-        epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 70 a fault of this program, "
-        "130 interrupted by Ctrl-C.",
+        epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 3 a check that says nothing of "
+        "the machine, 70 a fault of this program, 130 interrupted by Ctrl-C.",
     )
     parser.add_argument("--version", action="version", version=f"uncertain-lti {__version__}")
     parser.set_defaults(build_parser=build_parser)

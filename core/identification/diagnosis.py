@@ -87,7 +87,7 @@ def check_solvable(problem: Problem, transients: Sequence[Transient], names: Seq
 
 def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, list[str]]:
     """Rank of the nominal regressors and, in words, which columns make it deficient."""
-    names = [*names, "the drift c"] if problem.columns.drift else list(names)
+    names = [*names, "the disturbance c"] if problem.columns.drift else list(names)
     messages = []
     dead = sums.phi_scale == 0
     for j in np.flatnonzero(dead):
@@ -111,7 +111,7 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
     for j in np.flatnonzero((moved == 0) & ~dead[: problem.p]):
         messages.append(
             f"'{names[j]}' is constant ({problem.z[0, j]:.4g}) in every transition, so its column cannot be told from "
-            f"a drift; record it moving, or leave it out"
+            f"the disturbance c; record it moving, or leave it out"
         )
     return int(np.count_nonzero(values > limit)), messages
 

@@ -130,9 +130,9 @@ class Structure:
     ) -> Structure:
         """From the list under `structure:` in a signals file.
 
-        Each rule names elements by `state` (the row; `*` for all) and `from` (a state, a control, `drift`, `noise` or
-        `*` for every state and control), and gives `nominal` and/or `half_width`: a number, or {min: a, max: b}.
-        A later rule overrides an earlier one.
+        Each rule names elements by `state` (the row; `*` for all) and `from` (a state, a control, `disturbance`,
+        `noise` or `*` for every state and control), and gives `nominal` and/or `half_width`: a number, or
+        {min: a, max: b}. A later rule overrides an earlier one.
 
         Of a scheduled model, `knot` names the knot or mode that a rule holds for, by its number from 1 on (a list of
         numbers if there are two scheduling signals), or all, which is the default; `shared: true` has the elements be
@@ -188,7 +188,8 @@ class Structure:
                 raise FitError(f"{here}: what is shared is so at all knots; leave out knot, or shared")
             rows = range(n) if rule["state"] == "*" else [_position(rule["state"], states, f"{here}: state")]
             columns: list[tuple[str, str, int | None]] = []
-            additive = [term for term in ADDITIVE if rule["from"] == term.word]
+            word = "disturbance" if rule["from"] == "drift" else rule["from"]  # as rules had it before
+            additive = [term for term in ADDITIVE if word == term.word]
             if additive:
                 columns = [(term.nominal, term.half, None) for term in additive]
             elif rule["from"] == "*":

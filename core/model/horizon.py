@@ -73,7 +73,7 @@ class Run:
     The centre of the narrowest envelope of one step may be unstable in a block whose ends few samples visit; over many
     steps the least squares of the same elements often stay nearer to the machine.
 
-    `A` (n, n): 1/s; `B` (n, m): 1/s; `c` (n,): drift, 1/s.
+    `A` (n, n): 1/s; `B` (n, m): 1/s; `c` (n,): disturbance, 1/s.
     """
 
     def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike) -> None:

@@ -29,15 +29,15 @@ from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
-DRIFT = "drift"
-"""Name of the input, to be held at 1, that carries the drift c of a model in a state-space system."""
+DISTURBANCE = "disturbance"
+"""Name of the input, to be held at 1, that carries c of a model in a state-space system; `drift` in older ones."""
 _VECTORS = tuple(name for name in ARRAYS if SHAPES[name].regressor == "1")
 
 
 def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot: int | None = None) -> Any:
     """The nominal model as a `control.StateSpace`; its outputs are the states.
 
-    Half-widths have no place there: keep the model as well. A drift c becomes a last input called `drift`, to be
+    Half-widths have no place there: keep the model as well. c becomes a last input called `disturbance`, to be
     held at 1. Of a scheduled model there is one system per block, each for deviations from the one operating point, all
     with the same inputs; between the knots `model.at(...)` is a model without a schedule, with a system of its own.
 
@@ -62,26 +62,26 @@ def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot
     Raises
     ------
     ModelError
-        dt is not a positive number, a control is called `drift` and there is a drift, or there is no such block.
+        dt is not a positive number, a control is called `disturbance` and there is one, or there is no such block.
     """
     if dt is not None and not (math.isfinite(dt) and dt > 0):
         raise ModelError(f"dt is {dt}; it must be a positive number of seconds, or left out")
-    drift = bool(np.any(model.c))
-    if drift and DRIFT in model.control_names:
-        raise ModelError(f"a control is called '{DRIFT}', as the input for c would be; rename it")
+    offset = bool(np.any(model.c))
+    if offset and DISTURBANCE in model.control_names:
+        raise ModelError(f"a control is called '{DISTURBANCE}', as the input for c would be; rename it")
     if model.schedule is None:
         if knot is not None:
             raise ModelError(f"knot is {knot}, and the model has no schedule; leave it out")
-        return _system(model, dt, recorded, drift)
+        return _system(model, dt, recorded, offset)
     if knot is None:
-        return [_system(block, dt, recorded, drift) for block in model.blocks]
+        return [_system(block, dt, recorded, offset) for block in model.blocks]
     if not 0 <= knot < len(model.blocks):
         raise ModelError(f"knot is {knot}; the model has blocks 0 to {len(model.blocks) - 1}")
-    return _system(model.blocks[knot], dt, recorded, drift)
+    return _system(model.blocks[knot], dt, recorded, offset)
 
 
-def _system(model: Any, dt: float | None, recorded: bool, drift: bool) -> Any:
-    """Of a model without a schedule; drift: whether c is an input."""
+def _system(model: Any, dt: float | None, recorded: bool, offset: bool) -> Any:
+    """Of a model without a schedule; offset: whether c is an input."""
     import control
 
     A, B, c = np.array(model.A), np.array(model.B), np.array(model.c)
@@ -89,8 +89,8 @@ def _system(model: Any, dt: float | None, recorded: bool, drift: bool) -> Any:
         X, U = model.operating_point.X, model.operating_point.U
         A, B, c = A * X[:, None] / X, B * X[:, None] / U, c * X
     inputs = list(model.control_names)
-    if drift:
-        B, inputs = np.column_stack([B, c]), [*inputs, DRIFT]
+    if offset:
+        B, inputs = np.column_stack([B, c]), [*inputs, DISTURBANCE]
     if dt is not None:
         A, B = np.eye(model.n) + dt * A, dt * B
     n, m = B.shape
@@ -153,7 +153,7 @@ def from_control(
     if system.dt:
         A, B = (A - np.eye(n)) / system.dt, B / system.dt
     inputs, c = list(system.input_labels), np.zeros(n)
-    if inputs and inputs[-1] == DRIFT:
+    if inputs and inputs[-1] in (DISTURBANCE, "drift"):
         c, B, inputs = B[:, -1], B[:, :-1], inputs[:-1]
     if signals is None:
         if recorded:

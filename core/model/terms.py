@@ -65,7 +65,7 @@ class Term:
 TERMS = (
     Term("A", "dA", "x", True, True, "state matrix"),
     Term("B", "dB", "u", True, True, "control matrix"),
-    Term("c", "dc", "1", True, False, "drift", "drift"),
+    Term("c", "dc", "1", True, False, "disturbance", "disturbance"),
     Term("", "v", "1", False, False, "measurement noise", "noise"),
 )
 """Every term, in the order in which the bounds sum their columns."""

@@ -72,7 +72,7 @@ class UncertainLTI:
     c : array (n,), optional
         Drift, 1/s; 0 by default.
     dc : array (n,), optional
-        Half-width of the drift, 1/s; 0 by default.
+        Half-width of the disturbance, 1/s; 0 by default.
     v : array (n,), optional
         Half-width of measurement noise, normalised; not multiplied by Δt; 0 by default.
     schedule : Schedule, optional

@@ -84,7 +84,7 @@ def fit(
         W(t_{k+1}) for step k of N; positive; full matrices symmetric positive definite. Off-diagonal elements
         couple the rows in (10); (11) uses the diagonal. Default ones.
     additive : {"none", "disturbance", "noise", "both"}, optional
-        Further terms: drift c with half-width dc (disturbance), half-width v of measurement noise (noise). Default:
+        Further terms: disturbance c with half-width dc, half-width v of measurement noise (noise). Default:
         that of the signals file, else noise, or both chosen in the same way.
     operating_point : OperatingPoint, optional
         Steady state and scales; default: those of the transients' signals, or values used as they are; where criterion
@@ -101,7 +101,7 @@ def fit(
         least to the greatest recorded value, the inner ones where they shrink the largest residuals most; or with
         "auto": as many as the recordings carry, by what is left out of the fit (`choose_knots`), with the table in
         `model.fit_summary["schedule"]`. Default: that of the signals file, else one block. With a
-        schedule and an additive term the drift c is unknown, too: it moves the steady state from knot to knot.
+        schedule and an additive term c is unknown, too: it moves the steady state from knot to knot.
     horizons : HorizonRule, mapping, sequence of int or "auto", optional
         Envelopes over several steps beside that of one: numbers of steps; `{"seconds": [0.1, 0.5]}`;
         `{"longest": 1.0}`, a geometric set of horizons up to so many seconds, of which those stay that hold on what is

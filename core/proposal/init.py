@@ -20,6 +20,7 @@ import numpy as np
 
 from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, TransientError
+from uncertain_lti.base.packages import absent
 from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
 from uncertain_lti.proposal.choosing import choose
 from uncertain_lti.proposal.effects import earlier, held
@@ -123,7 +124,10 @@ def propose(
         set_own_scale(candidate)
     warnings = (*(warning for bag in bags for warning in bag.warnings), *([doubt] if doubt else []))
     members = _members(chosen, used, moving)
-    memories = _memories(chosen, used, sources)
+    try:
+        memories = _memories(chosen, used, sources)
+    except ModuleNotFoundError as error:  # all but this needs no solver
+        memories, warnings = [], (*warnings, f"what lies further back was not tried: {absent(error.name) or error}")
     text = signals_file(bags, sources, chosen, used, doubt, memories, members, runs)
     return Proposal(tuple(chosen), tuple(used), text, warnings, tuple(members))
 

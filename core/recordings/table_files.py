@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.packages import absent
 from uncertain_lti.recordings.aside import aside, most_inflated, one_line
 from uncertain_lti.recordings.unreadable import os_error
 
@@ -433,10 +434,7 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: list[str]) ->
 
 
 def _wants(path: Path, package: str) -> str:
-    return (
-        f"{path}: reading it takes the Python package {package}, which is not installed; "
-        f"pip install 'uncertain-lti-ros[tables]'"
-    )
+    return f"{path}: it cannot be read: {absent(package)}"
 
 
 _READERS: Mapping[str, Callable[[Path], RawTable]] = {

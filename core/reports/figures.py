@@ -178,7 +178,7 @@ def horizon_figure(
 def matrices_figure(model: UncertainLTI) -> Any:
     """A and B with their half-widths ΔA and ΔB as heat maps with names, in 1/s of normalised quantities.
 
-    A dot marks an element whose half-width is greater than itself: its sign is not known. Columns c (drift) and
+    A dot marks an element whose half-width is greater than itself: its sign is not known. Columns c (disturbance) and
     v (noise, not multiplied by Δt) appear where the model has them. A scheduled model has a row per element, of those
     whose intervals reach farthest, and a column per block.
 
@@ -484,7 +484,7 @@ def _scale(values: Array, kind: str) -> dict[str, Any]:
 
 
 def _elements(model: UncertainLTI) -> tuple[Array, Array, list[str]]:
-    """Nominal elements and half-widths side by side, (..., n, columns), with what the model has of drift and noise."""
+    """Nominal elements and half-widths side by side, (..., n, columns), with its disturbance and noise."""
     nominal, half = [model.A, model.B], [model.dA, model.dB]
     columns = [_short(name) for name in (*model.state_names, *model.control_names)]
     for term, centre, width in model.additive():

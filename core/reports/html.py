@@ -47,9 +47,7 @@ MOST_DRAWN = 6
 """Recordings with charts of their own; those with most violations."""
 _COLUMNS = 700  # of a chart
 _MOST_STATES, _MOST_ROWS, _MOST_EPISODES = 8, 40, 20
-_ANSWER = {YES: "Yes", CARE: "With care", UNKNOWN: "Unknown", NO: "No"}
 _TONE = {YES: "good", CARE: "care", UNKNOWN: "care", NO: "bad"}
-_WEIGHED = {YES: "in its favour", CARE: "mind", UNKNOWN: "unknown", NO: "against it"}
 _STATE = {"quiet": "nothing", "violations": "violations", "alarm": "alarm", "unknown": "no verdict"}
 
 Block = dict[str, Any]
@@ -119,11 +117,11 @@ def _cards(facts: Mapping[str, Any]) -> Iterator[Block]:
     rely, happened = facts["rely"], facts["happened"]
     reasons = sorted(rely["reasons"], key=lambda r: WEIGHTS.index(r["weight"]))
     listed: list[Block] = [
-        {"lead": _WEIGHED[r["weight"]], "tone": _TONE[r["weight"]], "text": _cut(r["text"])} for r in reasons[:6]
+        {"lead": r["weight"], "tone": _TONE[r["weight"]], "text": _cut(r["text"])} for r in reasons[:6]
     ]
     if len(reasons) > 6:
         listed.append({"soft": True, "text": f"and {len(reasons) - 6} more", "to": "trust"})
-    yield {"title": "May I rely on it?", "tone": _TONE[rely["answer"]], "answer": _ANSWER[rely["answer"]]} | {
+    yield {"title": "May I rely on it?", "tone": _TONE[rely["answer"]], "answer": rely["answer"].capitalize()} | {
         "list": listed
     }
     what, look = _headline(facts)

@@ -1,0 +1,35 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Python packages that not every installation has, and how to get them."""
+
+from __future__ import annotations
+
+_EXTRAS = {
+    "fit": "cvxpy daqp highspy osqp piqp scipy",
+    "plots": "PIL jinja2 markupsafe matplotlib",
+    "tables": "pyarrow",
+    "control": "control",
+    "cluster": "distributed",
+    "completion": "shtab",
+    "ros": "rclpy rosgraph_msgs sensor_msgs std_msgs std_srvs uncertain_lti_ros",
+    "": "lz4 mcap rosbags tqdm zstandard",
+}
+"""What brings which packages: an extra of setup.py, or every installation."""
+
+
+def absent(package: str | None) -> str:
+    """That a package is not installed, and the remedy; empty where it is none of ours."""
+    first = (package or "").partition(".")[0]
+    for extra, packages in _EXTRAS.items():
+        if first in packages.split():
+            ros = "source a ROS 2 Jazzy installation, or " * (extra == "ros")
+            what = f"'.[{extra}]'" if extra else "., or rosdep with its folder rosdep"
+            return f"the Python package {first} is not installed; {ros}in the checkout: pip install {what}"
+    return ""
