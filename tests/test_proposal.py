@@ -726,3 +726,29 @@ def test_a_column_that_says_which_run_a_row_is_of_is_named(tmp_path, column, ids
 def test_a_mode_or_a_counter_tells_no_runs_apart(tmp_path, ids):
     path = trials(tmp_path / "modes.csv", "test", ids, restart=False, rows=60 if len(ids) == 3 else 10)
     assert "table:" not in propose([path]).text
+
+
+def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_path):
+    """A pump that is switched and its flow, one that never ran, an analyser, a label, a valve of a controller."""
+    rng = np.random.default_rng(0)
+    rows, level, analyser = [], 1.0, 0.0
+    on = np.repeat(rng.integers(0, 2, 60), 20)
+    for k in range(1200):
+        flow, valve = on[k] * (30 + rng.normal()), 50 + 5 * (level - 1) + rng.normal()
+        analyser = rng.normal() if k % 5 == 0 else analyser
+        pressure = 2 * flow + 3 * rng.normal()
+        rows.append([60 * k, level, rng.normal(), pressure, on[k], flow, 0, valve, analyser, level, int(k == 700)])
+        level += 0.01 * (flow - 15) - 0.05 * (level - 1) + 0.01 * rng.normal()
+    names = ["time", "Level1", "Temp", "Press", "S_PU1", "F_PU1", "S_PU2", "XMV_1", "Ratio", "Level1_again", "ATT_FLAG"]
+    path = tmp_path / "plant.csv"
+    path.write_text(",".join(names) + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    proposal = propose([path])
+    assert [c.name for c in proposal.states] == ["Level1", "Temp"], proposal.text
+    why = {c.name: c.why for c in proposal.controls}
+    assert why["S_PU1"] == "switched between 0, 1" and why["F_PU1"] == "0 whenever S_PU1 is off"
+    assert why["S_PU2"].startswith("always 0 here, so its effect is unknown") and "judged as well" in why["XMV_1"]
+    for words in ("Ratio.*an analyser: holds each value for 5 rows", "Press.*answers within a row", "ATT_FLAG: a label",
+                  "Level1_again: moves with Level1"):  # fmt: skip
+        assert re.search(words, proposal.text), words
+    model = fitted([path], proposal)
+    assert model.state_names == ("Level1", "Temp", "XMV_1") and model.fit_summary["violations"] == 0

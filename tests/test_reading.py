@@ -608,6 +608,19 @@ def test_a_still_stretch_ends_where_nobody_recorded(tmp_path: Path, seam: int) -
     assert (transient.signals.states[0].steady, transient.signals.states[0].scale) == (1.0, 3.0)
 
 
+def test_a_judged_control_is_read_as_the_control_that_it_is(tmp_path: Path) -> None:
+    """At each sample the value that a control would have, held as long; a file of a model keeps it."""
+    path = float_bag(tmp_path, "a.mcap", range(0, 3000 * MS, 100 * MS), range(0, 2000 * MS, 70 * MS))
+    control = replace(XU.controls[0], max_hold=0.3)
+    (plain,) = read_transients(path, replace(XU, controls=(control,)))
+    (read,) = read_transients(path, replace(XU, controls=(replace(control, judged=True),)))
+    assert read.state_names == ("x", "u") and read.x[:, 1].tobytes() == plain.u[: len(read), 0].tobytes()
+    assert np.isnan(read.x[:, 1]).any() and read.signals is not None
+    model_of(read.signals).save(tmp_path / "judged.model.json")
+    again = read_as_fitted(path, UncertainLTI.load(tmp_path / "judged.model.json").signals)
+    assert again.x.tobytes() == read.x.tobytes() and again.signals.states[1].judged
+
+
 @pytest.mark.parametrize("one_topic", [True, False])
 def test_controls_at_the_arrival_are_read_as_they_are_taken_of_a_recording(one_topic: bool, tmp_path: Path) -> None:
     """What `Transient.controls_at` makes of a recording is what a signals file says, live and offline."""

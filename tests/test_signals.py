@@ -416,6 +416,13 @@ def test_what_is_not_said_has_the_stated_defaults(tmp_path: Path) -> None:
     assert signals.states == (Signal("x", "/a", "data", 0.0, 1.0, "", "", None, 0),)
 
 
+def test_a_judged_control_has_a_row_behind_those_of_the_states(tmp_path: Path) -> None:
+    signals = SignalMap.load(saved(tmp_path, control("judged: true, max_hold: 0.5")))
+    assert [s.name for s in signals.states] == ["x", "u"] and signals.controls == ()
+    assert (signals.longest_age(1), signals.states[1].judged) == (0.5, True)
+    assert SignalMap.load(saved(tmp_path, control("judged: false"))).controls[0].name == "u"
+
+
 def test_every_shipped_signals_file_loads(signals_folder: Path) -> None:
     files = sorted(signals_folder.glob("*.yaml"))
     assert len(files) >= 6
@@ -490,6 +497,8 @@ def control(entry: str) -> str:
         (control("delay: 1000000000000000000000"), "signal 'u': delay is 1000000000000000000000; it must be 0 to"),
         (control("at: end"), "signal 'u': at is 'end'; write departure, arrival or both"),
         (control("at: both, delay: 1"), "signal 'u at arrival': at is arrival, and it is taken from earlier"),
+        (control("judged: 1"), "controls\\[0\\]: judged is 1; write true or false"),
+        (control("judged: true, delay: 1"), "signal 'u': is judged, and delayed, a memory or not at the departure"),
         (state("at: arrival"), "'x' is at arrival; that is for controls"),
         (X + "controls: [{name: u, topic: /a, field: data, at: both}]", "'u at arrival' is a state, which is judged"),
         (X + "clock: /b", "clock is /b, which carries no state; choose one of /a"),

@@ -373,7 +373,8 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"time x y\n1 2 3\n2 3 4\n", "apart by spaces alone"),
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
         ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
-        ("a.csv", b"time,y\n22/11/2026 06:28,2\n22/11/2026 06:29,3\n", "neither a number nor an ISO time"),
+        ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
+        ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
         ("a.csv", b"time,y\n2026-13-22T06:28:00,2\n2026-11-22T06:28:01,3\n", "is no day or time that there is"),
         ("a.csv", b"time,y\n1e300,2\n2e300,3\n", "is past the year 2262"),
         ("a.npz", b"PK\x03\x04nothing", "is damaged or no .npz file"),
@@ -538,3 +539,12 @@ def test_a_mat_file_that_breaks_its_reader_down_is_a_sentence(tables, tmp_path):
             Table(path)
         except BagError as error:
             assert str(path) in str(error) and "\n" not in str(error)
+
+
+def test_days_are_read_where_one_order_of_day_and_month_alone_goes_forward(tmp_path):
+    """As an hourly table of a plant has them: two digits of the year, and the hour alone."""
+    path = tmp_path / "a.csv"
+    path.write_text("DATETIME,x\n" + "".join(f"{12 + k // 24:02}/01/14 {k % 24:02},{k}\n" for k in range(48)))
+    (run,) = read_transients(path, SignalMap.from_dict({"states": [{"name": "x", "topic": "/table", "field": "x"}]}))
+    assert set(np.diff(run.t_ns).tolist()) == {3600 * 10**9}
+    assert run.t_ns[0] == np.datetime64("2014-01-12T00:00", "ns").astype(int)

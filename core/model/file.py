@@ -66,7 +66,7 @@ def structure(model: Any) -> dict[str, Any]:
     )
     newer = newer or not one_rule or model.residuals is not None or model.run is not None
     newer |= s.step is not None or any(g.memory or g.valid is not None or g.ignore for g in model.signals)
-    newer |= bool(model.signals.arrivals)
+    newer |= bool(model.signals.arrivals) or any(g.judged for g in model.signals)
     newer = newer or model.repeats is not None or bool(model.signatures)
     regimes: dict[str, Any] = {}
     if scheduled:
@@ -126,6 +126,8 @@ def _signal(signal: Signal, keys: Sequence[str]) -> dict[str, Any]:
         entry["valid"] = [v if math.isfinite(v) else None for v in signal.valid]
     if signal.at != "departure":
         entry["at"] = signal.at
+    if signal.judged:
+        entry |= {"judged": True, "max_hold": signal.max_hold}
     if signal.ignore:
         entry["ignore"] = [v if math.isfinite(v) else str(v) for v in signal.ignore]
     return entry

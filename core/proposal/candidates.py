@@ -40,7 +40,8 @@ class Candidate:
     it is unknown; `reason`: why it is not proposed; empty if it is, or if there is no reason against it; `ready`:
     `state` or `control` for one that a person may well want back; empty for others; `steady`: steady state, recorded
     units; `scale`: scale, recorded units; `delay`: samples by which the states follow a control later; `ignore`: values
-    that stand for none.
+    that stand for none; `why`: why it is proposed; empty where its place in the file says it; `judged`: it is a control
+    that is judged as well.
     """
 
     topic: str
@@ -54,6 +55,8 @@ class Candidate:
     scale: float = 1.0
     delay: int = 0
     ignore: tuple[float, ...] = ()
+    why: str = ""
+    judged: bool = False
 
     @property
     def element(self) -> str:

@@ -26,11 +26,13 @@ from uncertain_lti.proposal.choosing import choose
 from uncertain_lti.proposal.effects import earlier, held
 from uncertain_lti.proposal.memories import choose_memories
 from uncertain_lti.proposal.naming import name_signals
+from uncertain_lti.proposal.plant import is_plant, plant_signals
 from uncertain_lti.proposal.quantities import longest_hold, set_operating_point, set_own_scale
 from uncertain_lti.proposal.reading import Iterate, read_sources, run_column
 from uncertain_lti.proposal.roles import ask_for, assign_roles, at_rest
 from uncertain_lti.proposal.signals_file import entry, signals_file
 from uncertain_lti.recordings.formats import group_recordings
+from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.memory import Memory
 from uncertain_lti.signals.table_layout import TableLayout
@@ -98,6 +100,8 @@ def propose(
     if runs:
         bags = group_recordings(list(paths), layout=TableLayout(runs=runs))
     sources = read_sources(bags, progress)
+    if not (states or controls or like) and is_plant(sources):
+        return _of_plant(bags, sources, runs)
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     commands, measured = assign_roles(sources)
@@ -130,6 +134,15 @@ def propose(
         memories, warnings = [], (*warnings, f"what lies further back was not tried: {absent(error.name) or error}")
     text = signals_file(bags, sources, chosen, used, doubt, memories, members, runs)
     return Proposal(tuple(chosen), tuple(used), text, warnings, tuple(members))
+
+
+def _of_plant(bags: Sequence[Recording], sources: Sequence[Source], runs: str) -> Proposal:
+    """The proposal for process data; names are those of the columns."""
+    chosen, used = plant_signals(sources)
+    if not chosen:
+        raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
+    text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
+    return Proposal(tuple(chosen), tuple(used), text, tuple(warning for bag in bags for warning in bag.warnings))
 
 
 def _members(

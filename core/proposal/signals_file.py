@@ -22,11 +22,13 @@ from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.signals.additive import CHOICES_TEXT
 
 _LONGEST_LINE = 1 << 20  # letters
+_ADDITIVE = f"# The further term that measured data needs: {CHOICES_TEXT}; compare the widths they give."
 
 
 def signals_file(
     bags: Sequence[Recording], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
     doubt: str, memories: Sequence[str] = (), members: Mapping[str, Sequence[Candidate]] | None = None, runs: str = "",
+    plant: bool = False,
 ) -> str:  # fmt: skip
     """Write the text of the file."""
     every = {s.topic: s for s in sources}
@@ -38,9 +40,7 @@ def signals_file(
         "# States are what the machine remembers from one sample to the next; controls are what is done to it, as",
         "# it is commanded. Then: uncertain-lti fit BAG... --signals THIS_FILE --output machine.model.json",
         "",
-        f"# The further term that measured data needs: {CHOICES_TEXT}; compare the widths they give.",
-        "additive: noise",
-        "",
+        *([] if plant else [_ADDITIVE, "additive: noise", ""]),
         f"# Its messages define the sample instants: {clock.rate:.4g} a second.",
         f"clock: {_quoted(clock.topic)}",
     ]
@@ -59,15 +59,18 @@ def signals_file(
         lines += [f"  {_quoted(t)}: {{time: log}}" for t in topics]
     if runs:
         lines += ["", "# Each value of this column is a recording of its own.", "table:", f"  runs: {_quoted(runs)}"]
-    lines += ["", "# steady: median over the longest stretch in which nothing moves; scale: the largest such"]
-    lines.append("# magnitude, or the range where that is small. Both in recorded units.")
+    if plant:
+        lines += ["", "# Process data: every measurement is judged. steady: median; scale: range; in recorded units."]
+    else:
+        lines += ["", "# steady: median over the longest stretch in which nothing moves; scale: the largest such"]
+        lines.append("# magnitude, or the range where that is small. Both in recorded units.")
     lines += [f"# Beware: {doubt}."] if doubt else []
     if any(c.ignore for c in [*states, *controls]):
         lines.append(
             "# ignore: numbers that stand for no value, as they lie far from all others; they count as missing."
         )
     lines.append("states:")
-    lines += [entry(c) for c in states]
+    lines += [entry(c, comment=c.why) for c in states]
     lines += memories
     lines += [entry(c, comment=c.reason, out=True) for s in sources for c in s.candidates if c.ready == "state"]
     if controls:
@@ -77,7 +80,8 @@ def signals_file(
         if any(c.delay for c in controls):
             lines.append("  # delay: number of samples by which the states follow later")
         for candidate in controls:
-            lines.append(entry(candidate, *longest_hold(every[candidate.topic], clock)))
+            limit, why = (None, candidate.why) if plant else longest_hold(every[candidate.topic], clock)
+            lines.append(entry(candidate, limit, why))
         for candidate in (c for s in sources for c in s.candidates if c.ready == "control"):
             limit, _ = longest_hold(every[candidate.topic], clock)
             lines.append(entry(candidate, limit, candidate.reason, out=True))
@@ -150,6 +154,8 @@ def entry(candidate: Candidate, max_hold: float | None = None, comment: str = ""
         parts.append(f"unit: {candidate.unit}")
     if max_hold is not None:
         parts.append(f"max_hold: {_number(max_hold)}")
+    if candidate.judged:
+        parts.append("judged: true")
     if candidate.delay:
         parts.append(f"delay: {candidate.delay}")
     if candidate.ignore:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,7 @@ _UNIT = {
     "ns": r"ns|nsecs?|nanos(econds?)?",
 }  # fmt: skip
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
+_DAY = re.compile(r"(\d{1,2})[/.](\d{1,2})[/.](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
 _LARGEST_ZONE = 14  # hours
@@ -117,7 +119,7 @@ def _may_be(column: Column) -> bool:
     if column.dtype.kind != "O":
         return True
     first = next((str(cell) for cell in column if cell), "")
-    return bool(_ISO.match(first) or _CLOCK.match(first))
+    return bool(_ISO.match(first) or _CLOCK.match(first) or _DAY.fullmatch(first.strip()))
 
 
 def _unit(name: str, values: Column, stated: str = "") -> str:
@@ -174,6 +176,7 @@ def _too_late(where: str) -> BagError:
 def _of_text(where: str, cells: Sequence[object]) -> NDArray[np.int64]:
     """ISO 8601 with or without a zone (UTC where there is none), or times of day."""
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
+    cells = _as_iso(where, cells)
     plain: list[str] = []
     rows: list[int] = []
     shifts: list[int] = []
@@ -208,6 +211,30 @@ def _of_text(where: str, cells: Sequence[object]) -> NDArray[np.int64]:
     if (times == NO_TIME).all():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
     return times
+
+
+def _as_iso(where: str, cells: Sequence[object]) -> Sequence[object]:
+    """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day and goes forward."""
+    texts = [str(cell).strip() for cell in cells if str(cell).strip()]
+    found = [m for m in map(_DAY.fullmatch, texts) if m is not None]
+    if not found or len(found) < len(texts):
+        return cells
+    orders = []
+    for day, month in ((1, 2), (2, 1)):
+        texts = [
+            f"{m[3] if len(m[3]) == 4 else '20' + m[3]}-{int(m[month]):02}-{int(m[day]):02}T{int(m[4] or 0):02}:"
+            f"{m[5] or '00'}:{m[6] or '00'}"
+            for m in found
+        ]
+        if all(1 <= int(text[5:7]) <= 12 for text in texts) and all(a <= b for a, b in pairwise(texts)):
+            orders.append(texts)
+    if len(orders) == 1 or (orders and orders[0] == orders[1]):
+        iso = iter(orders[0])
+        return [next(iso) if str(cell).strip() else cell for cell in cells]
+    raise BagError(
+        f"{where}: '{found[0][0][:40]}' and the others do not say which is day and which is month; write times such as "
+        f"2026-11-22T06:28:01.25Z"
+    )
 
 
 def _parses(text: str) -> bool:

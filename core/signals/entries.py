@@ -179,8 +179,11 @@ def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
                 number = checked_number(entry[key], f"{here}: {key}")
                 entry[key] = number if number is not None else {"steady": 0.0, "scale": 1.0}[key]
         _limits(entry, here)
-        if entry.get("at") is None:
-            entry.pop("at", None)
+        for key in ("at", "judged"):
+            if entry.get(key) is None:
+                entry.pop(key, None)
+        if not isinstance(entry.get("judged", False), bool):
+            raise SignalError(f"{here}: judged is {reprlib.repr(entry['judged'])}; write true or false")
         if "max_hold" in entry:
             entry["max_hold"] = checked_number(entry["max_hold"], f"{here}: max_hold")
         delay = entry.get("delay", 0)

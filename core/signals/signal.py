@@ -40,7 +40,7 @@ class Signal:
     - delay}). For controls only; `valid`: least and greatest value of the field; beyond them it counts as missing. None
     for no limit; `ignore`: values of the field that stand for none; each also as single precision rounds it; `at`: the
     end of a step whose recorded value acts during it; a map makes two controls of one that is at both. For controls
-    only.
+    only; `judged`: a control with a row of its own, which a map puts behind the states.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Signal:
     valid: tuple[float, float] | None = None
     ignore: tuple[float, ...] = ()
     at: At = "departure"
+    judged: bool = False
 
     @property
     def memory(self) -> Memory | None:
@@ -107,6 +108,10 @@ class Signal:
         elif self.at != "departure" and (self.delay or self.memory):
             problem = (
                 f"at is {self.at}, and it is taken from earlier samples (delay, lag, diff, rate); leave one of them out"
+            )
+        elif self.judged and (self.delay or self.memory or self.at != "departure"):
+            problem = (
+                "is judged, and delayed, a memory or not at the departure, which leaves nothing to judge; choose one"
             )
         elif self.valid is not None and not self.valid[0] < self.valid[1]:
             problem = f"valid is {list(self.valid)}; write [least, greatest]"

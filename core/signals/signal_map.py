@@ -72,7 +72,7 @@ class SignalMap:
         States, in the order of x; at least one. One whose field is a memory (lag, diff or rate) is known before the
         step and so has no row: it becomes the last of the controls.
     controls : tuple of Signal, optional
-        Controls, in the order of u.
+        Controls, in the order of u. One that is judged has a row, too, and becomes the last of the states.
     scheduling : tuple of Signal, optional
         Further signals that are neither state nor control, and schedule the model.
     clock : str or None, optional
@@ -132,6 +132,7 @@ class SignalMap:
             object.__setattr__(self, kind, tuple(signals))
         self._place_memories()
         self._place_arrivals()
+        self._place_judged()
         if not self.states:
             raise SignalError(f"{self.source}: 'states' is empty; list at least one state")
         seen: set[str] = set()
@@ -149,7 +150,7 @@ class SignalMap:
         """Refuse what is for controls, said of another signal, and a schedule on no signal."""
         of_states = {(s.topic, s.field) for s in self.states}
         for signal in self.states:
-            if signal.max_hold is not None or signal.delay:
+            if (signal.max_hold is not None and not signal.judged) or signal.delay:
                 raise SignalError(
                     f"{self.source}: state '{signal.name}' has max_hold or delay; both are for controls "
                     f"(the age of a state is limited by max_skew)"
@@ -240,6 +241,13 @@ class SignalMap:
             object.__setattr__(self, "controls", tuple(ends))
             structure = with_rules(self.structure, {name + ARRIVAL: name for name in both})
             object.__setattr__(self, "structure", structure)
+
+    def _place_judged(self) -> None:
+        """Put controls that are judged behind the states: a row of their own, from the states and controls before."""
+        judged = tuple(s for s in self.controls if s.judged and not (s.delay or s.recalls or s.at != "departure"))
+        if judged:
+            object.__setattr__(self, "states", (*self.states, *judged))
+            object.__setattr__(self, "controls", tuple(s for s in self.controls if s not in judged))
 
     def __len__(self) -> int:
         return len(self.signals)

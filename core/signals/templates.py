@@ -98,7 +98,9 @@ def _own(top: Mapping[str, Any], member: Mapping[str, str]) -> list[dict[str, An
     """Rules that leave each state the signals of its own member, and those of none."""
     lists: Sequence[Any] = [e for key in ("states", "controls") for e in top.get(key) or [] if isinstance(e, dict)]
     names = [str(e.get("name")) for e in lists]
-    states = [str(e.get("name")) for e in top.get("states") or [] if isinstance(e, dict) and not _remembers(e)]
+    judged = [e for e in top.get("controls") or [] if isinstance(e, dict) and e.get("judged") is True]
+    rows = [e for e in [*(top.get("states") or []), *judged] if isinstance(e, dict) and not _remembers(e)]
+    states = [str(e.get("name")) for e in rows]
     return [
         {"state": state, "from": other, "nominal": 0, "half_width": 0}
         for state in states
