@@ -40,7 +40,8 @@ COMPILED = {
     "monitor.stream": "-O1",
     "monitor.verdict": "-O1",
     "monitor.verdict_messages": "-O1",
-    "recordings.message_reader": "-O2",
+    "recordings.mcap_walk": "-O2",
+    "recordings.message_reader": "-O3",
     "sampling.sampler": "-O2",
 }
 """Modules that are compiled, and how: the kernel, and typed Python of the live chain."""
@@ -113,6 +114,7 @@ setup(
         "uncertain_lti": ["py.typed"],
         "uncertain_lti.kernel": ["*.pxi", "*.pyi", "*.pyx"],
         "uncertain_lti.plants": ["*.json"],
+        "uncertain_lti.recordings": ["*.pyi", "*.pyx"],
         "uncertain_lti.reports": ["assets/*"],
         NAME: ["*.xml"],
     },

@@ -352,15 +352,9 @@ def read_messages(rng: random.Random, _: Path) -> str:
     values = [path.read(decoded) for path in taken]
     if found[0] != stamp or np.array(found[1]).tobytes() != np.array(values).tobytes():
         raise WrongError(f"{found} where the middleware says {(stamp, values)}; {data.hex()}")
-    if recorded != (stamp, np.array(values).tobytes()) and not told_apart(kind, data):
+    if recorded != (stamp, np.array(values).tobytes()):
         raise WrongError(f"{recorded} in a recording, live {found}; {data.hex()}")
     return "read"
-
-
-def told_apart(kind: str, data: bytes) -> bool:
-    """Whether names repeat: live the first one counts, and a recording is read by message then."""
-    names = [] if kind == ODOMETRY else recorded_definition(kind).decode(data).name
-    return len(set(names)) < len(names)
 
 
 @cache
@@ -371,15 +365,16 @@ def recorded_definition(kind: str) -> Any:
 
 
 def read_recorded(kind: str, paths: list[Any], messages: list[bytes]) -> tuple[int | None, bytes] | None:
-    """Stamp and values of the last of these messages of a recording; None where it is left out, or names repeat."""
-    from uncertain_lti.recordings.cdr_arrays import NO_STAMP, SLACK, FieldReader, Messages
+    """Stamp and values of the last of these messages of a recording; None where it is left out."""
+    from uncertain_lti.recordings.bag_arrays import FieldReader
+    from uncertain_lti.recordings.message_reader import NO_STAMP
 
-    ends = np.cumsum([len(data) for data in messages]) + SLACK
+    ends = np.cumsum([len(data) for data in messages])
     begins = ends - [len(data) for data in messages]
-    buffer = bytearray(SLACK) + b"".join(messages) + bytearray(SLACK)
     values, stamps = np.empty((len(messages), len(paths))), np.empty(len(messages), np.int64)
-    failures = FieldReader(recorded_definition(kind), paths).read(Messages(buffer, begins, ends), values, stamps)
-    if any(failure.row == len(messages) - 1 for failure in failures):
+    buffer = bytearray(b"".join(messages))
+    failures = FieldReader(recorded_definition(kind), paths).read(buffer, begins, ends, values, stamps)
+    if any(row == len(messages) - 1 for row, _ in failures):
         return None
     return None if stamps[-1] == NO_STAMP else int(stamps[-1]), values[-1].tobytes()
 

@@ -109,7 +109,7 @@ def test_columns_are_what_messages_give_and_come_in_blocks(converted, kind):
     from uncertain_lti.sampling.streams import check_paths
 
     columns = bag.columns(signals.topics, check_paths(bag, signals))
-    assert columns.alone <= 4 < len(columns.topic)  # the rest went through the vectorised path
+    assert columns.alone <= 4 < len(columns.topic)  # the rest was read by its plan
 
 
 @pytest.mark.parametrize("kind", ["db3", "ROS 1 bz2"])

@@ -17,7 +17,6 @@ import sys
 from pathlib import Path
 
 import fuzz
-import numpy as np
 import pytest
 
 
@@ -168,26 +167,6 @@ def test_a_truth_value_of_2_is_refused_live_and_of_recordings(path: str) -> None
         assert read_alike(kind, path, false, before) == (0.0 if path == "present" else 1.5)
         for odd in (2, 255):
             assert read_alike(kind, path, true[:at] + bytes([odd]) + true[at + 1 :], before) is None
-
-
-@pytest.mark.parametrize("start", [b"\0\1\0\0", BIG, b"\0\3\0\0"])
-def test_bytes_that_rclpy_leaves_behind_cost_no_layout(start: bytes) -> None:
-    """Also where the sequences that they are reserved for are not always empty."""
-    from uncertain_lti.recordings.cdr_arrays import SLACK, FieldReader, Messages
-    from uncertain_lti.signals.field_path import FieldPath
-
-    order = "<" if start[1] else ">"
-    filled = framed(b"base\0", start=start)[:-8] + struct.pack(f"{order}IIdI4x", 1, 0, 2.5, 0)
-    some = [framed(b"base\0", start=start, more=8), filled, framed(b"longer\0", start=start, more=8), filled]
-    messages = [some[i % 4] for i in range(200)]
-    ends = SLACK + np.cumsum([len(data) for data in messages])
-    buffer = bytearray(bytes(SLACK) + b"".join(messages) + bytes(SLACK))
-    reader = FieldReader(fuzz.recorded_definition(fuzz.JOINT_STATE), [FieldPath("position[a]")])
-    values, stamps = np.empty((200, 1)), np.empty(200, np.int64)
-    begins = ends - [len(data) for data in messages]
-    assert not reader.read(Messages(buffer, begins, ends), values, stamps)
-    assert (values == 1.5).all() and (stamps == 5_000_000_007).all()
-    assert reader.alone < 3
 
 
 def test_whatever_goes_wrong_is_noticed(tmp_path: Path) -> None:

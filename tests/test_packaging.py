@@ -42,7 +42,6 @@ LIVE = [
     "sampling.sampler",
     "sampling.transient",
     "sampling.steady_state",
-    "recordings.cdr_layout",
     "recordings.message_reader",
 ]
 

@@ -20,14 +20,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Integers
+from uncertain_lti.base.arrays import Array, Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.cdr_arrays import FieldReader, Messages
 from uncertain_lti.recordings.mcap_batches import Batch, IndexMismatchError, batches
 from uncertain_lti.recordings.mcap_records import LATEST, Contents
+from uncertain_lti.recordings.message_reader import NO_STAMP, NOT_PLAIN, Plan
 from uncertain_lti.recordings.message_types import Definition
 from uncertain_lti.recordings.raw_messages import RecordedChannel
 from uncertain_lti.recordings.recording import Columns, Progress, Recording
+from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_path import FieldPath
 
 
@@ -45,6 +46,39 @@ class _Undecoded:
         self.first = min(self.first, place)
         if place >= self.last:
             self.last, self.why = place, why
+
+
+class FieldReader:
+    """Reads some paths from the messages of one definition; `alone`: messages that were decoded one by one."""
+
+    def __init__(self, definition: Definition, paths: Sequence[FieldPath]) -> None:
+        self.definition, self.paths, self.alone = definition, paths, 0
+        self.plan = Plan(definition.type_name, paths, definition.fields)
+
+    def read(
+        self, data: bytearray, begin: Integers, end: Integers, values: Array, stamps: Integers
+    ) -> list[tuple[int, str]]:
+        """Fill in a row of values and a stamp, ns, for each message data[begin:end].
+
+        Returns rows of messages that cannot be decoded, each with the reason.
+        """
+        states = self.plan.read_all(data, begin, end, values, stamps)
+        if not self.plan.able:
+            states[states == 0] = NOT_PLAIN
+        failures = []
+        for row in np.flatnonzero(states).tolist():
+            if states[row] != NOT_PLAIN:
+                failures.append((row, self.plan.in_words(int(states[row]))))
+                continue
+            self.alone += 1
+            try:
+                message = self.definition.decode(bytes(data[begin[row] : end[row]]))
+            except BagError as error:
+                failures.append((row, str(error)))
+                continue
+            values[row] = [path.read(message) for path in self.paths]
+            stamps[row] = header_stamp_ns(message) or NO_STAMP
+        return failures
 
 
 class Blocks(Recording, Protocol):
@@ -163,11 +197,11 @@ class _Reading:
         failures: list[tuple[int, str]] = []
         for number in np.unique(reader).tolist():
             mine = np.flatnonzero(reader == number)
-            messages = Messages(batch.data, batch.begin[rows[mine]], batch.end[rows[mine]])
+            begins, ends = batch.begin[rows[mine]], batch.end[rows[mine]]
             read, stamps = np.empty((len(mine), values.shape[1])), np.empty(len(mine), dtype=np.int64)
             whole = len(mine) == len(rows)
-            failed = self.readers[number].read(messages, values if whole else read, stamps)
-            failures += [(int(mine[failure.row]), failure.why) for failure in failed]
+            failed = self.readers[number].read(batch.data, begins, ends, values if whole else read, stamps)
+            failures += [(int(mine[row]), why) for row, why in failed]
             stamp[rows[mine]] = stamps
             if not whole:
                 values[mine] = read

@@ -7,24 +7,16 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Messages of MCAP blocks as columns: some MiB of blocks in one buffer, the records in it found all at once.
-
-Records stand one behind the other, each with its length, so one follows them from the first to the last. Here
-many walkers take a step together: one begins at each block, and within a large block also wherever something looks
-like a message. Each has to arrive exactly where the next one began, which proves that the next one began well, so
-what is found is what walking alone finds (`mcap_records.walk`); where one does not, the blocks are walked alone.
-"""
+"""Messages of MCAP blocks as columns: some MiB of blocks in one buffer, and where the messages in it are."""
 
 from __future__ import annotations
 
-import re
 import struct
-from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import BinaryIO, NamedTuple, NoReturn
+from typing import Any, BinaryIO, NamedTuple, NoReturn
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -35,25 +27,15 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.cdr_arrays import SLACK, numbers_at
-from uncertain_lti.recordings.mcap_records import MESSAGE, RECORD, Block, Contents, crc32, parse, walk
+from uncertain_lti.recordings.mcap_records import RECORD, Block, Contents, crc32, parse
 from uncertain_lti.recordings.mcap_scan import most_records
+from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.unreadable import os_error
 
 _BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
-_STRIDE = 1 << 15  # bytes between two walkers in a large block
-_LOOK = 1 << 14  # bytes in which a walker looks for its first message
-_LIKE_A_MESSAGE = re.compile(rb"\x05.{4}\0{4}", re.DOTALL)
 _NEAR = 1 << 16  # bytes between blocks that are read along
-_FEW = 100  # messages in a block that one walker passes soon enough
-_EVERY = 16  # messages that a walker passes, where an index says where they are
-_LONG_INDEX = 1 << 10  # bytes per channel from which on an index is faster than looking
-_CHANNEL_AT = RECORD.size
-_LOG_TIME_AT = RECORD.size + 6
-_DATA_AT = RECORD.size + MESSAGE.size
 _CHECKSUM_AT = RECORD.size + 24
 _FEW_BLOCKS = 32
-_MOST_STEPS = 1 << 14
 _AHEAD = 1 << 24  # bytes; a larger batch is not read while another one is worked on
 
 
@@ -65,7 +47,7 @@ class IndexMismatchError(Exception):
 class Batch:
     """Messages of wanted channels in file order.
 
-    data[begin:end] is an encoded message. SLACK bytes before and after every message can be read as well.
+    data[begin:end] is an encoded message.
 
     `data`: A buffer that is used again for the next batch; `channel` (messages,): number of the channel in the file;
     `log_time` (messages,): log time, ns; `begin` (messages,): where each message begins; `end` (messages,): where it
@@ -88,12 +70,12 @@ def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
     if contents.converted:
         for group in groups:
             data, places = _converted(contents, group, channels)
-            yield _messages(data, _starts(data, places, contents), wanted, contents)
+            yield _messages(data, places, wanted, contents)
         return
     try:
         with open(contents.path, "rb", buffering=0) as stream:
             for data, places in _loaded(contents, stream, groups):
-                batch = _messages(data, _starts(data, places, contents), wanted, contents)
+                batch = _messages(data, places, wanted, contents)
                 counts = np.bincount(batch.channel, minlength=1 << 16)
                 for channel in missing:
                     missing[channel] -= int(counts[channel])
@@ -151,14 +133,13 @@ def _loaded(
 def _converted(
     contents: Contents, blocks: Sequence[Block], channels: Collection[int]
 ) -> tuple[bytearray, list[_Place]]:
-    """Blocks of a file that is no MCAP, in a buffer with SLACK bytes around."""
-    data = bytearray(SLACK)
+    """Blocks of a file that is no MCAP, in a buffer."""
+    data = bytearray()
     places = []
     for block in blocks:
         begin = len(data)
         data += contents.records(block, channels)
-        places.append(_Place(block, begin, len(data), None))
-    data += bytes(SLACK)
+        places.append(_Place(block, begin, len(data)))
     return data, places
 
 
@@ -168,7 +149,7 @@ def _begin(block: Block) -> int:
 
 
 def _end(block: Block) -> int:
-    return block.offset + block.size + block.indexed
+    return block.offset + block.size
 
 
 def _runs(blocks: Sequence[Block]) -> Iterator[list[Block]]:
@@ -187,12 +168,11 @@ def _runs(blocks: Sequence[Block]) -> Iterator[list[Block]]:
 
 
 class _Place(NamedTuple):
-    """Where the records of a block are in the buffer; offsets of its messages from begin, as its index has them."""
+    """Where the records of a block are in the buffer."""
 
     block: Block
     begin: int
     end: int
-    offsets: Integers | None
 
 
 class _Run(NamedTuple):
@@ -226,15 +206,15 @@ class _Loader:
     def fetch(self, blocks: Sequence[Block]) -> list[_Run]:
         """Read blocks, and decompress what can be decompressed together."""
         runs = []
-        at = SLACK
+        at = 0
         every = list(_runs(blocks))
         as_is = [all(not block.compression for block in run) for run in every]
         sizes = [
             _end(run[-1]) - _begin(run[0]) if direct else sum(block.length for block in run)
             for run, direct in zip(every, as_is, strict=True)
         ]
-        if len(self.data) < sum(sizes) + 2 * SLACK:
-            self.data = bytearray(sum(sizes) + 2 * SLACK)
+        if len(self.data) < sum(sizes):
+            self.data = bytearray(sum(sizes))
         for number, (run, direct, size) in enumerate(zip(every, as_is, sizes, strict=True)):
             begin = _begin(run[0])
             packed = memoryview(self.data)[at : at + size] if direct else self._room(number, _end(run[-1]) - begin)
@@ -248,7 +228,7 @@ class _Loader:
         return runs
 
     def place(self, runs: Sequence[_Run]) -> list[_Place]:
-        """Put the records of what was read into the buffer, with SLACK bytes around; raises as `batches` does."""
+        """Put the records of what was read into the buffer; raises as `batches` does."""
         view = memoryview(self.data)
         places: list[_Place] = []
         for blocks, packed, at, direct, ready in runs:
@@ -263,8 +243,7 @@ class _Loader:
                     self._refuse()
                 if block.unchecked and not self._as_stated(block, packed, offset, records):
                     self._refuse()
-                offsets = _offsets(block, packed[behind : behind + block.indexed])
-                places.append(_Place(block, begin, end, offsets))
+                places.append(_Place(block, begin, end))
                 at = at if direct else end
         return places
 
@@ -345,146 +324,27 @@ def _chunk_head(name_length: int) -> Callable[..., bytes]:
 # --- records in the buffer ----------------------------------------------------------------------------------
 
 
-def _starts(data: bytearray, places: Sequence[_Place], contents: Contents) -> Integers:
-    """Where the records in the buffer begin."""
-    for by_index in (True, False):
-        begins, limits = _walkers(data, places, by_index)
-        starts = _together(data, begins, limits)
-        if starts is not None:
-            return starts
-    alone = array("q")
-    most = most_records(contents.size)
-    for place in places:
-        reached = place.begin
-        for _, content, stop in walk(memoryview(data)[place.begin : place.end]):
-            if contents.indexed and len(alone) >= most:
-                raise IndexMismatchError
-            alone.append(place.begin + content - RECORD.size)
-            reached = place.begin + stop
-        if contents.indexed and reached != place.end:
-            raise IndexMismatchError
-    return np.frombuffer(alone, dtype=np.int64)
-
-
-def _walkers(data: bytearray, places: Sequence[_Place], by_index: bool) -> tuple[Integers, Integers]:
-    """Where walkers begin, and where each has to arrive."""
-    begins: list[int] = []
-    limits: list[int] = []
-    for place in places:
-        if place.begin == place.end:
-            continue
-        if not by_index:
-            here = _likely_messages(data, place)
-        elif place.offsets is not None:
-            here = (place.begin + place.offsets).tolist()
-        elif 0 < place.block.indexed < _FEW * 16:
-            here = []
-        else:
-            here = _likely_messages(data, place)
-        begins.append(place.begin)
-        begins += here
-        limits += here
-        limits.append(place.end)
-    return np.array(begins, dtype=np.int64), np.array(limits, dtype=np.int64)
-
-
-def _offsets(block: Block, after: memoryview) -> Integers | None:
-    """Offsets of some messages as stated behind a large block, in order, none at its begin; None where odd."""
-    if block.indexed < _LONG_INDEX * len(block.channels):
-        return None
-    offsets = []
-    at = 0
-    while at < block.indexed:
-        opcode, length = RECORD.unpack_from(after, at)
-        content = at + RECORD.size + 6
-        at += RECORD.size + length
-        if opcode != Opcode.MESSAGE_INDEX or at > block.indexed or length < 6 or (length - 6) % 16:
-            return None
-        offsets.append(np.frombuffer(after[content:at], "<i8")[1::2])
-    every = np.sort(np.concatenate(offsets))
-    if not len(every) or every[0] < 0 or every[-1] >= block.length:
-        return None
-    return every[1:][::_EVERY]
-
-
-def _together(data: bytearray, begins: Integers, limits: Integers) -> Integers | None:
-    """Where records begin, found by walkers that go side by side; None where one does not arrive."""
-    length = numbers_at(data, "<u4")
-    position, limit = begins, limits
-    found: list[Integers] = []
-    while position.size:
-        if len(found) == _MOST_STEPS:
-            return None  # one after the other they are passed sooner
-        found.append(position)
-        position = position + length[position + 1]
-        position += RECORD.size
-        going = position < limit
-        if np.count_nonzero(going) < len(going):
-            if not np.array_equal(position[~going], limit[~going]):
-                return None
-            position, limit = position[going], limit[going]
-    starts = np.concatenate(found)
-    starts.sort()
-    if length[starts + 5].any() or not np.frombuffer(data, np.uint8)[starts].all():
-        return None  # a record of 4 GiB and more, or a zero, where `walk` ends
-    return starts
-
-
-def _likely_messages(data: bytearray, place: _Place) -> list[int]:
-    """Where messages seem to begin, far from each other in a large block."""
-    found = []
-    goal = place.begin + _STRIDE
-    while goal + _STRIDE // 2 < place.end:
-        at = _likely_message(data, goal, place.end, place.block)
-        if at is not None:
-            found.append(at)
-        goal = (goal if at is None else at) + _STRIDE
-    return found
-
-
-def _likely_message(data: bytearray, begin: int, end: int, block: Block) -> int | None:
-    """Where a message of the block seems to begin, soon after `begin`."""
-    stop = min(begin + _LOOK, end - _DATA_AT)
-    while match := _LIKE_A_MESSAGE.search(data, begin, stop):
-        at = match.start()
-        _, length = RECORD.unpack_from(data, at)
-        channel, _, log_time, _ = MESSAGE.unpack_from(data, at + RECORD.size)
-        fits = MESSAGE.size <= length <= end - at - RECORD.size
-        if fits and channel in block.channels and block.start <= log_time <= block.end:
-            return at
-        begin = at + 1
-    return None
-
-
-def _messages(data: bytearray, starts: Integers, wanted: NDArray[np.bool_], contents: Contents) -> Batch:
+def _messages(data: bytearray, places: Sequence[_Place], wanted: NDArray[np.bool_], contents: Contents) -> Batch:
     """Messages of wanted channels among the records."""
-    is_message = np.frombuffer(data, np.uint8)[starts] == Opcode.MESSAGE
-    if not is_message.all():
+    left = most_records(contents.size)
+    found: list[tuple[NDArray[Any], ...]] = []
+    for _, begin, end in places:
+        records = walk_records(data, begin, end, left if contents.indexed else end - begin)
         if contents.indexed:
-            for start in starts[~is_message].tolist():
-                _hold_against(contents, data, start)
-        starts = starts[is_message]
-    length = numbers_at(data, "<u4")[starts + 1].astype(np.int64)
-    whole = length >= MESSAGE.size
-    if not whole.all():
-        if contents.indexed:
-            raise IndexMismatchError
-        starts, length = starts[whole], length[whole]
-    channel = numbers_at(data, "<u2")[starts + _CHANNEL_AT]
-    keep = wanted[channel]
-    if not keep.all():
-        starts, length, channel = starts[keep], length[keep], channel[keep]
-    log_time = numbers_at(data, "<u8")[starts + _LOG_TIME_AT]
-    return Batch(data, channel, log_time, starts + _DATA_AT, starts + length + RECORD.size)
+            left -= records.number
+            if records.stop != end or records.short:
+                raise IndexMismatchError
+            for definition in records.definitions:
+                _hold_against(contents, data, *definition)
+        keep = wanted[records.channel]
+        columns = records.channel, records.log_time, records.begin, records.end
+        found.append(columns if keep.all() else tuple(column[keep] for column in columns))
+    return Batch(data, *(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
-def _hold_against(contents: Contents, data: bytearray, start: int) -> None:
+def _hold_against(contents: Contents, data: bytearray, opcode: int, begin: int, end: int) -> None:
     """A definition in a chunk has to be the one that the summary gives."""
-    opcode, length = RECORD.unpack_from(data, start)
-    if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
-        return
-    content = bytes(memoryview(data)[start + RECORD.size : start + RECORD.size + length])
-    record = parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
+    record = parse(Schema if opcode == Opcode.SCHEMA else Channel, bytes(memoryview(data)[begin:end]))
     known: object = None
     if record is not None:
         known = (contents.schemas if opcode == Opcode.SCHEMA else contents.channels).get(record.id)

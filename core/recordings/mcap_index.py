@@ -154,7 +154,7 @@ def _block(index: bytes, data_end: int) -> Block:
         raise _NoIndexError
     if place + chunk_length + index_length > data_end or end > LATEST:
         raise _NoIndexError
-    return Block(place + before, size, compression, length, start, end, channels, before, index_length)
+    return Block(place + before, size, compression, length, start, end, channels, before)
 
 
 def outline_or_scan(path: Path) -> Contents:

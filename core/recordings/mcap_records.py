@@ -27,6 +27,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.unreadable import os_error
 
 try:
@@ -53,9 +54,8 @@ class Block(NamedTuple):
     `offset`: first byte; `size`: bytes in the file; `compression`: empty where the bytes are records as they are;
     `length`: bytes of the records; `start`: smallest log time, ns; `end`: largest log time, ns; `channels`: those that
     have a message here; `unchecked`: of a chunk that was found in an index (`mcap_index.outline`), bytes in front of
-    its records, which are still to be compared with the block, and the records with their checksum; 0 otherwise;
-    `indexed`: of such a chunk, bytes behind its records, which say where its messages are; 0 otherwise; `cut`: the file
-    ends within it.
+    its records, which are still to be compared with the block, and the records with their checksum; 0 otherwise; `cut`:
+    the file ends within it.
     """
 
     offset: int
@@ -66,7 +66,6 @@ class Block(NamedTuple):
     end: int
     channels: frozenset[int]
     unchecked: int = 0
-    indexed: int = 0
     cut: bool = False
 
 
@@ -144,10 +143,9 @@ def message_record(channel: int, sequence: int, log_time: int, publish_time: int
 
 def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:
     """Messages among some records; the data of each is `records[begin:end]`."""
-    for opcode, begin, end in walk(records):
-        if opcode == Opcode.MESSAGE and end - begin >= MESSAGE.size:
-            channel, _, log_time, publish_time = MESSAGE.unpack_from(records, begin)
-            yield channel, log_time, publish_time, begin + MESSAGE.size, end
+    found = walk_records(records, 0, len(records), len(records))
+    for channel, log_time, begin, end in zip(*(column.tolist() for column in found[:4]), strict=True):
+        yield channel, log_time, int.from_bytes(records[begin - 8 : begin], "little"), begin, end
 
 
 def walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:

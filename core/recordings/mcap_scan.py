@@ -34,6 +34,7 @@ import struct
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, DataEnd, Footer, Schema, Statistics
 
@@ -57,6 +58,7 @@ from uncertain_lti.recordings.mcap_records import (
     seconds,
     walk,
 )
+from uncertain_lti.recordings.mcap_walk import Records, walk_records
 from uncertain_lti.recordings.unreadable import not_mcap, os_error
 
 _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
@@ -218,7 +220,7 @@ class _Scanner:
             self.bare_begin = position
         self.bare_end = end
         if opcode == Opcode.MESSAGE:
-            self._message(content, 0, len(content), self.bare)
+            self._message(content, self.bare)
         else:
             self._definition(opcode, content)
 
@@ -270,22 +272,18 @@ class _Scanner:
             if trouble:
                 self._leave_out(where, trouble)
                 return
-        tally: dict[int, Tally] = {}
-        end = 0
-        for opcode, start, stop in walk(records):
-            if compression:
-                if not self.records_left:
-                    self._leave_out(where, "with it the file holds more records than bytes", cut)
-                    return
-                self.records_left -= 1
-            end = stop
-            if opcode == Opcode.MESSAGE:
-                self._message(records, start, end, tally)
-            elif opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
-                self._definition(opcode, records[start:end])
-        self.odd_records += end < len(records) and not cut
-        if tally:
-            self._block(begin + data_begin, len(data), compression, end, tally, cut)
+        found = walk_records(records, 0, len(records), self.records_left + 1 if compression else len(records))
+        if compression:
+            self.records_left -= found.number
+            if self.records_left < 0:
+                self.records_left = 0
+                self._leave_out(where, "with it the file holds more records than bytes", cut)
+                return
+        for opcode, start, stop in found.definitions:
+            self._definition(opcode, records[start:stop])
+        self.odd_records += found.short + (found.stop < len(records) and not cut)
+        if len(found.channel):
+            self._block(begin + data_begin, len(data), compression, found.stop, _tally(found), cut)
 
     def _leave_out(self, where: object, why: str, cut: bool = False) -> None:
         if not cut:  # what little a cut leaves of a chunk's beginning is reported with the cut
@@ -294,19 +292,12 @@ class _Scanner:
                 path = self.found.path
                 self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
 
-    def _message(self, records: bytes | memoryview, begin: int, end: int, tally: dict[int, Tally]) -> None:
-        if end - begin < MESSAGE.size:
+    def _message(self, content: bytes, tally: dict[int, Tally]) -> None:
+        if len(content) < MESSAGE.size:
             self.odd_records += 1
             return
-        channel, _, time, _ = MESSAGE.unpack_from(records, begin)
-        if entry := tally.get(channel):
-            entry.count += 1
-            if time > entry.last:
-                entry.last = time
-            elif time < entry.first:
-                entry.first = time
-        else:
-            tally[channel] = Tally(1, time, time)
+        channel, _, time, _ = MESSAGE.unpack_from(content)
+        _add(tally, channel, Tally(1, time, time))
 
     def _block(
         self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally], cut: bool = False
@@ -324,11 +315,7 @@ class _Scanner:
             )
         )
         for channel, entry in tally.items():
-            if total := self.found.tally.get(channel):
-                total.count += entry.count
-                total.first, total.last = min(total.first, entry.first), max(total.last, entry.last)
-            else:
-                self.found.tally[channel] = entry
+            _add(self.found.tally, channel, entry)
 
     def _definition(self, opcode: int, content: bytes | memoryview) -> None:
         record = None
@@ -388,3 +375,20 @@ class _Scanner:
             return b""
         self.stream.seek(offset)
         return self.stream.read(min(size, self.found.size - offset))
+
+
+def _add(tally: dict[int, Tally], channel: int, more: Tally) -> None:
+    if total := tally.get(channel):
+        total.count += more.count
+        total.first, total.last = min(total.first, more.first), max(total.last, more.last)
+    else:
+        tally[channel] = more
+
+
+def _tally(found: Records) -> dict[int, Tally]:
+    order = np.argsort(found.channel, kind="stable")
+    channels, starts, counts = np.unique(found.channel[order], return_index=True, return_counts=True)
+    times = found.log_time[order]
+    ends = np.minimum.reduceat(times, starts), np.maximum.reduceat(times, starts)
+    rows = zip(channels.tolist(), counts.tolist(), ends[0].tolist(), ends[1].tolist(), strict=True)
+    return {channel: Tally(number, first, last) for channel, number, first, last in rows}

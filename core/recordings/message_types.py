@@ -30,7 +30,7 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.cdr_layout import CODES, ENCAPSULATIONS, PADDING, UnfitError, Walk
+from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan
 from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_types import FieldType
 
@@ -71,37 +71,16 @@ class Definition:
         the middleware does.
         """
         try:
-            message = self.decode_strictly(data)
-            if not self._has_zeros(self.type_name, message):
-                return message
-            return _OddText(self, _plain(data)).message(self.type_name)
-        except BagError:
-            try:
-                data = _plain(data)
-                odd = _OddText(self, data)
-                message = odd.message(self.type_name)
-                if self._may_end(data, odd.left) and not self._untrue(data):
-                    return message
-            except Exception:  # not that alone
-                pass
-            raise
-
-    def decode_strictly(self, data: bytes) -> Any:
-        """Decode one CDR message whose text is as it should be."""
-        try:
             data = _plain(data)
-            layout = self.store.get_msgdef(self.type_name)
-            read = layout.deserialize_cdr_le if data[1] else layout.deserialize_cdr_be
-            message, end = read(data[4:], 0, layout.cls, self.store)
-            left = len(data) - 4 - end
-            fits = self._may_end(data, left)
-        except Exception as error:  # the generated decoders raise whatever the bytes lead them to
+        except Exception as error:  # a library raises whatever the bytes lead it to
             raise BagError(_one_line(error)) from None
-        if not fits:
-            raise BagError(f"it is {left} bytes longer than its definition" if left > 0 else "it is cut")
-        if self._untrue(data):
-            raise BagError("it holds a truth value that is neither 0 nor 1")
-        return message
+        if why := self._plan.wrong(data):
+            raise BagError(why)
+        return _Decoder(self, data).message(self.type_name)
+
+    @functools.cached_property
+    def _plan(self) -> Plan:
+        return Plan(self.type_name, (), self.fields)
 
     def from_ros1(self, data: bytes) -> bytes:
         """One message of a ROS 1 bag as ROS 2 has it (`rosbags`); of a definition that `ros2_text` made."""
@@ -130,59 +109,6 @@ class Definition:
             for _, fields in self.types.values()
             for _, (node, what) in fields
         )
-
-    def _may_end(self, data: bytes, left: int) -> bool:
-        """Whether these bytes may be left behind a message."""
-        if 0 <= left <= PADDING:
-            return True
-        walk = Walk(data, self.fields)
-        try:
-            walk.message(self.type_name)
-        except UnfitError:
-            return False
-        return left > 0 and not walk.excess
-
-    def _untrue(self, data: bytes) -> bool:
-        """Whether a truth value is neither 0 nor 1, as far as the message can be walked."""
-        if not self._truths:
-            return False
-        walk = Walk(data, self.fields)
-        try:
-            walk.message(self.type_name)
-        except UnfitError:
-            return False
-        return walk.untrue
-
-    @functools.cached_property
-    def _truths(self) -> bool:
-        """Whether there may be truth values in a message."""
-        return any(field.type_name == "bool" for name in self.types for field in self.fields(name).values())
-
-    @functools.cached_property
-    def _texts(self) -> Mapping[str, list[tuple[str, FieldType]]]:
-        """Type -> its fields that are text, or messages with text in them."""
-        found: dict[str, list[tuple[str, FieldType]]] = {}
-
-        def look_into(type_name: str) -> bool:
-            if type_name not in found:
-                found[type_name] = [
-                    (name, field)
-                    for name, field in self.fields(type_name).items()
-                    if field.kind == "string" or (field.kind == "message" and look_into(field.type_name))
-                ]
-            return bool(found[type_name])
-
-        look_into(self.type_name)
-        return found
-
-    def _has_zeros(self, type_name: str, message: Any) -> bool:
-        """Whether a text goes on behind a zero, where the middleware ends it."""
-        for name, field in self._texts[type_name]:
-            value = getattr(message, name)
-            for one in [value] if field.array is None else value:
-                if ("\0" in one) if field.kind == "string" else self._has_zeros(field.type_name, one):
-                    return True
-        return False
 
     @functools.cached_property
     def has_header(self) -> bool:
@@ -230,16 +156,12 @@ class Definition:
         }
 
 
-class _OddText:
-    """Reads a message number by number, and lets text in it be odd."""
+class _Decoder:
+    """Reads a message that is whole, number by number."""
 
     def __init__(self, definition: Definition, data: bytes) -> None:
         self._definition, self._data, self._at = definition, data[4:], 0
         self._order: Literal["<", ">"] = "<" if data[1] else ">"
-
-    @property
-    def left(self) -> int:
-        return len(self._data) - self._at
 
     def message(self, type_name: str) -> Any:
         values = [self._value(node, what) for _, (node, what) in self._definition.types[type_name][1]]
@@ -255,8 +177,6 @@ class _OddText:
             count = int(self._numbers("uint32", 1)[0])
         if inner == Nodetype.BASE and inner_what[0] != "string":
             return self._numbers(inner_what[0], count)
-        if count > self.left:
-            raise ValueError
         return [self._value(inner, inner_what) for _ in range(count)]
 
     def _numbers(self, kind: str, count: int) -> Any:
@@ -270,11 +190,8 @@ class _OddText:
 
     def _text(self) -> str:
         length = int(self._numbers("uint32", 1)[0])
-        if length > self.left:
-            raise ValueError
-        data = self._data[self._at : self._at + length]
         self._at += length
-        return data.split(b"\0")[0].decode(errors="replace")
+        return self._data[self._at - length : self._at].split(b"\0")[0].decode(errors="replace")
 
 
 def _plain(data: bytes, wanted: int = _LARGEST_MESSAGE) -> bytes:
