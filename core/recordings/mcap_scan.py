@@ -44,7 +44,6 @@ from uncertain_lti.recordings.mcap_records import (
     CHUNK,
     FOOTER_SIZE,
     LARGEST_CHUNK,
-    MESSAGE,
     PIECE,
     PRIVATE,
     RECORD,
@@ -61,6 +60,7 @@ from uncertain_lti.recordings.mcap_records import (
 from uncertain_lti.recordings.mcap_walk import Records, walk_records
 from uncertain_lti.recordings.unreadable import not_mcap, os_error
 
+_LEAST_STRETCH = 1 << 14  # bytes
 _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
 _CHUNK_AT = struct.Struct("<16xQ")  # in a chunk's index
 _FIRST_WARNINGS = 3  # of a kind that are reported one by one
@@ -89,10 +89,6 @@ def scan(path: Path) -> Contents:
 
 
 class _Scanner:
-    bare_begin: int
-    bare_end: int
-    bare: dict[int, Tally]  # of the block outside chunks that is being walked
-
     def __init__(self, path: Path, stream: BinaryIO, size: int) -> None:
         self.stream = stream
         self.found = Contents(path, size)
@@ -108,7 +104,7 @@ class _Scanner:
         self.records_left = most_records(size)  # in chunks
         self.bytes_left = most_inflated(size)
         self.definitions_left = _LARGEST_DEFINITIONS
-        self._forget_bare()
+        self.stretch = _LEAST_STRETCH  # bytes outside chunks that are read at once
 
     def run(self) -> Contents:
         found, path = self.found, self.found.path
@@ -116,7 +112,6 @@ class _Scanner:
         if self.closed:
             self._summary()
         ended = self._data_section()
-        self._end_bare()
         found.schemas = self.summary_schemas | found.schemas
         found.channels = self.summary_channels | found.channels
         lost = self._orphans()
@@ -176,12 +171,12 @@ class _Scanner:
             if ends:
                 self._data_end(parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None)
                 return True
+            if opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                position = self._bare(position, end, following)
+                self.stream.seek(position)
+                continue
             self.sums = crc32(header, self.sums)
-            if opcode == Opcode.MESSAGE or opcode == Opcode.SCHEMA or opcode == Opcode.CHANNEL:
-                content = self.stream.read(length)
-                self.sums = crc32(content, self.sums)
-                self._bare(position, opcode, content)
-            elif opcode == Opcode.CHUNK:
+            if opcode == Opcode.CHUNK:
                 content = self.stream.read(length)
                 self.sums = crc32(content, self.sums)
                 self._chunk(position, begin, content)
@@ -212,27 +207,24 @@ class _Scanner:
         self.warned[kind] += 1
         return self.warned[kind] <= _FIRST_WARNINGS
 
-    def _bare(self, position: int, opcode: int, content: bytes) -> None:
-        """A record outside chunks: continues the current block or begins one."""
-        end = position + RECORD.size + len(content)
-        if self.bare_end != position or end - self.bare_begin > _BARE_BLOCK:
-            self._end_bare()
-            self.bare_begin = position
-        self.bare_end = end
-        if opcode == Opcode.MESSAGE:
-            self._message(content, self.bare)
-        else:
-            self._definition(opcode, content)
+    def _bare(self, begin: int, end: int, following: int) -> int:
+        """Records outside chunks, of which one ends at `end`, as far as there is nothing else; returns where that is.
 
-    def _end_bare(self) -> None:
-        if self.bare:
-            size = self.bare_end - self.bare_begin
-            self._block(self.bare_begin, size, "", size, self.bare)
-        self._forget_bare()
+        More is read at once the longer they go on: in between there may be chunks, which are then read twice.
+        """
+        records = self._at(begin, max(end - begin, min(self.stretch, following - begin)))
+        found = walk_records(records, 0, len(records), len(records), bare=True)
+        self.stretch = min(4 * self.stretch, _BARE_BLOCK) if 2 * found.stop > len(records) else _LEAST_STRETCH
+        self.sums = crc32(memoryview(records)[: found.stop], self.sums)
+        self._take(records, found)
+        if len(found.channel):
+            self._block(begin, found.stop, "", found.stop, _tally(found))
+        return begin + found.stop
 
-    def _forget_bare(self) -> None:
-        self.bare_begin, self.bare_end = -1, -1
-        self.bare = {}
+    def _take(self, records: bytes | memoryview, found: Records) -> None:
+        for opcode, start, stop in found.definitions:
+            self._definition(opcode, records[start:stop])
+        self.odd_records += found.short
 
     def _chunk(self, position: int, begin: int, content: bytes, cut: bool = False) -> None:
         if len(content) < CHUNK.size:
@@ -279,9 +271,8 @@ class _Scanner:
                 self.records_left = 0
                 self._leave_out(where, "with it the file holds more records than bytes", cut)
                 return
-        for opcode, start, stop in found.definitions:
-            self._definition(opcode, records[start:stop])
-        self.odd_records += found.short + (found.stop < len(records) and not cut)
+        self._take(records, found)
+        self.odd_records += found.stop < len(records) and not cut
         if len(found.channel):
             self._block(begin + data_begin, len(data), compression, found.stop, _tally(found), cut)
 
@@ -291,13 +282,6 @@ class _Scanner:
             if self._first("chunk"):
                 path = self.found.path
                 self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
-
-    def _message(self, content: bytes, tally: dict[int, Tally]) -> None:
-        if len(content) < MESSAGE.size:
-            self.odd_records += 1
-            return
-        channel, _, time, _ = MESSAGE.unpack_from(content)
-        _add(tally, channel, Tally(1, time, time))
 
     def _block(
         self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally], cut: bool = False

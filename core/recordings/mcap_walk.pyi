@@ -22,4 +22,6 @@ class Records(NamedTuple):
     number: int
     stop: int
 
-def walk_records(block: bytes | bytearray | memoryview, begin: int, end: int, most: int) -> Records: ...
+def walk_records(
+    block: bytes | bytearray | memoryview, begin: int, end: int, most: int, bare: bool = False
+) -> Records: ...

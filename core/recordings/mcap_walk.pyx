@@ -37,8 +37,8 @@ class Records(NamedTuple):
     stop: int
 
 
-def walk_records(block, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t most):
-    """Whole records of block[begin:end], at most so many, until one that is cut or of opcode 0."""
+def walk_records(block, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t most, bint bare=False):
+    """Whole records of block[begin:end], at most so many, until one that is cut or of opcode 0; if bare, until another."""
     cdef const uint8_t[::1] data = block
     cdef Py_ssize_t at = begin, found = 0, number = 0, short = 0
     cdef Py_ssize_t room = min(most, (end - begin) // (HEAD + MESSAGE_HEAD))
@@ -50,7 +50,7 @@ def walk_records(block, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t most):
     definitions = []
     while number < most and at + HEAD <= end and data[at]:
         memcpy(&length, &data[at + 1], 8)
-        if length > <uint64_t>(end - at - HEAD):
+        if length > <uint64_t>(end - at - HEAD) or (bare and not OPCODE_OF_SCHEMA <= data[at] <= OPCODE_OF_MESSAGE):
             break
         number += 1
         if data[at] in (OPCODE_OF_SCHEMA, OPCODE_OF_CHANNEL):

@@ -36,6 +36,7 @@ CODES = {
 ENCAPSULATIONS = b"\0\0", b"\0\1", b"\0\3"
 cdef enum:
     ENCAPSULATION = 4  # bytes before the first field
+    MOST = 1 << 30  # elements; no message has as many
     PADDING = 3  # bytes that may stand behind any message: some senders fill up to a multiple of four
     RESERVED = 4  # bytes that rclpy leaves behind a message for each empty sequence of 8-byte numbers in it
 cdef enum:  # what a node is
@@ -84,6 +85,32 @@ cdef class _Node:
     def __cinit__(self):
         self.array = self.slot = self.every = self.name_at = -1
         self.fields, self.indexed, self.named = [], [], []
+
+
+def _together(_Node one, _Node other):
+    """Two stretches of numbers of one size that nobody wants, one behind the other, as one; None if they are not."""
+    cdef _Node both = _Node()
+    both.kind, both.array = NUMBER, 0
+    for node in (one, other):
+        found = _numbers_alone(node)
+        if found is None or both.size not in (0, found[0]) or both.array + found[1] > MOST:
+            return None
+        both.size, both.array = found[0], both.array + found[1]
+    return both
+
+
+def _numbers_alone(_Node node):
+    """Size and number of what a field is if it is nothing but numbers that nobody wants; else None."""
+    if not node.array or node.slot >= 0 or node.indexed or node.named or node.every >= 0:
+        return None
+    count = node.array if node.array > 0 else 1
+    if node.kind == NUMBER:
+        return node.size, count
+    if node.kind != MESSAGE:
+        return None
+    inside = (node.element if node.array > 0 else node).fields
+    found = _numbers_alone(inside[0]) if len(inside) == 1 else None
+    return found and (found[0], found[1] * count)
 
 
 cdef class Plan:
@@ -145,7 +172,7 @@ cdef class Plan:
         if not wants and key in self.unwanted:
             return self.unwanted[key]
         node = _Node()
-        node.array = -1 if kind.array is None else kind.array
+        node.array = -1 if kind.array is None else min(kind.array, MOST)
         code = CODES.get(kind.type_name, "") if kind.kind not in ("string", "message") else ""
         if kind.kind == "message":
             node.kind = MESSAGE
@@ -203,12 +230,20 @@ cdef class Plan:
             else:
                 for position, name in enumerate(self.functions[number].takes.parts(fields)):
                     groups.setdefault(name, []).append(((), number, position))
-        for position, (name, kind) in enumerate(fields.items()):
+        named = -1  # the first field whose elements are looked up by name
+        for name, kind in fields.items():
             child = self.node(kind, groups.get(name, []))
-            node.fields.append(child)
-            if child.named and node.name_at < 0:
-                node.name_at = list(fields).index("name")
-                node.ahead = node.name_at > position
+            if name == "name":
+                node.name_at = len(node.fields)
+            elif child.named and named < 0:
+                named = len(node.fields)
+            together = _together(node.fields[len(node.fields) - 1], child) if node.fields else None
+            if together is not None:
+                node.fields.pop()
+            node.fields.append(child if together is None else together)
+        if named < 0:
+            node.name_at = -1
+        node.ahead = node.name_at > named
 
     # --- one message ----------------------------------------------------------------------------------------
 
@@ -279,6 +314,8 @@ cdef class Plan:
 
     cdef bint numbers(self, _Node node, Py_ssize_t count, Py_ssize_t names, Py_ssize_t number) except? False:
         cdef Py_ssize_t start = self.at, i
+        if count > self.size:
+            return False
         if count:
             start = (start + node.size - 1) & ~(node.size - 1)
             self.at = start + count * node.size
@@ -291,7 +328,7 @@ cdef class Plan:
                 self.untrue |= self.data[i] > 1
         if node.slot >= 0:
             self.slots[node.slot] = self.number(node.code, start)
-        elif node.array >= 0:
+        elif node.indexed or node.named or node.every >= 0:
             for index, slot in node.indexed:
                 if index < count:
                     self.slots[<Py_ssize_t>slot] = self.number(node.code, start + <Py_ssize_t>index * node.size)
@@ -441,7 +478,7 @@ cdef class Plan:
             if function is None:
                 target[:, path] = rows[:, self.parts[path][0]]
             else:
-                good = np.flatnonzero(state == 0)
+                good = np.flatnonzero(state == 0) if state.any() else slice(None)
                 target[good, path] = self.all_computed(path, function, good, rows, places, buffer, begin)
         return state
 
@@ -466,11 +503,12 @@ cdef class Plan:
         if slots and all(self.codes[slot] in "fd" for slot in slots):
             with np.errstate(all="ignore"):
                 arguments, size = function.terms(*(rows[good, slot] for slot in slots))
-            there = np.broadcast_to(np.asarray(size > 0.0), len(good)).copy()
-            result = np.full(len(good), math.nan)
+            there = np.broadcast_to(np.asarray(size > 0.0), len(arguments[0])).copy()
+            result = np.full(len(there), math.nan)
             result[there] = list(map(function.number, *(argument[there].tolist() for argument in arguments)))
             return result
         data = memoryview(buffer)
+        good = np.arange(len(rows))[good]
         return [self.computed(number, function, rows[i], places[i], data[begin[i] :]) for i in good.tolist()]
 
 
