@@ -11,7 +11,6 @@
 
 import os
 import platform
-import re
 import shutil
 import signal
 import ssl
@@ -34,19 +33,22 @@ pytestmark = pytest.mark.skipif(
 )
 
 COMPILED = [
-    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "core/kernel").glob("*.p[yx]*")) if path.suffix != ".pyi"),
-    *(
-        f"core/{name.replace('.', '/')}.py"
-        for name in re.findall(r'^    "(\w+\.\w+)": "-O', (ROOT / "setup.py").read_text(), re.MULTILINE)
-        if not name.startswith("kernel.")
-    ),
+    str(path.relative_to(ROOT))
+    for path in sorted((ROOT / "core").rglob("*.p[yx]*"))
+    if path.suffix in (".py", ".pyx")
+    and (
+        path.parent.name == "kernel"
+        or path.suffix == ".pyx"
+        or f'"{path.parent.name}.{path.stem}": "-O' in (ROOT / "setup.py").read_text()
+    )
 ]
 
 
 def test_what_is_compiled_makes_the_environment_anew_when_it_changes():
     text = (ROOT / "run").read_text()
-    assert len(COMPILED) > 12 and all(name in text or name.startswith("core/kernel/") for name in COMPILED)
-    assert " core/kernel/* " in text
+    assert len(COMPILED) > 10
+    assert all(name in text for name in COMPILED if not name.startswith("core/kernel/") and name.endswith(".py"))
+    assert " core/kernel/* " in text and " core/recordings/*.pyx " in text
 
 
 @pytest.fixture

@@ -125,9 +125,7 @@ def test_without_pyarrow_the_sentence_names_the_command(tmp_path, monkeypatch):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
-    with pytest.raises(
-        BagError, match=r"package pyarrow is not installed; in the checkout: pip install '.\[tables\]"
-    ):
+    with pytest.raises(BagError, match=r"package pyarrow is not installed; in the checkout: pip install '.\[tables\]"):
         open_recording(tmp_path / "a.parquet")
 
 

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from rclpy.serialization import deserialize_message
 
@@ -69,12 +68,8 @@ def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | Non
 
     def make_reader(type_name: str, paths: Sequence[FieldPath]) -> MessageReader:
         kind = message_class(type_name)
-
-        def decode(data: bytes) -> Any:
-            if len(data) > settings.largest_message:
-                raise ValueError(f"{len(data)} bytes are more than parameter largest_message allows")
-            return deserialize_message(data, kind)
-
-        return MessageReader(type_name, paths, _type_fields, decode)
+        return MessageReader(
+            type_name, paths, _type_fields, lambda data: deserialize_message(data, kind), settings.largest_message
+        )
 
     return Session(model, rule, types, _type_fields, make_reader, time.monotonic(), arming, settings.real("catch_up"))

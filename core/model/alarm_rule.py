@@ -192,7 +192,7 @@ Rule = AlarmRule | StatisticRule
 
 
 def labels(rules: Sequence[Rule]) -> tuple[str, ...]:
-    """What each rule is called: its kind, `@` its horizon if that is not 1, and `#2` if it is the second of that name."""
+    """What each rule is called: its kind, `@` its horizon if that is not 1, and `#2` if it is the second so named."""
     found: list[str] = []
     seen: dict[str, int] = {}
     for rule in rules:

@@ -30,6 +30,11 @@ class MessageReader:
     type_name: str
     decoded: int
     def __init__(
-        self, type_name: str, paths: Sequence[FieldPath], type_fields: TypeFields, decode: Callable[[bytes], Any]
+        self,
+        type_name: str,
+        paths: Sequence[FieldPath],
+        type_fields: TypeFields,
+        decode: Callable[[bytes], Any],
+        largest: int = ...,
     ) -> None: ...
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]]: ...

@@ -18,6 +18,7 @@ as its type says: live one by one, of a recording many in one call.
 
 import math
 import struct
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -517,15 +518,17 @@ cdef class MessageReader:
 
     `type_name`: as package/msg/Name; `paths`: checked against the type; `type_fields`: type name -> {field name:
     FieldType}; `decode`: serialised message -> message; may raise anything where that is not one; `decoded`: messages
-    that it was needed for.
+    that it was needed for; `largest`: bytes of a message that is read.
     """
 
     cdef readonly object type_name, decoded
     cdef object decode, paths
     cdef Plan plan
+    cdef Py_ssize_t largest
 
-    def __init__(self, type_name, paths, type_fields, decode):
+    def __init__(self, type_name, paths, type_fields, decode, largest=sys.maxsize):
         self.type_name, self.paths, self.decode, self.decoded = type_name, tuple(paths), decode, 0
+        self.largest = largest
         self.plan = None
         try:
             self.plan = Plan(type_name, self.paths, type_fields)
@@ -534,6 +537,8 @@ cdef class MessageReader:
 
     def read(self, data):
         """Header stamp and one value per path."""
+        if len(data) > self.largest:
+            raise UnreadableError(f"is of {len(data)} bytes, more than parameter largest_message allows")
         if self.plan is not None:
             what, found = self.plan.read(data)
             if what == CUT:  # some of which the middleware fills up with zeros

@@ -40,7 +40,7 @@ Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
 def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, str]:
-    """Per topic `header` or `log`: what the map says, else header where most messages of all recordings carry a stamp."""
+    """Per topic `header` or `log`: what the map says, else header where most messages carry a stamp."""
     sources: dict[str, str] = {}
     for position, name in enumerate(signals.topics):
         stamps = np.concatenate([s.stamp[s.topic == position] for s in streams])
@@ -49,7 +49,7 @@ def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, 
 
 
 def time_source(signals: SignalMap, topic: str, stamped: int, counted: int) -> str:
-    """What counts as the time of a topic's messages: what the map says, else the stamp where most messages carry one."""
+    """What counts as the time of a topic: what the map says, else the stamp where most messages carry one."""
     chosen = signals.time.get(topic)
     if chosen == "header" and not stamped:
         raise SignalError(
