@@ -141,16 +141,6 @@ def add_signals(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_within(parser: argparse.ArgumentParser) -> None:
-    """Declare the time within which a fault shall be seen."""
-    parser.add_argument(
-        "--within",
-        type=float,
-        metavar="S",
-        help="time within which a fault shall be seen (default: 1 s or 20 steps, at most a quarter of a recording)",
-    )
-
-
 def add_output(parser: argparse.ArgumentParser, required: bool) -> None:
     """Declare the model file that a command writes, and `--force`."""
     parser.add_argument("--output", required=required, metavar="MODEL", help="model file to write (*.model.json)")

@@ -24,7 +24,6 @@ from uncertain_lti.cli.command import (
     add_force,
     add_model,
     add_recordings,
-    add_within,
     model_target,
     print_json,
     print_notes,
@@ -48,7 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PER_HOUR",
         help="learn the panel again, for at most so many false alarms per hour with 90%% confidence",
     )
-    add_within(parser)
+    parser.add_argument(
+        "--within",
+        type=float,
+        metavar="S",
+        help="time within which a fault shall be seen (default: 1 s or 20 steps, at most a quarter of a recording)",
+    )
     parser.add_argument(
         "--output",
         metavar="MODEL",

@@ -30,7 +30,8 @@ from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 
 UNVOUCHED, STRANGE = 0.2, 0.5
-"""Share of the verdicts outside the fitted domain from which on their quiet says nothing, or the machine is another."""
+"""Share of the verdicts outside the fitted domain from which on their quiet says nothing; there, or in alarm from early
+on, from which the machine may be another."""
 JUDGED = 0.5
 """Share of the steps that must have a verdict for their quiet to say something."""
 MOST_EXPLAINED = 100
@@ -163,6 +164,12 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     x, span = verdicts.transient.x[verdicts.judged], model.domain.x_max - model.domain.x_min
     if (span > 0).any() and not np.ptp(x, axis=0).any():
         return "nothing that is judged moves in it"
+    alarmed = verdicts.alarm[verdicts.judged]
+    if alarmed.mean() > STRANGE and alarmed[: max(1, judged // 10)].any():
+        return (
+            f"the alarm is up for {alarmed.mean():.0%} of it, from early on: the fault was there before, or this is "
+            f"another machine, in other units, or run as in no recording of the fit"
+        )
     return ""
 
 

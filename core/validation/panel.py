@@ -17,6 +17,13 @@ beyond those of one as the quantiles of a normal distribution do,
     threshold = median + a (largest - median),   a = sqrt(log(N n) / log N).
 
 Where windows are few, the largest of one state is chance, and the states share what is relative to their typical peak.
+Recordings differ by more than their blocks, so a threshold is also the limit below which the largest size of one more
+recording or group lies with CONFIDENCE, where the logarithms of the largest sizes p of each of G (TELLING at least) are
+normal,
+
+    exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1.
+
+[Hahn, G. J. and Meeker, W. Q., Statistical Intervals, 1991, section 4.8]
 """
 
 from __future__ import annotations
@@ -48,7 +55,9 @@ FEW = 30
 MORE = 0.1
 """Over the number of recordings, groups or blocks: share by which thresholds are raised for what the next brings."""
 CONFIDENCE = 0.9
-"""Of the limit of the false-alarm rate, one-sided."""
+"""Of the limit of the false-alarm rate, one-sided, and of the largest size in one more recording or group."""
+TELLING = 4
+"""Recordings or groups from which on the spread of their largest sizes is known well enough to reckon with."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
 NEARBY = 0.75
@@ -164,21 +173,24 @@ def learn(validation: Validation, transients: Sequence[Transient], rate: float |
             far = part.extrapolated > 0
             unlike.append(part.name)
         left.append(part.without(far))
-    fitted = [judge(model, model, run, run.name) for run in transients]
+    sizes = [sizes_of(rules, part) for part in left]
+    fitted = [sizes_of(rules, judge(model, model, run, run.name)) for run in transients]
     units = unit_numbers(parts)
-    thresholds = [
-        _threshold(
-            rule, model.n, dt, units, [sizes_of([rule], p)[0] for p in left], [sizes_of([rule], p)[0] for p in fitted]
-        )
-        for rule in rules
-    ]
-    shown = [part for part in left if part.judged]
-    hours = sum(part.hours for part in shown)
+    thresholds = []
+    for r, rule in enumerate(rules):
+        peaks = _peaks(units, [of[r] for of in sizes])
+        found = _threshold(rule, model.n, dt, np.concatenate([of[r] for of in (*sizes, *fitted)]), peaks)
+        found *= 1.0 + MORE / len(peaks)
+        if validation.what != "block" and len(peaks) >= TELLING:
+            found = np.maximum(found, _of_next(peaks))
+        thresholds.append(np.clip(found, 1e-6, LARGEST**0.5))
     levels = [
-        np.max([(s / t).max(axis=1) for s, t in zip(sizes_of(rules, part), thresholds, strict=True)], axis=0)
-        for part in shown
+        (part, np.max([(s / t).max(axis=1) for s, t in zip(of, thresholds, strict=True)], axis=0))
+        for part, of in zip(left, sizes, strict=True)
+        if part.judged
     ]
-    factor, limit, alarms = _factor(shown, levels, hours, len(rules), rate)
+    hours = sum(part.hours for part, _ in levels)
+    factor, limit, alarms = _factor(levels, hours, len(rules), rate)
     thresholds = [factor * t for t in thresholds]
     usual, median = np.average(
         [(p.usual_width, p.median_width) for p in parts], axis=0, weights=[p.judged for p in parts]
@@ -192,37 +204,47 @@ def learn(validation: Validation, transients: Sequence[Transient], rate: float |
     )  # fmt: skip
 
 
-def _threshold(
-    rule: StatisticRule, n: int, dt: float, units: NDArray[np.intp], left: Sequence[Array], fitted: Sequence[Array]
-) -> Array:
-    """Threshold (n,) or (1,) of one rule: its sizes on every left-out part, and on what was fitted."""
-    peaks = np.full((int(units.max()) + 1, left[0].shape[1]), 1e-9)
-    for unit, size in zip(units.tolist(), left, strict=True):
-        peaks[unit] = np.maximum(peaks[unit], size.max(axis=0, initial=0.0))
-    every = np.concatenate([*left, *fitted])
-    top = every.max(axis=0)
-    median = np.median(every, axis=0)
+def _threshold(rule: StatisticRule, n: int, dt: float, every: Array, peaks: Array) -> Array:
+    """Threshold (n,) or (1,) of one rule: of its sizes (K, n) or (K, 1) on all healthy data, and the `_peaks` there."""
+    top, median = every.max(axis=0), np.median(every, axis=0)
     windows = max(3.0, len(every) / 2.0 / max(1, round(rule.window_s / dt)))
     found = median + math.sqrt(math.log(windows * n) / math.log(windows)) * (top - median)
     if windows < FEW:
         typical = np.exp(np.log(peaks).mean(axis=0))
         found = np.maximum(found, typical * (top / typical).max())
-    found *= 1.0 + MORE / len(peaks)
-    return np.asarray(np.clip(found, 1e-6, LARGEST**0.5))
+    return np.asarray(found)
+
+
+def _of_next(peaks: Array) -> Array:
+    """Limit, with CONFIDENCE, of the largest size in one more recording or group, (n,) or (1,)."""
+    from scipy.special import stdtrit
+
+    logs, count = np.log(peaks), len(peaks)
+    spread = math.sqrt(logs.var(axis=0, ddof=1).mean())
+    return np.asarray(
+        np.exp(logs.mean(axis=0) + stdtrit(count - 1, CONFIDENCE) * math.sqrt(1.0 + 1.0 / count) * spread)
+    )
+
+
+def _peaks(units: NDArray[np.intp], values: Sequence[Array]) -> Array:
+    """The largest of the values (K,) or (K, n) of the parts of each unit, at least 1e-9."""
+    found = np.full((int(units.max()) + 1, *values[0].shape[1:]), 1e-9)
+    for unit, each in zip(units.tolist(), values, strict=True):
+        found[unit] = np.maximum(found[unit], each.max(axis=0, initial=0.0))
+    return found
 
 
 def _factor(
-    parts: Sequence[Part], levels: Sequence[Array], hours: float, rules: int, rate: float | None
+    shown: Sequence[tuple[Part, Array]], hours: float, rules: int, rate: float | None
 ) -> tuple[float, float, int]:
     """The lowest factor on the thresholds that keeps to a rate, the limit of the rate there, and alarms left out.
 
     A threshold that is the largest size of so many hours is passed about once in as many: every rule but one counts as
     a cluster of alarms, and those come in clusters as they do somewhat below the thresholds.
     """
-    largest = np.zeros(int(unit_numbers(parts).max(initial=-1)) + 1)
-    for unit, level in zip(unit_numbers(parts).tolist(), levels, strict=True):
-        largest[unit] = max(largest[unit], float(level.max(initial=0.0)))
-    third = float(np.sort(largest)[::-1][min(2, len(largest) - 1)])
+    parts, levels = [part for part, _ in shown], [level for _, level in shown]
+    largest = np.sort(_peaks(unit_numbers(parts), levels))[::-1] if parts else np.zeros(1)
+    third = float(largest[:3][-1])
 
     def raised(factor: float) -> Array:
         return by_unit(parts, [rising(v > factor, p.starts) for v, p in zip(levels, parts, strict=True)])
