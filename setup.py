@@ -42,7 +42,7 @@ COMPILED = {
     "monitor.verdict_messages": "-O1",
     "recordings.mcap_walk": "-O2",
     "recordings.message_reader": "-O3",
-    "sampling.sampler": "-O2",
+    "sampling.sampler": "-O1",
 }
 """Modules that are compiled, and how: the kernel, and typed Python of the live chain."""
 
@@ -58,7 +58,7 @@ def compiled() -> list[Extension]:
     for dotted, level in COMPILED.items():
         path = Path("core", *dotted.split("."))
         source = next(str(path.with_suffix(end)) for end in (".pyx", ".py") if (ROOT / path).with_suffix(end).exists())
-        arguments = [level, "-g0", "-ffp-contract=off"]
+        arguments = [level, "-g0", "-w", "-ffp-contract=off"]
         extensions.append(Extension(f"uncertain_lti.{dotted}", [source], extra_compile_args=arguments))
     found: list[Extension] = cythonize(extensions, build_dir="build/cython", language_level=3, quiet=True)
     return found
@@ -67,7 +67,9 @@ def compiled() -> list[Extension]:
 extras = {
     # What `uncertain_lti.fit` needs. The newest of these want numpy 2: in a sourced ROS 2 say
     # `pip install '.[fit]' 'numpy<2'` (./run pins its numpy), and pip takes the last that do without.
-    "fit": ["cvxpy", "daqp", "highspy", "osqp>=1", "piqp", "scipy"],
+    "fit": ["daqp", "highspy", "piqp", "scipy"],
+    # `fit(method="cvxpy")`: the whole problem as written, for comparison.
+    "oracle": ["cvxpy", "highspy", "osqp>=1"],
     "cluster": ["distributed"],
     # Checksums of recordings ten times as fast as zlib's.
     "fast": ["isal"],

@@ -313,7 +313,7 @@ def test_every_block_runs(page, tmp_path, request):
     every = blocks(page)
     if any(ROS.search(b.text) and "not run" not in b.marks for b in every):
         pytest.importorskip("rclpy", reason="neither a ROS 2 installation nor the rclpy wheels are here")
-    pytest.importorskip("cvxpy", reason="the extra fit is not installed")
+    pytest.importorskip("cvxpy", reason="the extra oracle is not installed")
     if "control" in page.read_text():
         pytest.importorskip("control", reason="the extra control is not installed")
     with own_domain() as domain:

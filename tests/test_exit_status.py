@@ -150,6 +150,14 @@ def test_a_model_is_written_whoever_reads_what_is_said(tmp_path, command):
 SOLVERS = ("cvxpy", "daqp", "highspy", "osqp", "piqp", "scipy")
 
 
+def test_in_the_environment_of_the_programs_the_remedy_is_one_command_of_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    (tmp_path / "made-for").write_text("use\n")
+    assert absent("pyarrow") == "the Python package pyarrow is not installed; in the checkout: ./run setup --all"
+    (tmp_path / "made-for").write_text("all\n")
+    assert absent("pyarrow").endswith("pip install '.[tables]'")
+
+
 def without(packages, words):
     gone = f"import sys; sys.modules.update(dict.fromkeys({packages!r}))"
     program = f"{gone}; from uncertain_lti.cli.main import main; sys.exit(main())"

@@ -63,7 +63,7 @@ def run(tmp_path):
         shutil.copy(ROOT / name, checkout / name)
     bin = tmp_path / "bin"
     bin.mkdir()
-    for tool in "bash cat cksum dirname env grep rm sed tail uname".split():
+    for tool in "bash cat cksum dirname env gcc grep rm sed tail uname".split():
         (bin / tool).symlink_to(shutil.which(tool))
 
     def call(*arguments: str, programs: dict[str, str] | None = None, cwd: Path | None = None, **environment: str):
@@ -113,30 +113,61 @@ def test_unknown_command(run):
 
 
 def test_no_python(run):
-    assert "apt-get install python3 python3-venv" in refusal(run("setup"))
+    assert "apt-get install python3 python3-dev gcc" in refusal(run("setup"))
 
 
 def test_every_python_of_a_wrong_version_is_named(run):
-    programs = {"python3": python_of_version("3.13"), "python3.12": "exit 127"}
+    programs = {"python3": python_of_version("3.14"), "python3.12": "exit 127"}
     sentence = refusal(run("setup", programs=programs))
-    assert "Python 3.11 or 3.12 is needed" in sentence and "python3 is 3.13" in sentence
+    assert "Python 3.11, 3.12 or 3.13 is needed" in sentence and "python3 is 3.14" in sentence
     assert "python3.12 is" not in sentence
 
 
-@pytest.fixture
-def without_venv(tmp_path):
-    """Shell text that is this interpreter as Debian ships it without python3-venv."""
-    (tmp_path / "ensurepip.py").write_text("raise ModuleNotFoundError\n")
-    return this_python(f'PYTHONPATH="{tmp_path}"')
+def without(module: str, folder: Path) -> str:
+    """Shell text that is this interpreter without a module of the standard library."""
+    (folder / f"{module}.py").write_text("raise ModuleNotFoundError\n")
+    return this_python(f'PYTHONPATH="{folder}"')
 
 
-def test_python_without_venv_module(run, without_venv):
-    sentence = refusal(run("setup", programs={"python3": without_venv}))
+def test_python_without_venv_module(run, tmp_path):
+    sentence = refusal(run("setup", programs={"python3": without("venv", tmp_path)}))
     assert sentence.endswith(f"apt-get install python{VERSION}-venv")
 
 
-def test_a_suitable_python_is_found_under_its_own_name(run, without_venv):
-    programs = {"python3": python_of_version("3.13"), f"python{VERSION}": without_venv}
+def test_python_without_ensurepip_takes_pip_from_the_index(run, tmp_path):
+    """As Debian ships it without python3-venv; the index offers no wheel of pip, and then none that is what it says."""
+    page, asked = [b""], []
+
+    class Index(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(page[0])
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Index) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        index = {"PIP_INDEX_URL": f"http://127.0.0.1:{server.server_address[1]}/simple"}
+        programs = {"python3": without("ensurepip", tmp_path)}
+        first = run("setup", programs=programs, **index)
+        page[0] = b"".join(
+            f'<a href="../../p/pip-{v}-py3-none-any.whl#sha256={"0" * 64}">'.encode() for v in ("9.0", "25.1")
+        )
+        second = run("setup", programs=programs, **index)
+        server.shutdown()
+    assert first.returncode == second.returncode == 2
+    assert first.stderr.strip().endswith("/simple/pip/ lists no wheel of pip")
+    assert "pip-25.1-py3-none-any.whl is not what" in second.stderr.splitlines()[-1]
+    assert asked == ["/simple/pip/", "/simple/pip/", "/p/pip-25.1-py3-none-any.whl"]
+
+
+def test_no_compiler(run):
+    sentence = refusal(run("setup", programs={"python3": this_python("CC=no-such-compiler")}))
+    assert "a C compiler" in sentence and sentence.endswith(f"apt-get install gcc python{VERSION}-dev")
+
+
+def test_a_suitable_python_is_found_under_its_own_name(run, tmp_path):
+    programs = {"python3": python_of_version("3.14"), f"python{VERSION}": without("venv", tmp_path)}
     assert f"Python {VERSION} has no venv module" in refusal(run("setup", programs=programs))
 
 
@@ -184,7 +215,7 @@ def write(path, text):
 
 bin = Path(sys.argv[-1]) / "bin"
 bin.mkdir(parents=True)
-write(bin / "python", '[[ $2 == pip ]] || exec "{python}" "$@"')
+write(bin / "python", '[[ $2 == pip || $1 == *.whl/pip ]] || exec "{python}" "$@"')
 for name in {programs}:
     write(bin / name, 'printf "%s\\n" "${{0##*/}}" "$PWD" "$@"')
 """
@@ -264,7 +295,7 @@ def test_a_start_from_the_environment_itself_does_not_use_what_it_removes(run, s
     nowhere = {"PIP_INDEX_URL": "http://127.0.0.1:9", "PIP_RETRIES": "1"}
     sentence = refusal(run("setup", programs={"python3": inside}, **nowhere))
     assert "no package index can be reached" in sentence  # it came that far
-    assert (checkout / ".venv/bin/python").resolve().exists() and (checkout / ".venv/bin/pip").exists()
+    assert (checkout / ".venv/bin/python").resolve().exists()
 
 
 def test_a_start_from_the_environment_itself_does_not_make_it_again(run, slow, tmp_path):
@@ -279,6 +310,7 @@ def test_a_start_from_the_environment_itself_does_not_make_it_again(run, slow, t
     shutil.rmtree(environment)
     subprocess.run([link, "-m", "venv", "--without-pip", environment], check=True)
     (environment / "made-from").write_text(made_from)
+    (environment / "made-for").write_text("use\n")
     done = run("setup", programs={"python3": f'exec "{environment}/bin/python3" "$@"'})
     assert done.returncode == 0 and "ready" in done.stdout and "installing" not in done.stdout, done
     assert (tmp_path / "made").read_text() == "x"
@@ -321,7 +353,7 @@ def test_a_checkout_of_somebody_else_is_a_sentence(run, tmp_path):
         )
     finally:
         shutil.rmtree(folder)
-    if "Python 3.11 or 3.12 is needed" in done.stderr:
+    if "Python 3.11, 3.12 or 3.13 is needed" in done.stderr:
         pytest.skip("others cannot run this Python")
     assert "/.venv cannot be written by" in refusal(done) and "copy the checkout" in done.stderr
 
@@ -341,21 +373,37 @@ def test_a_machine_without_loopback_is_a_sentence(run, tmp_path, command):
 
 
 def test_setup_takes_one_option(run):
-    assert "setup takes --monitor and nothing else, and not 'all'" in refusal(
+    assert "setup takes --all or --monitor, and not 'all'" in refusal(
         run("setup", "all", programs={"python3": this_python()})
     )
+
+
+def noting(maker: Path, asked: Path) -> None:
+    """Let the environments that are made note what their pip is asked for."""
+    said = "[[ $2 == pip || $1 == *.whl/pip ]]"
+    maker.write_text(maker.read_text().replace(said, f'{said} && printf "%s\\\\n" "$*" >>"{asked}"; {said}'))
+
+
+def test_the_programs_need_less_than_the_tests(run, slow, tmp_path):
+    """What is asked for later is added to what there is; what is there is not installed again."""
+    asked = tmp_path / "asked"
+    noting(tmp_path / "make_environment.py", asked)
+    for option in ([], [], ["--all"], []):
+        assert run("setup", *option, programs={"python3": slow}).returncode == 0
+    first, second = (line.rpartition(" ")[2] for line in asked.read_text().splitlines() if " -e " in line)
+    assert first == ".[completion,fast,fit,plots,ros]"
+    assert set(second[2:-1].split(",")) > {"completion", "fit", "plots", "ros", "test", "docs", "oracle", "tables"}
+    assert (tmp_path / "made").read_text() == "x"
 
 
 def test_a_small_environment_for_robots_that_only_monitor(run, slow, tmp_path):
     """Neither the recordings' nor the fit's packages: what is asked for is numpy, PyYAML, rclpy, and this alone."""
     asked = tmp_path / "asked"
-    maker = tmp_path / "make_environment.py"
-    noting = f'''[[ $2 == pip ]] && printf "%s\\n" "$*" >>"{asked}"; [[ $2 == pip ]] || exec'''
-    maker.write_text(maker.read_text().replace("[[ $2 == pip ]] || exec", noting))
+    noting(tmp_path / "make_environment.py", asked)
     done = run("setup", "--monitor", programs={"python3": slow})
     assert done.returncode == 0 and "ready: .venv-monitor" in done.stdout, done
-    first, second = asked.read_text().splitlines()
-    wanted = first.partition("version-check ")[2].split()
+    first, second = (line for line in asked.read_text().splitlines() if "--no-build-isolation" in line)
+    wanted = first.partition("--no-build-isolation ")[2].split()
     assert wanted[:2] == ["numpy", "PyYAML"] and [w.partition("==")[0] for w in wanted[2:]] == [
         "ros-jazzy-common-interfaces",
         "ros-rclpy[fastrtps]",

@@ -11,8 +11,12 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 _EXTRAS = {
-    "fit": "cvxpy daqp highspy osqp piqp scipy",
+    "fit": "daqp highspy piqp scipy",
+    "oracle": "cvxpy osqp",
     "plots": "PIL jinja2 markupsafe matplotlib",
     "tables": "pyarrow",
     "control": "control",
@@ -24,12 +28,20 @@ _EXTRAS = {
 """What brings which packages: an extra of setup.py, or every installation."""
 
 
+def _made_by_run() -> bool:
+    """Whether this is the environment that ./run makes for the programs alone."""
+    made_for = Path(sys.prefix, "made-for")
+    return made_for.is_file() and made_for.read_text() == "use\n"
+
+
 def absent(package: str | None) -> str:
     """That a package is not installed, and the remedy; empty where it is none of ours."""
     first = (package or "").partition(".")[0]
     for extra, packages in _EXTRAS.items():
         if first in packages.split():
             ros = "source a ROS 2 Jazzy installation, or " * (extra == "ros")
-            what = f"'.[{extra}]'" if extra else "., or rosdep with its folder rosdep"
-            return f"the Python package {first} is not installed; {ros}in the checkout: pip install {what}"
+            what = "pip install " + (f"'.[{extra}]'" if extra else "., or rosdep with its folder rosdep")
+            if _made_by_run():
+                what = "./run setup --all"
+            return f"the Python package {first} is not installed; {ros}in the checkout: {what}"
     return ""
