@@ -386,10 +386,11 @@ def arriving(messages: Sequence[Message]) -> list[Arriving]:
     return [((m.log_time - messages[0].log_time) * 1e-9, m.topic, m.log_time, m.data) for m in messages]
 
 
-def run(session: Session, messages: Sequence[Arriving], until: float = 100.0) -> list[Any]:
+def run(session: Session, messages: Sequence[Arriving], until: float | None = None) -> list[Any]:
     """Verdicts of a session that gets these messages, and is asked every 0.1 s what it releases, as by the node."""
     verdicts, now = list[Any](), 0.0
-    for at, topic, arrival_ns, data in [*messages, (until, "", 0, b"")]:
+    end = messages[-1][0] + 10.0 if until is None else until
+    for at, topic, arrival_ns, data in [*messages, (end, "", 0, b"")]:
         while now + 0.1 < at:
             now += 0.1
             for due in session.release(now):

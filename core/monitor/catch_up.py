@@ -48,10 +48,10 @@ class _Progress:
         self.first_behind = -(2**63)  # ns, the first message behind the clock topic
 
     def advance(self, stamp: int, now: float) -> int:
-        """Take a stamp; the step from the one before."""
+        """Take a stamp; the step from the greatest one before. An older one shows no progress, and no burst after it."""
         step = stamp - self.newest if self.newest else 0
-        self.newest = stamp
-        self._last.append((now, stamp))
+        self.newest = max(self.newest, stamp)
+        self._last.append((now, self.newest))
         return step
 
     @property
@@ -199,11 +199,8 @@ class CatchUp:
 
     def lag(self, topic: str) -> int:
         """How far a topic is usually behind the clock topic, ns; 0 where that is no more than a step."""
-        if topic not in self._behind:
-            prompt = self._progress[topic].prompt
-            found = round(median(prompt)) if len(prompt) >= _PROMPT else 0
-        else:
-            found = self._behind[topic]
+        prompt = self._progress[topic].prompt
+        found = self._behind.get(topic, round(median(prompt)) if prompt else 0)
         return found if found > self._step_ns else 0
 
     def _bursts(self) -> dict[str, int]:
@@ -214,9 +211,11 @@ class CatchUp:
             progress = self._progress[topic]
             late = progress.most_behind - lag
             early = lag > 0 and (self._clock_in_burst or lag - progress.least_behind > 3 * self._step_ns // 2)
-            if early or late > (self._step_ns // 2 if lag else 0) or progress.first_behind - lag > self._step_ns:
+            known = topic in self._behind or progress.prompt  # else one message may have been held up, or always lags
+            alone = progress.first_behind - lag if known else 0
+            if early or late > (self._step_ns // 2 if lag else 0) or alone > self._step_ns:
                 bursts = True
-                self.behind_ns = max(self.behind_ns, late, progress.first_behind - lag)  # 0 if the clock topic was late
+                self.behind_ns = max(self.behind_ns, late, alone)  # 0 if the clock topic was late
         return lags if bursts else {}
 
     def ready(self, now: float) -> list[Waiting]:
