@@ -29,6 +29,7 @@ _QUIET = STALL  # s that messages wait at least: a longer pause counts as anothe
 _BURST = 5  # stamps that advance this many times as fast as the steady time come in a burst
 _LAG = 0.1  # s that stamps may lag more than they did before a stall, and nothing is held back any more
 _PACE = 0.1  # stamps whose pace differs from that of the steady time by a larger share have no usual lag
+_JUMP = 1.0  # s that the clock topic may advance beyond its pace between two looks, or its lags are of another time
 _LAGS = 50  # looks, of which the usual lag is found
 _PROMPT = 3  # messages one after the other that come at their pace show by how much a topic usually lags
 
@@ -40,7 +41,8 @@ class _Progress:
     """How far the stamps of one topic have come."""
 
     def __init__(self) -> None:
-        self._last: deque[tuple[float, int]] = deque(maxlen=10)  # steady time and stamp of the last messages
+        self._last: deque[tuple[float, int]] = deque(maxlen=10)  # steady time and stamp of the last that went on
+        self.at = 0.0  # steady time of the last message, s
         self.newest = 0  # stamp, ns
         self.behind = 0  # ns, the last message behind the clock topic
         self.prompt: deque[int] = deque(maxlen=_LAGS)  # ns, the last messages behind the clock topic, none in a burst
@@ -48,23 +50,20 @@ class _Progress:
         self.first_behind = -(2**63)  # ns, the first message behind the clock topic
 
     def advance(self, stamp: int, now: float) -> int:
-        """Take a stamp; the step from the greatest one before. An older one shows no progress, and no burst after it."""
+        """Take a stamp; the step from the greatest one before. One that is no greater is no progress."""
         step = stamp - self.newest if self.newest else 0
-        self.newest = max(self.newest, stamp)
-        self._last.append((now, self.newest))
+        self.at = now
+        if stamp > self.newest:
+            self.newest = stamp
+            self._last.append((now, stamp))
         return step
-
-    @property
-    def at(self) -> float:
-        """Steady time of the last message, s."""
-        return self._last[-1][0]
 
     def in_burst(self, messages: int) -> bool:
         """Whether the last messages came much sooner one after the other than their steps are long."""
         if len(self._last) < 2:
             return False
         then, stamp = self._last[max(0, len(self._last) - messages)]
-        return (self.at - then) * _BURST < (self.newest - stamp) * 1e-9
+        return (self._last[-1][0] - then) * _BURST < (self.newest - stamp) * 1e-9
 
     @property
     def longest_step(self) -> int:
@@ -82,13 +81,18 @@ class Lags:
 
     def look(self, heard: float, stamp_ns: int) -> None:
         """Note the last message of the clock topic; to be called now and then."""
-        if not self._seen or heard > self._seen[-1][0]:
+        if not self._seen:
+            self._seen.append((heard, stamp_ns))
+        elif heard > (before := self._seen[-1])[0]:
+            if not 0.0 <= (stamp_ns - before[1]) * 1e-9 <= _JUMP + 2 * _BURST * (heard - before[0]):
+                self._seen.clear()
+                self._behind.clear()
             self._seen.append((heard, stamp_ns))
 
     def look_at(self, topic: str, heard: float, stamp_ns: int) -> None:
         """Note the last message of another topic, after that of the clock topic."""
         seen = self._behind.setdefault(topic, deque(maxlen=_LAGS))
-        if self._seen and (not seen or heard > seen[-1][0]):
+        if self._seen and heard >= self._seen[0][0] and (not seen or heard > seen[-1][0]):
             (first, began), (clock_heard, clock) = self._seen[0], self._seen[-1]
             pace = (clock - began) * 1e-9 / (clock_heard - first) if clock_heard > first else 1.0
             seen.append((heard, clock + round((heard - clock_heard) * pace * 1e9) - stamp_ns))
