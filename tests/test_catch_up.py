@@ -269,6 +269,38 @@ def test_a_topic_that_is_sent_once_is_not_waited_for_again() -> None:
     assert STALL <= 0.01 * k <= STALL + 0.011
 
 
+def test_a_topic_that_lags_and_falls_silent_was_not_held_up() -> None:
+    """Two messages, each 50 ms behind the clock topic: no sample may get a control that was not there yet."""
+    catch_up, order = waiting(), []
+    for k in range(60):
+        catch_up.put("x", len(order), b"", 10**9 + 10**7 * k, 0.01 * k)
+        order.append("x")
+        if 5 <= k < 7:
+            catch_up.put("u", len(order), b"", 10**9 + 10**7 * (k - 5), 0.01 * k + 1e-4)
+            order.append("u")
+        if released := catch_up.ready(0.01 * k + 1e-4):
+            break
+    assert catch_up.over and catch_up.reordered == 0
+    assert [(topic, k) for topic, k, _ in released] == [(topic, k) for k, topic in enumerate(order)]
+
+
+def test_an_older_stamp_of_the_clock_topic_is_no_burst_after_it() -> None:
+    """A sample that comes too late, and the next one at its time, 2 ms after it: nothing was held up."""
+    catch_up, order = waiting(), []
+    for k in range(60):
+        at = 0.01 * k + 1e-4
+        if k == 8:
+            catch_up.put("x", len(order), b"", 10**9 + 10**7 * 5, at - 2e-3)
+            order.append("x")
+        for topic, lag in (("x", 0), ("u", 2)):
+            if k >= lag:
+                catch_up.put(topic, len(order), b"", 10**9 + 10**7 * (k - lag), at + 2e-3 * (topic == "u" and k % 2))
+                order.append(topic)
+        if released := catch_up.ready(at):
+            break
+    assert catch_up.over and catch_up.reordered == 0 and len(released) == len(order)
+
+
 def test_where_time_steps_back_messages_stay_as_they_came() -> None:
     catch_up = waiting()
     stamps = [("x", 5.0), ("x", 5.01), ("x", 1.0), ("x", 1.01), ("u", 5.0), ("u", 5.01), ("u", 1.0), ("u", 1.01)]
