@@ -100,6 +100,7 @@ def by_hand(
         ]
         a, p = replace(a, valid=(0.24, 0.45)), replace(p, valid=(-0.7, math.inf), at="both")
         signals = SignalMap((a, b), (p, q, *memories))
+    signals = options.pop("signals", signals)
     n, m = len(signals.states), len(signals.controls)
     rng = np.random.default_rng(7)
     clock = signals.states[0].topic
@@ -332,6 +333,26 @@ def test_memories_limits_and_a_constant_step_give_live_what_they_give_offline(wo
     outputs = Outputs.of(world)
     world.command("play", tmp_path / "run.mcap", "--rate", 2.0).succeed()
     outputs.hold_against(verdicts, ("a", "b"))
+
+
+@pytest.mark.parametrize("at", ["departure", "arrival", "both"])
+def test_a_command_at_an_arrival_or_judged_gives_live_what_check_gives(world: World, tmp_path: Path, at: str) -> None:
+    plain = by_hand().signals
+    p, q = plain.controls
+    signals = replace(plain, controls=(replace(p, at=at), replace(q, judged=True)))
+    model = by_hand(alarm_rule=AlarmRule(2, 5), signals=signals)
+    names = ("a", "b", "q")
+    assert model.state_names == names and model.m == (2 if at == "both" else 1)
+    path, bag = saved(model, tmp_path), header_bag(by_hand(), tmp_path / "run.mcap", 300)
+    verdicts = offline(path, bag)
+    checked = EnvelopeMonitor(model).check(read_as_fitted(bag, UncertainLTI.load(path).signals))
+    judged = [v for v in verdicts if v.judged]
+    assert len(judged) > 100 and bits(checked.lower[checked.judged]) == bits([v.lower for v in judged])
+    assert checked.alarm.tolist() == [v.alarm for v in verdicts if not v.status.dropped]
+    world.monitor(path)
+    outputs = Outputs.of(world)
+    world.command("play", bag, "--rate", 2.0).succeed()
+    outputs.hold_against(verdicts, names)
 
 
 def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp_path: Path) -> None:
