@@ -16,6 +16,8 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import yaml
+
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = (
     "base", "kernel", "signals", "recordings", "sampling", "model", "monitor", "identification", "validation",
@@ -132,3 +134,17 @@ def test_every_file_begins_with_the_licence():
     assert len(texts) > 100 and HEADER.startswith("# Copyright ") and HEADER.endswith("under the License.\n")
     lacking = [name for name, text in texts.items() if text and not re.sub(r"\A#!.*\n", "", text).startswith(HEADER)]
     assert not lacking, "copy the first eight lines of this file"
+
+
+def test_workflows_try_every_python_that_run_takes_and_pin_their_actions():
+    """Read as text: nothing here can run them."""
+    run = (ROOT / "run").read_text()
+    versions = re.search(r"case \$version in ([\d. |]+)\) python", run)[1].split(" | ")
+    tests, wheels = (yaml.safe_load((ROOT / f".github/workflows/{name}.yml").read_text()) for name in ("tests", "wheels"))
+    assert tests["jobs"]["test"]["strategy"]["matrix"]["python"] == versions
+    steps = [step for flow in (tests, wheels) for job in flow["jobs"].values() for step in job["steps"]]
+    assert all(re.fullmatch(r"[\w-]+/[\w-]+@v\d+\.\d+\.\d+", step["uses"]) for step in steps if "uses" in step)
+    built = next(step["env"] for step in steps if "cibuildwheel" in step.get("uses", ""))
+    assert built["CIBW_BUILD"].split() == [f"cp{version.replace('.', '')}-manylinux_*" for version in versions]
+    for path in re.findall(r"\{project\}/(\S+)", built["CIBW_TEST_COMMAND"]):
+        assert (ROOT / path).is_file()
