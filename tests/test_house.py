@@ -140,7 +140,8 @@ def test_workflows_try_every_python_that_run_takes_and_pin_their_actions():
     """Read as text: nothing here can run them."""
     run = (ROOT / "run").read_text()
     versions = re.search(r"case \$version in ([\d. |]+)\) python", run)[1].split(" | ")
-    tests, wheels = (yaml.safe_load((ROOT / f".github/workflows/{name}.yml").read_text()) for name in ("tests", "wheels"))
+    folder = ROOT / ".github/workflows"
+    tests, wheels = (yaml.safe_load((folder / f"{name}.yml").read_text()) for name in ("tests", "wheels"))
     assert tests["jobs"]["test"]["strategy"]["matrix"]["python"] == versions
     steps = [step for flow in (tests, wheels) for job in flow["jobs"].values() for step in job["steps"]]
     assert all(re.fullmatch(r"[\w-]+/[\w-]+@v\d+\.\d+\.\d+", step["uses"]) for step in steps if "uses" in step)
