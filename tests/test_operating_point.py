@@ -24,6 +24,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.sampling.steady_state import (
     STILL_BAND,
     STILL_SAMPLES,
+    end_stops,
     resolve_auto,
     still_stretches,
 )
@@ -256,6 +257,15 @@ def test_rectangular_steps_between_levels_are_commands_and_no_end_stops() -> Non
     levels = np.repeat(np.r_[1.0, np.linspace(2.0, 5.0, 12), 6.0], [200] + [12] * 12 + [50])[:, None]
     steady, _, words = resolve_auto(signals(AUTO), [levels])
     assert steady == [1.0] and "end stop" not in words
+
+
+def test_an_end_stop_is_held_long_enough_at_once_and_is_one_of_many_values() -> None:
+    at = STILL_SAMPLES - 2  # with the last sample of the way there and the first of the way back
+    assert end_stops([driven(1.2, held=at, rests=0)]) == [[1.2]]
+    assert end_stops([driven(1.2, held=at - 1, rests=0)]) == [[]]
+    assert end_stops([np.vstack([driven(1.2, held=at - 3, rests=0)] * 2)]) == [[]]
+    steps = np.repeat(np.linspace(0.3, 1.2, 8), [1] * 7 + [30])[:, None]
+    assert end_stops([steps]) == [[]]
 
 
 def test_where_nothing_is_still_but_at_an_end_stop_it_is_said() -> None:

@@ -21,7 +21,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
-from uncertain_lti.validation.panel import learn, promises, rules_for, worth
+from uncertain_lti.validation.panel import CONFIDENCE, Panel, learn, promises, rules_for, worth
 
 DT = 0.1
 
@@ -131,6 +131,14 @@ def test_a_rate_lowers_thresholds_as_far_as_the_recordings_can_show_it(runs):
     assert "cannot show that" in said and "h more without an alarm would" in said
     with pytest.raises(FitError, match="positive number per hour"):
         fit(runs, false_alarms=-1.0)
+
+
+def test_the_hours_that_would_show_a_rate_show_it():
+    hours, asked = 6.0, 0.1
+    limit = rate_interval(np.zeros(8), hours, CONFIDENCE, one_sided=True)[1]
+    panel = Panel((), limit, 0, hours, 8, "recording", np.ones(1), 1.0, 1.0, asked=asked)
+    needed = panel.needed_hours
+    assert needed > hours and rate_interval(np.zeros(8), needed, CONFIDENCE, one_sided=True)[1] == pytest.approx(asked)
 
 
 def test_a_single_recording_is_left_out_in_blocks_and_little_is_said_to_be_little():
