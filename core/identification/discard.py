@@ -225,7 +225,7 @@ def _drop(row: Row, index: int) -> None:
     position = np.cumsum(keep) - 1
     row.pool = position[row.pool[keep[row.pool]]]
     row.samples = row.samples[keep]
-    row.phi, row.plain_phi, row.psi = row.phi[keep], row.plain_phi[keep], row.psi[keep]
+    row.plain_phi, row.psi = row.plain_phi[keep], row.psi[keep]
     row.y, row.half, row.width = row.y[keep], row.half[keep], row.width[keep]
     row._simplex, row._known = None, np.empty(0, dtype=np.intp)
 

@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Moments, Samples
-from uncertain_lti.identification.solvers import FEASIBLE, Sense, Simplex, dual_bound, solve_qp
+from uncertain_lti.identification.solvers import FEASIBLE, Answer, Simplex, dual_bound, solve_near, solve_qp
 
 TOLERANCE = 1e-11
 """Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
@@ -136,6 +136,18 @@ class Chosen:
             elements[there] = np.broadcast_to(values, len(self.first))[self.members[there]]
 
 
+@dataclass(frozen=True)
+class _Held:
+    """Regressors (K, r) and (K, q) of samples, each over its size (K,); rows that see the same samples share them."""
+
+    z: Array
+    dt: Array
+    s: Array | None
+    phi: Array
+    psi: Array
+    size: Array
+
+
 class Row:
     """One row of the model in scaled unknowns ξ = [θ d], with the samples held for it and the working set among them.
 
@@ -157,6 +169,7 @@ class Row:
         self._bounds = bounds
         self._shared = shared
         self.refined = False
+        self._held: _Held | None = None
         self.width: Array = np.empty(0)
         self.kept: float | None = None  # violation, in units of the size, of an answer of before that was good
         self.width_unit = 1.0  # of δ and `width`, in addition to scale: of order one in refined coordinates
@@ -174,7 +187,7 @@ class Row:
     def _forget(self) -> None:
         """What solvers start from."""
         self.attempt = _ATTEMPTS[0]
-        self._active: dict[str, Sense] = {}  # what was active in the last programme of a kind
+        self._last: dict[str, Answer] = {}  # to the last programme of a kind
         self._simplex: Simplex | None = None
         self._known: Index = np.empty(0, dtype=np.intp)
 
@@ -298,6 +311,9 @@ class Row:
     def _phi(self, samples: Samples) -> Array:
         return self._columns.phi(samples.z, samples.s)
 
+    def _psi(self, samples: Samples) -> Array:
+        return self._columns.psi(samples.z, samples.dt, samples.s)
+
     def scaled(self) -> tuple[Array, Array]:
         """Return the row's elements as differences from its fixed part, in scaled units.
 
@@ -353,25 +369,53 @@ class Row:
         theta = change * self.unit_phi * self.scale
         self.phi_columns.put(self.theta, theta + self.fixed_theta[self.free_phi] if self.refined else theta)
 
-    def hold(self, samples: Samples, columns: Columns) -> None:
-        """Hold these samples, and the working set so far."""
+    def hold(self, samples: Samples, columns: Columns, like: Row | None = None) -> None:
+        """Hold these samples, and the working set so far; `like`: a row that may hold the same transitions."""
         self._columns = columns
-        p = len(samples.z)
         kept = self.samples[self.pool]
-        self.samples = samples = Samples.join([samples, kept], p)
+        if not np.isin(kept.index, samples.index).all():
+            samples = Samples.join([samples, kept], len(samples.z))
+        self.samples = samples
         self.pool = np.searchsorted(samples.index, kept.index)
-        phi, psi = self._phi(samples), columns.psi(samples.z, samples.dt, samples.s)
-        size = self.size_unit @ psi
-        size[size == 0.0] = 1.0
-        # rows of the programme: each sample divided by its own size, so that one near rest weighs as any other
-        self.plain_phi = ((self.phi_columns.take(phi) * self.unit_phi[:, None]) / size).T
-        self.phi = self.plain_phi if self.basis is None else self.plain_phi @ self.basis
-        self.psi = ((self.psi_columns.take(psi) * self.unit_psi[:, None]) / size).T
-        self.y = (samples.rate - self.fixed_theta @ phi) / (size * self.scale)
-        self.half = (self.fixed_d @ psi) / (size * self.scale)
+        held = next((row._held for row in (self, like) if row is not None and row._holds(self)), None)
+        self._held = held = held or self._divided(samples)
+        self.plain_phi, self.psi, size = held.phi, held.psi, held.size
+        fixed_phi = self.fixed_theta @ self._phi(samples) if self.fixed_theta.any() else 0.0
+        fixed_psi = self.fixed_d @ self._psi(samples) if self.fixed_d.any() else np.zeros(len(samples))
+        self.y = (samples.rate - fixed_phi) / (size * self.scale)
+        self.half = fixed_psi / (size * self.scale)
         self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
         if self.refined:
             self.width = self.width / self.width_unit
+
+    def _holds(self, other: Row) -> bool:
+        """Whether this row has divided the samples of another as that one would."""
+        held, samples = self._held, other.samples
+        return (
+            held is not None
+            and (held.z is samples.z and held.dt is samples.dt and held.s is samples.s)
+            and self._shared is None
+            and np.array_equal(self.size_unit, other.size_unit)
+            and np.array_equal(self.free_phi, other.free_phi)
+            and np.array_equal(self.free_psi, other.free_psi)
+        )
+
+    def _divided(self, samples: Samples) -> _Held:
+        """Each sample divided by its own size, so that one near rest weighs as any other."""
+        psi = self._psi(samples)
+        size = self.size_unit @ psi
+        size[size == 0.0] = 1.0
+        phi = ((self.phi_columns.take(self._phi(samples)) * self.unit_phi[:, None]) / size).T
+        psi = ((self.psi_columns.take(psi) * self.unit_psi[:, None]) / size).T
+        return _Held(samples.z, samples.dt, samples.s, phi, psi, size)
+
+    def release(self) -> None:
+        """Hold the working set alone."""
+        self.hold(Samples.join([], len(self.samples.z)), self._columns)
+
+    def _along(self, pool: Index) -> Array:
+        """Regressors of the nominal unknowns of some samples, in the row's coordinates, (K, r)."""
+        return self.plain_phi[pool] if self.basis is None else self.plain_phi[pool] @ self.basis
 
     def slacks(self) -> tuple[Array, Array | None]:
         """Slack of every held sample.
@@ -419,7 +463,7 @@ class Row:
 
         Returns (2 K, r + q): G; Returns (2 K,): h.
         """
-        phi, psi = self.phi[pool], self.psi[pool]
+        phi, psi = self._along(pool), self.psi[pool]
         y, half = self.y[pool], self.half[pool]
         return np.vstack([np.hstack([phi, psi]), np.hstack([-phi, psi])]), np.concatenate([y - half, -y - half])
 
@@ -448,32 +492,35 @@ class Row:
         upper: Array,
         any_solver: bool = False,
     ) -> tuple[Array, str]:
-        """Solve a programme whose rows are some for each sample of the pool, from what was active last time.
+        """Solve a programme whose rows are some for each sample of the pool, from where the last of its kind ended.
 
         objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
         """
         feasible = FEASIBLE if self.refined else ROUGH
-        fixed, per_sample = len(lower), len(h) // max(len(self.pool), 1)
+        last, per_sample = self._last.get(kind), len(h) // max(len(self.pool), 1)
         start = None
-        if kind in self._active and per_sample:
-            known = self._active[kind][fixed:].reshape(per_sample, -1)
+        if last is not None and last.active is not None and per_sample:
+            known = last.active[len(lower) : len(last.active) - len(self.asked)].reshape(per_sample, -1)
             known = known[:, : len(self.pool)]  # the pool grows, but for discards
-            start = np.zeros(fixed + len(h), dtype=np.int32)
-            start[:fixed] = self._active[kind][:fixed]
-            start[fixed:].reshape(per_sample, -1)[:, : known.shape[1]] = known
-        for attempt in _ATTEMPTS:
+            start = np.zeros(len(lower) + len(h) + len(self.asked), dtype=np.int32)
+            start[: len(lower)] = last.active[: len(lower)]
+            there = start[len(lower) : len(lower) + len(h)].reshape(per_sample, -1)
+            there[:, : known.shape[1]] = known
+        begin = np.zeros(len(lower)) if last is None else last.xi
+        if last is None and self.basis is None:
+            begin[: self.r] = self.scaled()[0]
+        G, h = self._asked(G, h)
+        for self.attempt in _ATTEMPTS:
             try:
-                answer = solve_qp(*objective(*attempt), *self._asked(G, h), lower, upper, start, False, feasible)
+                answer = solve_near(*objective(*self.attempt), G, h, lower, upper, begin, start, feasible)
                 break
             except FitError:
                 continue
         else:
             if not any_solver:
                 raise FitError("DAQP could not solve the quadratic programme")
-            answer = solve_qp(*objective(*attempt), *self._asked(G, h), lower, upper, feasible=feasible)
-        self.attempt = attempt
-        if answer.active is not None and not len(self.asked):
-            self._active[kind] = answer.active
+            answer = solve_qp(*objective(*self.attempt), G, h, lower, upper, feasible=feasible)
+        self._last[kind] = answer
         return answer.xi, answer.solver
 
     def _asked(self, G: Array, h: Array) -> tuple[Array, Array]:
@@ -592,7 +639,7 @@ class Row:
         """
         width = self.width[pool] / self._unit
         unit = np.minimum(1.0, 1.0 / width)
-        phi, y = self.phi[pool] * (width * unit)[:, None], self.y[pool] * width * unit
+        phi, y = self._along(pool) * (width * unit)[:, None], self.y[pool] * width * unit
         sides = np.hstack([phi, unit[:, None]]), np.hstack([-phi, unit[:, None]])
         return np.vstack(sides), np.concatenate([y, -y])
 
@@ -661,7 +708,10 @@ class Row:
         for value, direction in zip(values.tolist(), directions.T, strict=True):
             if value > 1e-13 or not free[np.abs(direction) > COLLINEAR].all():
                 return float(value)
-            if np.abs(self.phi @ direction).max(initial=0.0) > COLLINEAR:
+            if (
+                np.abs(self.plain_phi @ (direction if self.basis is None else self.basis @ direction)).max(initial=0.0)
+                > COLLINEAR
+            ):
                 return float(value)
         return 1.0
 
@@ -812,7 +862,7 @@ class Row:
         H, f = self.hessian(self.plain, self.plain_linear, BOUNDED_TIE_BREAK)
         f, largest = f + H @ point, float(np.diagonal(H).max())
         step, solver, contained = np.zeros(len(point)), "HiGHS simplex", 2 * len(pool)
-        around = h[:contained].copy()
+        around, active = h[:contained].copy(), None
         for room in _ROOM:
             h[:contained] -= room
             for share in _HOLD:
@@ -820,7 +870,8 @@ class Row:
                 try:
                     held = H + hold * np.eye(len(step)), f - hold * step
                     low, high = self.lower - point, self.upper - point
-                    answer = solve_qp(*held, G, h, low, high, feasible=_ROOM[-1] if self.refined else FEASIBLE)
+                    feasible = _ROOM[-1] if self.refined else FEASIBLE
+                    answer = solve_near(*held, G, h, low, high, step, active, feasible, any_solver=True)
                 except FitError:
                     break
                 left = max(0.0, -float((G[:contained] @ answer.xi - around).min(initial=0.0)))  # the repair covers it
@@ -829,7 +880,7 @@ class Row:
                     1.0 + GOOD
                 ) * self.allowed:
                     break
-                step, solver = answer.xi, answer.solver
+                step, solver, active = answer.xi, answer.solver, answer.active
             if step.any():
                 break
         self.attempt = _ATTEMPTS[0]
@@ -843,7 +894,7 @@ class Row:
         """
         if self.r == 0:
             return
-        phi, psi = self.phi[self.pool], self.psi[self.pool]
+        phi, psi = self._along(self.pool), self.psi[self.pool]
         half = psi @ (self.d[self.free_psi] / (self.unit_psi * self.scale)) + self.half[self.pool]
         y = self.y[self.pool]
         try:

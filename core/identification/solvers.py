@@ -26,6 +26,11 @@ Sense = NDArray[np.int32]
 FEASIBLE = 1e-9
 """Largest violation, in scaled units, of an answer that counts as solved; the repair covers it."""
 
+_SLIGHT = 1e-11
+"""The same of a row that the programme left out."""
+_NEAR = 2
+"""Rows per unknown that a programme begins with."""
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -80,6 +85,43 @@ def solve_qp(
         return best[1]
     names = ", ".join(name for name, _ in _SOLVERS)
     raise FitError(f"no solver ({names}) could solve the quadratic programme; scale the signals to order one")
+
+
+def solve_near(
+    H: Array,
+    f: Array,
+    G: Array,
+    h: Array,
+    lower: Array,
+    upper: Array,
+    xi: Array,
+    active: Sense | None = None,
+    feasible: float = FEASIBLE,
+    any_solver: bool = False,
+) -> Answer:
+    """As `solve_qp`, with the rows that are near at ξ alone, and then those that the answer violates.
+
+    A strictly convex programme has one minimiser, so it does not matter which other rows were left out.
+    """
+    slack, size = G @ xi - h, len(f)
+    wanted = slack < -_SLIGHT
+    if active is not None:
+        wanted |= active[size:] > 0
+    near = _NEAR * size
+    wanted[np.argpartition(slack, near)[:near] if len(slack) > near else slice(None)] = True
+    while True:
+        start = None if active is None else np.concatenate([active[:size], active[size:][wanted]])
+        answer = solve_qp(H, f, G[wanted], h[wanted], lower, upper, start, any_solver, feasible)
+        if answer.active is None:
+            active = None
+        else:
+            active = np.zeros(size + len(h), dtype=np.int32)
+            active[:size] = answer.active[:size]
+            active[size:][wanted] = answer.active[size:]
+        left = ~wanted & (G @ answer.xi - h < -_SLIGHT)
+        if not left.any():
+            return Answer(answer.xi, answer.solver, active)
+        wanted |= left
 
 
 _Found = tuple[Array | None, Sense | None]

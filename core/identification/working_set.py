@@ -108,6 +108,7 @@ class WorkingSet:
         self._reach: Array | None = None  # (2, n), in these scales of the rows
         self._reach_scales = np.empty(0)
         self._coupled_gap = np.inf
+        self._like: Row | None = None  # the row that held samples last
         self._least_eigenvalue: float | None = None  # of the full weights, once it is needed
 
     def quadratic(self) -> Solution:
@@ -428,7 +429,8 @@ class WorkingSet:
     def _hold(self, row: Row, samples: Samples) -> None:
         if len(self.excluded):
             samples = samples[~np.isin(samples.index, self.excluded)]
-        row.hold(samples, self.fleet.columns)
+        row.hold(samples, self.fleet.columns, self._like)
+        self._like = row
 
     def _sizes(self) -> str:
         return "/".join(str(len(row.pool)) for row in self.rows)
