@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError, ModelError, TransientError
-from uncertain_lti.identification import fit, fleet, formulation, passes, row, solvers
+from uncertain_lti.identification import fit, fleet, formulation, passes, row, solvers, working_set
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
@@ -850,3 +850,41 @@ def test_a_weight_beside_the_largest_width_that_is_too_large_is_seen(monkeypatch
     np.testing.assert_allclose(model.fit_summary["objective"], expected.fit_summary["objective"], rtol=1e-7)
     np.testing.assert_allclose(model.fit_summary["mean_width"], expected.fit_summary["mean_width"], rtol=1e-3)
     assert model.fit_summary["optimality_gap"] < 1e-6 and count_outside(model, [transient]) == 0
+
+
+def test_rows_proven_in_groups_have_the_optimum_of_rows_proven_together(monkeypatch):
+    rng = np.random.default_rng(5)
+    N, x = 30_000, np.zeros((30_001, 3))
+    u = rng.normal(size=(N + 1, 1))
+    for k in range(N):
+        x[k + 1] = 0.95 * x[k] + 0.02 * x[k, ::-1] + 0.1 * u[k] + 0.01 * rng.uniform(-1, 1, 3)
+    transient = Transient(np.arange(N + 1) * 0.01, x, u)
+    together = [fit([transient], criterion=c, additive="noise", describe_data=False) for c in ("qp", "lp")]
+    monkeypatch.setattr(working_set, "_HELD_BYTES", 1)
+    for criterion, model in zip(("qp", "lp"), together, strict=True):
+        alone = fit([transient], criterion=criterion, additive="noise", describe_data=False)
+        assert alone.fit_summary["objective"] == pytest.approx(model.fit_summary["objective"], rel=1e-9)
+        assert alone.fit_summary["optimality_gap"] < 1e-6
+        assert alone.fit_summary["solver"]["passes"] > model.fit_summary["solver"]["passes"]
+
+
+def test_near_rows_alone_lead_to_the_minimiser_of_all():
+    rng = np.random.default_rng(6)
+    root, G = rng.normal(size=(6, 6)), rng.normal(size=(400, 6))
+    H, f = root @ root.T + np.eye(6), rng.normal(size=6)
+    h, lower, upper = G @ rng.normal(size=6) - rng.uniform(0, 1, 400), np.full(6, -np.inf), np.full(6, np.inf)
+    whole = solvers.solve_qp(H, f, G, h, lower, upper)
+    for xi in (np.zeros(6), whole.xi, 100 * rng.normal(size=6)):
+        near = solvers.solve_near(H, f, G, h, lower, upper, xi)
+        np.testing.assert_allclose(near.xi, whole.xi, rtol=0, atol=1e-9)
+        again = solvers.solve_near(H, f, G, h, lower, upper, near.xi, near.active)
+        np.testing.assert_allclose(again.xi, whole.xi, rtol=0, atol=1e-9)
+
+
+def test_a_long_fit_says_how_far_its_rows_are(monkeypatch):
+    rng = np.random.default_rng(7)
+    monkeypatch.setattr(working_set, "_SILENCE", 0.0)
+    x = rng.normal(size=(200, 3))
+    said = []
+    fit([Transient(np.arange(200) * 0.01, x, rng.normal(size=(200, 1)))], additive="noise", progress=said.append)
+    assert any(text.startswith("row 3 of 3, about ") and text.endswith(" s left") for text in said)

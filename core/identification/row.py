@@ -410,8 +410,11 @@ class Row:
         return _Held(samples.z, samples.dt, samples.s, phi, psi, size)
 
     def release(self) -> None:
-        """Hold the working set alone."""
-        self.hold(Samples.join([], len(self.samples.z)), self._columns)
+        """Hold the working set alone, and what is outside by rounding."""
+        outside = self.slack() < 0.0
+        outside[self.pool] = False
+        self.pool = np.concatenate([self.pool, np.flatnonzero(outside)])
+        self.hold(self.samples[np.sort(self.pool)], self._columns)
 
     def _along(self, pool: Index) -> Array:
         """Regressors of the nominal unknowns of some samples, in the row's coordinates, (K, r)."""

@@ -13,12 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from time import perf_counter
 
 import numpy as np
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Samples
 from uncertain_lti.identification.regimes import tied_blocks
@@ -41,6 +43,10 @@ _FURTHER = 2.5
 SUBSAMPLE = 10_000
 """Transitions of the first solve; up to twice as many are held as a whole."""
 MAX_ROUNDS, FEW_ROUNDS = 200, 60
+_HELD_BYTES = 300_000_000
+"""Memory for the samples of the rows that are proven together, about."""
+_SILENCE = 2.0
+"""After so long, s, a word on how far the rows are."""
 _REMEDY = "a state may follow from the others exactly: leave it out, or fix its row by structure"
 
 
@@ -105,8 +111,8 @@ class WorkingSet:
         ]
         self.solvers: set[str] = set()
         self.rounds, self.passes = 0, 1
-        self._reach: Array | None = None  # (2, n), in these scales of the rows
-        self._reach_scales = np.empty(0)
+        self._reach = np.zeros((2, fleet.n))  # in these scales of the rows
+        self._reach_scales = np.full(fleet.n, np.nan)
         self._coupled_gap = np.inf
         self._like: Row | None = None  # the row that held samples last
         self._least_eigenvalue: float | None = None  # of the full weights, once it is needed
@@ -121,9 +127,6 @@ class WorkingSet:
         again = [row for row in self.rows if row.unknown and not gaps[row.i] + row.lifted_loss() <= GOOD]
         if again:
             before = {row.i: (row.answer(), self._lifted(row)) for row in again}
-            for row in again:
-                if not row.refined:
-                    row.refine()
             self._again(again, self._settle_quadratic)
             for row in again:
                 gaps[row.i] = row.duality_gap()
@@ -137,7 +140,7 @@ class WorkingSet:
         return replace(self._solution(), gap=float(gaps.max(initial=0.0)))
 
     def _again(self, rows: list[Row], settle: Callable[[list[Row]], None]) -> None:
-        """Solve rows once more; what a solver cannot improve stays as it was."""
+        """Solve rows once more, in refined coordinates; what a solver cannot improve stays as it was."""
 
         def settle_each(some: list[Row]) -> None:
             for row in some:
@@ -149,8 +152,18 @@ class WorkingSet:
                 except FitError:
                     row.theta, row.d, row.limit = theta, d, limit
 
-        settle_each(rows)
-        self._prove(settle_each)
+        for group in self._groups(rows):
+            for row in group:
+                if not row.refined:
+                    self._refine(row)
+            settle_each(group)
+            self._prove(settle_each, group)
+
+    def _refine(self, row: Row) -> None:
+        """Refine a row with the first samples at hand, which it may have released."""
+        if not self.whole:
+            self._hold(row, self._first[row.i])
+        row.refine()
 
     def _settle_quadratic(self, rows: list[Row]) -> None:
         for row in rows:
@@ -251,7 +264,7 @@ class WorkingSet:
             row.exact = True
         if again:  # the weight relative to δ was too large for these rows
             settle(again)
-            self._prove(settle)
+            self._prove(settle, again)
         again = [
             row
             for row in self.rows
@@ -260,7 +273,6 @@ class WorkingSet:
         if again:
             before = {row.i: (row.answer(), self._largest_width(row)) for row in again}
             for row in again:
-                row.refine()
                 row.exact = True
             self._again(again, settle)
             for row in again:
@@ -328,30 +340,52 @@ class WorkingSet:
 
     # --- all samples ---
 
-    def _run(self, settle: Callable[[list[Row]], None]) -> None:
-        self._start(settle)
-        self._prove(settle)
-
     def _start(self, settle: Callable[[list[Row]], None]) -> None:
         """Solve on the first samples."""
         for row, samples in zip(self.rows, self._first, strict=True):
             self._hold(row, samples)
             row.start()
             row.widen_pool(most=4 * (row.r + row.q))
-        settle(self.rows)
+        if self.sums.coupled is not None:
+            settle(self.rows)
+            return
+        began = said = perf_counter()
+        for number, row in enumerate(self.rows, start=1):
+            settle([row])
+            now = perf_counter()
+            if now - said > _SILENCE and number < len(self.rows):
+                said, left = now, (now - began) / number * (len(self.rows) - number)
+                text = f"row {number + 1} of {len(self.rows)}, about {left:.0f} s left"
+                self.progress(CountedStep(text, number + 1, len(self.rows)))
 
-    def _prove(self, settle: Callable[[list[Row]], None]) -> None:
+    def _groups(self, rows: list[Row]) -> list[list[Row]]:
+        """Rows whose samples fit in memory together; with full weights, all."""
+        if self.sums.coupled is not None or self.whole:
+            return [rows]
+        columns, count = self.fleet.columns, self.fleet.columns.count
+        each = 8 * SUBSAMPLE * (3 * self.fleet.p + len(columns.nominal) + len(columns.half)) * count
+        size = max(1, _HELD_BYTES // each)
+        return [rows[k : k + size] for k in range(0, len(rows), size)]
+
+    def _prove(self, settle: Callable[[list[Row]], None], rows: list[Row] | None = None) -> None:
         """Hold the solution against all samples, and solve again, until it contains them all."""
         if self.whole:
             return
+        groups = self._groups(self.rows if rows is None else rows)
+        for rows in groups:
+            self._prove_group(settle, rows)
+            if len(self._groups(self.rows)) > 1:
+                for row in rows:
+                    row.release()
+
+    def _prove_group(self, settle: Callable[[list[Row]], None], rows: list[Row]) -> None:
         most = 2 * SUBSAMPLE + self.fleet.N // 500
         share = 0.2 * most / self.fleet.N
-        rows, scanned = self.rows, False
+        scanned = False
         for _ in range(MAX_ROUNDS):
-            scales = np.array([row.scale for row in self.rows])
-            # the samples held after a pass are those of least slack, so the next reach would shrink: keep the first
-            if self._reach is None or not np.array_equal(scales, self._reach_scales):
-                self._reach, self._reach_scales = np.array([row.reach(share) for row in self.rows]).T, scales
+            for row in rows:  # the samples held after a pass are those of least slack: keep the first reach
+                if self._reach_scales[row.i] != row.scale:
+                    self._reach[:, row.i], self._reach_scales[row.i] = row.reach(share), row.scale
             wanted = self._reach
             if scanned:  # few are left near the bounds, and what is held further off need not be looked for again
                 wanted = _FURTHER * wanted
