@@ -467,7 +467,8 @@ class WorkingSet:
         self._like = row
 
     def _sizes(self) -> str:
-        return "/".join(str(len(row.pool)) for row in self.rows)
+        sizes = [len(row.pool) for row in self.rows]
+        return "/".join(map(str, sizes)) if len(sizes) <= 12 else f"of {min(sizes)} to {max(sizes)} a row"
 
     # --- held samples ---
 
