@@ -73,14 +73,20 @@ class _Progress:
 
 
 class Lags:
-    """By how much stamps usually lag: those of the clock topic behind the steady time, of others behind the clock's."""
+    """By how much stamps usually lag: those of the clock topic behind the steady time, of others behind the clock's.
+
+    `since`: steady time, s; of messages heard up to then it is not known when they came: they waited.
+    """
 
     def __init__(self) -> None:
+        self.since = -math.inf
         self._seen: deque[tuple[float, int]] = deque(maxlen=_LAGS)
         self._behind: dict[str, deque[tuple[float, int]]] = {}
 
     def look(self, heard: float, stamp_ns: int) -> None:
         """Note the last message of the clock topic; to be called now and then."""
+        if heard <= self.since:
+            return
         if not self._seen:
             self._seen.append((heard, stamp_ns))
         elif heard > (before := self._seen[-1])[0]:
@@ -92,7 +98,8 @@ class Lags:
     def look_at(self, topic: str, heard: float, stamp_ns: int) -> None:
         """Note the last message of another topic, after that of the clock topic."""
         seen = self._behind.setdefault(topic, deque(maxlen=_LAGS))
-        if self._seen and heard >= self._seen[0][0] and (not seen or heard > seen[-1][0]):
+        unknown = max(self.since, seen[-1][0] if seen else -math.inf)
+        if self._seen and heard >= self._seen[0][0] and heard > unknown:
             (first, began), (clock_heard, clock) = self._seen[0], self._seen[-1]
             pace = (clock - began) * 1e-9 / (clock_heard - first) if clock_heard > first else 1.0
             seen.append((heard, clock + round((heard - clock_heard) * pace * 1e9) - stamp_ns))

@@ -386,7 +386,7 @@ class Stream:
         released = waits.finish(now) if all_of_them else waits.ready(now)
         self.reordered += waits.reordered - before
         if waits.over:
-            self._catches_up = None
+            self._catches_up, self._lags.since = None, now
             if waits.reordered:
                 self.caught_up = (
                     f"topics arrived one after another, up to {waits.behind_ns * 1e-9:.3g} s apart; "
