@@ -25,7 +25,7 @@ from perturbed import held_up, run
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
 from uncertain_lti.identification import fit
-from uncertain_lti.monitor.catch_up import MOST, STALL, WINDOW, CatchUp
+from uncertain_lti.monitor.catch_up import MOST, STALL, WINDOW, CatchUp, Lags
 from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
@@ -299,6 +299,41 @@ def test_an_older_stamp_of_the_clock_topic_is_no_burst_after_it() -> None:
         if released := catch_up.ready(at):
             break
     assert catch_up.over and catch_up.reordered == 0 and len(released) == len(order)
+
+
+def test_a_sample_that_comes_with_the_next_one_is_no_burst_of_the_clock_topic() -> None:
+    """Its message was late by a step, as one in a recording may be; the controls always lag by two steps."""
+    catch_up, count = waiting(), 0
+    for k in range(60):
+        at = 0.01 * k
+        if k != 8:
+            catch_up.put("x", count, b"", 10**9 + 10**7 * k, at)
+            count += 1
+        if k >= 2:
+            catch_up.put("u", count, b"", 10**9 + 10**7 * (k - 2), at + 2e-3 * (k % 2))
+            count += 1
+        if k == 8:
+            catch_up.put("x", count, b"", 10**9 + 10**7 * 8, at + 9.9e-3)
+            count += 1
+        if released := catch_up.ready(at + 2e-3):
+            break
+    assert catch_up.over and catch_up.reordered == 0
+    assert [arrival for _, arrival, _ in released] == list(range(count))
+
+
+def test_messages_that_waited_and_times_before_a_jump_tell_no_lag() -> None:
+    lags, second = Lags(), 10**9
+    for k in range(5):  # taken at once
+        lags.since = 0.1 * k
+        lags.look(lags.since, second + 10**8 * k)
+        lags.look_at("u", lags.since, second + 10**8 * k)
+    assert lags.behind() == {} and lags.usual() is None
+    for k in range(5, 10):
+        lags.look(0.1 * k, second + 10**8 * k)
+        lags.look_at("u", 0.1 * k, second + 10**8 * k - 4 * 10**7)
+    assert lags.behind() == {"u": 4 * 10**7}
+    lags.look(1.0, 7200 * second)
+    assert lags.behind() == {}
 
 
 def test_where_time_steps_back_messages_stay_as_they_came() -> None:

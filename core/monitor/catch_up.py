@@ -185,7 +185,7 @@ class CatchUp:
         if topic == self._clock:
             if self._lag is not None:
                 self._most_behind = max(self._most_behind, now - stamp_ns * 1e-9 - self._lag)
-            self._clock_in_burst |= progress.in_burst(2)
+            self._clock_in_burst |= progress.in_burst(3)  # one that comes late by a step comes with the next one
             self._recent.append((now, stamp_ns))
             while self._recent[0][0] < now - _QUIET:
                 self._recent.popleft()
