@@ -39,6 +39,7 @@ from uncertain_lti.cli import (
     reproduce,
     ros,
     signature,
+    start,
     topics,
     tune,
     validate,
@@ -46,6 +47,7 @@ from uncertain_lti.cli import (
 from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output
 
 COMMANDS: tuple[Command, ...] = (
+    start.COMMAND,
     topics.COMMAND,
     init.COMMAND,
     fit.COMMAND,

@@ -1,0 +1,84 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""`uncertain-lti start` does what `init`, `fit` and `report` do one after another."""
+
+import json
+
+import numpy as np
+import pytest
+from engine_bag import engine_bag
+
+from uncertain_lti import UncertainLTI
+from uncertain_lti.cli.main import main
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed in (1, 2, 3):
+        engine_bag(tmp_path / f"healthy_{seed}.mcap", seed=seed)
+    engine_bag(tmp_path / "damaged.mcap", seed=4, change=lambda k, x: x * (1 + k % 2 * (k > 200)))
+    return tmp_path
+
+
+HEALTHY = [f"healthy_{seed}.mcap" for seed in (1, 2, 3)]
+
+
+def test_start_gives_the_files_of_the_three_commands(folder, capsys):
+    assert main(["start", *HEALTHY, "--check", "damaged.mcap"]) == 1
+    printed = capsys.readouterr().out
+    assert "The alarm was raised" in printed and (folder / "machine.html").as_uri() in printed
+    assert printed.splitlines()[-3:] == [
+        "  scp machine.model.json ROBOT:",
+        "  envelope_monitor --ros-args -p model:=machine.model.json",
+        "  ros2 topic echo /envelope_monitor/violation",
+    ]
+    assert main(["init", *HEALTHY, "--output", "alone.yaml"]) == 0
+    assert main(["fit", *HEALTHY, "--signals", "alone.yaml", "--output", "alone.model.json"]) == 0
+    assert (folder / "machine.yaml").read_text() == (folder / "alone.yaml").read_text()
+    ours, alone = (UncertainLTI.load(f"{name}.model.json") for name in ("machine", "alone"))
+    assert np.array_equal(ours.A, alone.A) and np.array_equal(ours.dA, alone.dA) and ours.alarm == alone.alarm
+    assert (folder / "machine.html").read_text().lstrip().lower().startswith("<!doctype html")
+
+
+def test_an_edited_signals_file_is_used_as_it_is(folder, capsys):
+    assert main(["start", *HEALTHY, "--output", "m", "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+    text = (folder / "m.yaml").read_text()
+    (folder / "m.yaml").write_text(text.replace("name: fan_speed", "name: fan"))
+    assert main(["start", *HEALTHY, "--output", "m"]) == 2
+    assert "write over it with --force" in capsys.readouterr().err
+    assert main(["start", *HEALTHY, "--output", "m", "--force", "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert "init" not in data and data["exit_status"] == 0 and not data["findings"]["alarm"]
+    assert "fan" in UncertainLTI.load("m.model.json").state_names
+    assert data["fit"]["fit"]["transitions"] == 3 * 299 and data["report"] == "m.html"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["absent.mcap"], "absent.mcap"),
+        ([*HEALTHY, "--output", "models/"], "names no file"),
+        ([*HEALTHY, "--output", "no_such_folder/m"], "no_such_folder"),
+    ],
+)
+def test_bad_input_gets_one_sentence(folder, capsys, words, sentence):
+    assert main(["start", *words]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1
+    assert said.err.startswith("uncertain-lti start: ") and sentence in said.err
+
+
+def test_a_recording_that_cannot_be_reported_on_ends_with_its_reason(folder, capsys):
+    (folder / "broken.mcap").write_bytes(b"nothing")
+    assert main(["start", *HEALTHY, "--check", "broken.mcap"]) == 2
+    said = capsys.readouterr().err
+    assert "broken.mcap" in said and "Traceback" not in said
