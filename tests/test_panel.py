@@ -18,7 +18,7 @@ from tanks import Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
+from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.panel import CONFIDENCE, Panel, learn, promises, rules_for, worth
@@ -139,6 +139,13 @@ def test_the_hours_that_would_show_a_rate_show_it():
     panel = Panel((), limit, 0, hours, 8, "recording", np.ones(1), 1.0, 1.0, asked=asked)
     needed = panel.needed_hours
     assert needed > hours and rate_interval(np.zeros(8), needed, CONFIDENCE, one_sided=True)[1] == pytest.approx(asked)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_states_are_judged_together_only_where_two_have_residuals_that_were_kept(n):
+    zero, column = np.zeros((n, n)), np.zeros((n, 1))
+    rules = rules_for(UncertainLTI(zero, column, zero, column, v=np.ones(n)), 1000, 0.1)
+    assert {"energy", "mean"} <= {rule.kind for rule in rules} and not set(JOINT) & {rule.kind for rule in rules}
 
 
 def test_a_single_recording_is_left_out_in_blocks_and_little_is_said_to_be_little():
