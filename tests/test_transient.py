@@ -97,6 +97,13 @@ def test_a_transient_of_its_own_samples_is_itself(run: tuple[Any, ...]) -> None:
     assert not +twice.counters
 
 
+def test_a_part_keeps_the_step_of_its_run() -> None:
+    t = [0.0, 0.1, 0.21, 0.3, 0.4]
+    for step, dt in ((0.1, [0.1, 0.1]), ("recorded", [0.11, 0.09])):
+        part = Transient(t, np.zeros(5), [], step=step).replace(slice(1, 4))
+        np.testing.assert_allclose(part.transitions().dt, dt)
+
+
 def test_what_was_counted_before_is_added_to() -> None:
     transient = Transient([0.0, 1.0, 1.0, 2.0], np.zeros(4), [], counters={"equal stamp": 2, "late /u": 3})
     assert transient.counters == {"equal stamp": 3, "late /u": 3}
