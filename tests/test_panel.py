@@ -141,9 +141,10 @@ def test_the_hours_that_would_show_a_rate_show_it():
     assert needed > hours and rate_interval(np.zeros(8), needed, CONFIDENCE, one_sided=True)[1] == pytest.approx(asked)
 
 
-def test_one_state_has_no_rules_of_states_together():
-    one = np.zeros((1, 1))
-    kinds = {rule.kind for rule in rules_for(UncertainLTI(one, one, one, one, v=np.ones(1)), 1000, 0.1)}
+@pytest.mark.parametrize("n", [1, 2])
+def test_states_are_judged_together_only_where_two_have_residuals_that_were_kept(n):
+    zero, column = np.zeros((n, n)), np.zeros((n, 1))
+    kinds = {rule.kind for rule in rules_for(UncertainLTI(zero, column, zero, column, v=np.ones(n)), 1000, 0.1)}
     assert {"energy", "mean"} <= kinds and not set(JOINT) & kinds
 
 

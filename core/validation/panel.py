@@ -122,10 +122,11 @@ def rules_for(model: UncertainLTI, steps: int, dt: float) -> list[StatisticRule]
     The same rules look at the longest horizon of the model.
     """
     found = []
-    for h in dict.fromkeys((1, *(horizon.steps for horizon in model.horizons[-1:]))):
+    longest = {horizon.steps: horizon.residuals for horizon in model.horizons[-1:]}
+    for h, residuals in ({1: model.residuals} | longest).items():
         for kind, window, least in PANEL:
             window = min(window, steps // least)
-            if window < 1 or (kind in JOINT and (model.n < 2 or model.residuals_at(h) is None)):
+            if window < 1 or (kind in JOINT and (model.n < 2 or residuals is None)):
                 continue
             rule = StatisticRule(kind, (window + 0.5) * dt if window > 1 else 0.0, 1.0, h)
             if rule not in found:
