@@ -24,6 +24,8 @@ from hypothesis import strategies as st
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.proposal.candidates import Candidate, Source
+from uncertain_lti.proposal.choosing import choose
 from uncertain_lti.proposal.init import propose
 from uncertain_lti.proposal.reading import LONGEST_ARRAY
 from uncertain_lti.proposal.roles import role_by_name
@@ -598,6 +600,68 @@ def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
     for asked in ({"states": ["/none"]}, {"controls": ["/other/cmd:date"]}):
         with pytest.raises(BagError, match="meets nothing that moves"):
             propose([path], **asked)
+
+
+def test_a_column_that_is_asked_for_without_its_topic_is_named_with_it(tmp_path):
+    rows = [f"{0.1 * k},{np.sin(k)},{np.cos(2 * k)}" for k in range(100)]
+    (tmp_path / "run.csv").write_text("\n".join(["time,speed,u", *rows]))
+    with pytest.raises(BagError, match="a field is asked for with its topic, /table:speed$"):
+        propose([tmp_path / "run.csv"], states=["speed"])
+    with pytest.raises(BagError, match="topics there: /table$"):
+        propose([tmp_path / "run.csv"], states=["none"])
+
+
+def table_of(path, columns):
+    rows = np.column_stack([0.01 * np.arange(len(next(iter(columns.values())))), *columns.values()])
+    np.savetxt(path, rows, delimiter=",", header=",".join(["time", *columns]), comments="")
+    return path
+
+
+def answers(rng, commands, noise=1e-4, pole=0.95):
+    """What follows commands (N, k) with a lag of the first order."""
+    x = np.zeros_like(commands)
+    for k in range(len(x) - 1):
+        x[k + 1] = pole * x[k] + 0.05 * commands[k] + noise * rng.normal(size=x.shape[1])
+    return x
+
+
+def test_an_axis_that_is_mostly_noise_stays_with_its_body(tmp_path):
+    """As on a small drone, where one of three rates is noisier than what it remembers."""
+    rng = np.random.default_rng(4)
+    commands = np.repeat(rng.normal(size=(200, 3)), 20, axis=0)
+    rates = answers(rng, commands) + [0, 1, 0] * rng.normal(size=(4000, 3))
+    columns = {f"w{axis}": rates[:, i] for i, axis in enumerate("xyz")}
+    path = table_of(tmp_path / "a.csv", columns | {f"cmd_{i}": commands[:, i] for i in range(3)})
+    assert [c.path for c in propose([path]).states] == ["wx", "wy", "wz"]
+
+
+def test_motors_are_taken_or_left_as_one_with_the_true_reason(tmp_path):
+    rng = np.random.default_rng(5)
+    commands = np.repeat(rng.normal(size=(300, 4)), 20, axis=0)
+    motors = answers(rng, commands, pole=0.9)
+    others = np.column_stack([answers(rng, commands[:, :3]), answers(rng, commands[:, 1:], pole=0.97)])
+    columns = dict(zip(["wx", "wy", "wz", "vx", "vy", "vz"], others.T, strict=True))
+    columns |= {f"rpm_{i}": motors[:, i] for i in range(4)} | {f"cmd_{i}": commands[:, i] for i in range(4)}
+    proposal = propose([table_of(tmp_path / "a.csv", columns)])
+    states = {c.path for c in proposal.states}
+    families = [{"wx", "wy", "wz"}, {"vx", "vy", "vz"}, {f"rpm_{i}" for i in range(4)}]
+    assert all(family <= states or not family & states for family in families) and len(states) >= 6
+    assert "at most 8 states are proposed" in proposal.text and "too short" not in proposal.text
+
+
+def test_every_axis_that_some_surface_turns_is_proposed(tmp_path):
+    """As of an aeroplane, whose ailerons show far more than its elevator in everything together."""
+    rng = np.random.default_rng(6)
+    commands = np.repeat(rng.normal(size=(200, 2)), 20, axis=0)
+    roll, pitch = answers(rng, commands).T * [[1.0], [0.5]] + rng.normal(size=(2, 4000)) * [[1e-4], [4e-3]]
+    driven_by = {"aileron_cmd": commands[:, 0], "elevator_cmd": commands[:, 1]}
+    pool = [Candidate("/pose", f"{name}(orientation)", [v]) for name, v in (("roll", roll), ("pitch", pitch))]
+    used = [Candidate("/cmd", name, [v]) for name, v in driven_by.items()]
+    at = np.arange(4000, dtype=np.int64) * 10**7
+    body = Source("/pose", "geometry_msgs/msg/PoseStamped", "state", False, None, [at], [at], pool)
+    surfaces = Source("/cmd", "std_msgs/msg/Float64MultiArray", "control", False, None, [at], [at], used)
+    states, _ = choose([body], [surfaces])
+    assert [c.path for c in states] == ["roll(orientation)", "pitch(orientation)"]
 
 
 def test_the_file_of_one_joint_is_that_of_all(recordings):

@@ -524,6 +524,23 @@ def test_a_small_parquet_that_expands_is_refused(tmp_path):
         Table(path)
 
 
+def test_rows_that_a_damaged_parquet_does_not_list_are_not_lost_in_silence(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    path = tmp_path / "a.parquet"
+    parquet.write_table(pa.table({name: np.arange(200.0) for name in ("time", "x")}), path)
+    data, rows, fewer = path.read_bytes(), b"\x90\x03", b"\x90\x02"  # 200 and 136, as the footer writes them
+    refused = 0
+    for at in (i for i in range(len(data)) if data.startswith(rows, i)):
+        path.write_bytes(data[:at] + fewer + data[at + 2 :])
+        try:
+            assert len(Table(path).times) == 200
+        except BagError as error:
+            refused += "it states 200 rows, and 136 are read" in str(error)
+    assert refused
+
+
 def test_a_mat_file_that_breaks_its_reader_down_is_a_sentence(tables, tmp_path):
     """A flipped bit was a segmentation fault of the reader, and the end of the command."""
     data = tables[".mat"].read_bytes()

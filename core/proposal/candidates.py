@@ -65,6 +65,14 @@ class Candidate:
         return match[1] if match and not match[1].isdigit() else ""
 
     @property
+    def family(self) -> tuple[str, str]:
+        """Topic and path without the axis or the number: what the axes of one body and its motors have in common."""
+        alike = re.sub(r"(?<=[\w.])[xyz]$", "*", self.path)
+        if alike == self.path and re.match(r"(?!data\b)[^\W\d]{2}", self.path.rpartition(".")[2]):
+            alike = re.sub(r"\d+", "*", self.path)
+        return self.topic, alike
+
+    @property
     def kind(self) -> str:
         """Path without the entry: `position` of `position[j0]`."""
         return self.path.partition("[")[0]

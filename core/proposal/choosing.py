@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,11 +29,30 @@ ALIKE = 0.8
 """Rate of a topic, relative to that of the fastest, from which on both may give states of one model."""
 
 
+STEERS = 100.0
+"""F statistic of one control alone from which on it counts as turning an axis of a body."""
+
+
 PER_UNKNOWN = 20
 """Transitions per signal below which further signals are only listed."""
 
 
 MOST_STATES, MOST_CONTROLS = 8, 6
+
+
+@dataclass(frozen=True)
+class _Room:
+    """How many signals of a kind are proposed at most, and the reason for leaving out more."""
+
+    most: int
+    reason: str
+
+    @classmethod
+    def of(cls, carried: int, most: int, what: str) -> _Room:
+        if carried < most:
+            most = max(1, carried)
+            return cls(most, f"the recording is too short for more than {most} {what}")
+        return cls(most, f"others show more, and at most {most} {what} are proposed; exchange one if this matters")
 
 
 def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "") -> tuple[list[Candidate], str]:
@@ -73,11 +92,15 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     steps = steps_of(pool, every, used)
     N = len(steps.X)
     room = max(2, N // PER_UNKNOWN)
-    used = _strongest(steps, used, max(1, min(MOST_CONTROLS, room // 2)))
+    used = _strongest(steps, used, _Room.of(room // 2, MOST_CONTROLS, "controls"))
     steps = steps_of(pool, every, used)
-    most = max(1, min(MOST_STATES, room - len(used)))
-    driven = _driven(pool, every, used)
-    keep = _coupled(steps, pool, most, _is_pose(pool), driven) if N >= FEWEST else pool[:MOST_STATES]
+    states_room = _Room.of(room - len(used), MOST_STATES, "states")
+    if N < FEWEST:
+        keep = pool[:MOST_STATES]
+    elif _is_pose(pool):
+        keep = _steered(pool, states_room, _driven(pool, every, used))
+    else:
+        keep = _coupled(steps, pool, states_room, _driven(pool, every, used).max(axis=0, initial=0.0))
     drop_idle_controls(steps_of(keep, every, used), used)
     used = [c for c in used if not c.reason]
     _delay(keep, every, used)
@@ -85,12 +108,15 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
 
 
 def _driven(pool: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> Array:
-    """How clearly the controls show in the next step of each candidate (n,), at the delay at which they show most."""
-    found = np.zeros(len(pool))
+    """How clearly all controls, and each, show in the next step of each candidate, at the delay at which they do most.
+
+    Returns (1 + m, n).
+    """
+    found = np.zeros((1 + len(used), len(pool)))
     for lag in range(LONGEST_DELAY + 1):
         steps = steps_of(pool, every, used, [lag] * len(used))
         if used and len(steps.X) >= FEWEST:
-            found = np.maximum(found, steps.effect(range(len(pool))))
+            found = np.maximum(found, np.vstack([steps.effect(range(len(pool))), steps.effect_of_each()]))
     return found
 
 
@@ -119,42 +145,58 @@ def _one_element(
     return [c for c in pool if not c.reason], [c for c in used if not c.reason]
 
 
-def _strongest(steps: Steps, used: list[Candidate], most: int) -> list[Candidate]:
+def _strongest(steps: Steps, used: list[Candidate], room: _Room) -> list[Candidate]:
     """The controls that show most, up to a number."""
-    if len(used) <= most or len(steps.X) < FEWEST:
-        for candidate in used[most:]:
-            candidate.reason = "the recording is too short for this many controls"
-        return used[:most]
-    n = steps.X.shape[1]
-    strength = []
-    for j in range(len(used)):
-        alone = replace(steps, X=np.hstack([steps.X, np.delete(steps.U, j, axis=1)]), U=steps.U[:, [j]])
-        strength.append(float(np.max(alone.effect(range(n)), initial=0.0)))
-    order = np.argsort(strength)[::-1][:most]
-    for j, candidate in enumerate(used):
-        if j not in order:
-            candidate.reason = "others show more, and the recording is too short for all"
-    return [c for j, c in enumerate(used) if j in order]
+    order = np.arange(len(used))
+    if len(used) > room.most and len(steps.X) >= FEWEST:
+        order = np.argsort(steps.effect_of_each().max(axis=1, initial=0.0))[::-1]
+    for j in order[room.most :]:
+        used[j].reason = room.reason
+    return [c for c in used if not c.reason]
 
 
-def _coupled(steps: Steps, pool: list[Candidate], most: int, pose: bool, driven: Array) -> list[Candidate]:
+def _steered(pool: list[Candidate], room: _Room, driven: Array) -> list[Candidate]:
+    """Of a body's pose those in which some control shows most: all of its numbers are coupled by geometry.
+
+    A place adds up what the attitude did, so that the attitude goes before where the controls show in it at all. A
+    control counts for what it shows in at least half as clearly as where it shows most: of an aeroplane each surface
+    turns another axis. `driven` (1 + m, n): of all controls, and of each.
+    """
+    angles = [i for i, c in enumerate(pool) if "(" in c.path and driven[0, i] > FAINT]
+    among, least = (angles, FAINT) if angles else (list(range(len(pool))), SHOWS)
+    shown = driven[:, among]
+    best = shown.max(axis=1, initial=0.0)
+    best[1:][best[1:] < STEERS] = math.inf
+    clear = ((shown >= 0.5 * best[:, None]) & (shown > least)).any(axis=0)
+    kept = sorted(np.array(among)[clear].tolist(), key=lambda i: -driven[0, i])[: room.most]
+    for i, candidate in enumerate(pool):
+        if kept and i not in kept:
+            candidate.ready = "state"
+            candidate.reason = "a place moves with the attitude by geometry, or the controls show less in it"
+    return [pool[i] for i in sorted(kept)] or _first(pool, room)
+
+
+def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) -> list[Candidate]:
     """States in whose next step the controls show, those that help to predict them, and those that follow them.
 
-    Of a body's pose only those in which the controls show most: all of its numbers are coupled by geometry, and a
-    place adds up what the attitude did, so that the attitude goes before where the controls show in it at all.
+    A family, such as the axes of a body or its motors, is taken or left as one, unless it has no room alone.
     """
-    n = len(pool)
     order = [int(i) for i in np.argsort(-driven, kind="stable")]
-    angles = [i for i in order if "(" in pool[i].path and driven[i] > FAINT] if pose else []
-    among = angles or order
-    least = SHOWS if not pose else max(FAINT if angles else SHOWS, 0.5 * float(driven[among].max(initial=0.0)))
-    kept = [i for i in among if driven[i] > least][:most]
+    kept: list[int] = []
+    full: set[int] = set()
+
+    def take(strongest: int) -> None:
+        family = [j for j in order if pool[j].family == pool[strongest].family and j not in kept]
+        if len(family) > room.most:
+            family = [strongest]
+        (kept.extend if len(kept) + len(family) <= room.most else full.update)(family)
+
+    for i in order:
+        if driven[i] > SHOWS and i not in kept and i not in full:
+            take(i)
     if not kept:
-        for candidate in pool[most:]:
-            candidate.reason = "the recording is too short for this many states"
-        return pool[:most]
-    while len(kept) < most and not pose:
-        rest = [j for j in range(n) if j not in kept]
+        return _first(pool, room)
+    while rest := [j for j in order if j not in kept and j not in full]:
         strength = [
             max(
                 float(steps.effect(kept, of=[j], given=kept).max()),
@@ -162,20 +204,25 @@ def _coupled(steps: Steps, pool: list[Candidate], most: int, pose: bool, driven:
             )
             for j in rest
         ]
-        if not rest or max(strength) <= SHOWS:
+        if max(strength) <= SHOWS:
             break
-        kept.append(rest[int(np.argmax(strength))])
+        take(rest[int(np.argmax(strength))])
     for j, candidate in enumerate(pool):
         if j not in kept:
             candidate.ready = "state"
             candidate.reason = (
-                "the recording is too short for more"
-                if len(kept) == most
-                else "a place moves with the attitude by geometry, or the controls show less in it"
-                if pose
+                room.reason
+                if j in full
                 else "the controls do not show in it, and nothing couples it to the states above"
             )
     return [pool[j] for j in sorted(kept)]
+
+
+def _first(pool: list[Candidate], room: _Room) -> list[Candidate]:
+    """The first candidates, where the controls show in none."""
+    for candidate in pool[room.most :]:
+        candidate.reason = room.reason
+    return pool[: room.most]
 
 
 def _delay(states: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> None:

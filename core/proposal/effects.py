@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,6 +56,12 @@ class Steps:
         floor = 1e-12 * (Y**2).sum(axis=0) + 1e-300
         gain = np.maximum(without - full, 0.0) / len(tested)
         return np.asarray(gain / ((full + floor) / freedom))
+
+    def effect_of_each(self) -> Array:
+        """F statistic of each control, given the others, in the next step of each state (m, n)."""
+        n, m = self.X.shape[1], self.U.shape[1]
+        each = [replace(self, X=np.hstack([self.X, np.delete(self.U, j, 1)]), U=self.U[:, [j]]) for j in range(m)]
+        return np.array([alone.effect(range(n)) for alone in each]).reshape(m, n)
 
 
 def residual(Z: Array, Y: Array) -> Array:

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -72,7 +71,10 @@ def _function(of: Array, values: Array) -> bool:
 def drop_noise(
     pool: list[Candidate], every: dict[str, Source], used: Sequence[Candidate]
 ) -> tuple[list[Candidate], str]:
-    """Drop candidates that are noise from sample to sample, unless all are."""
+    """Drop candidates that are noise from sample to sample, unless all are.
+
+    What the controls show in stays where another of its family does: all axes of a body turn by the same law.
+    """
     late = [*used] * (SHORT_DELAY + 1)
     steps = steps_of(pool, every, late, [lag for lag in range(SHORT_DELAY + 1) for _ in used])
     if len(steps.X) < max(FEWEST, 2 * (len(pool) + len(late))):
@@ -83,8 +85,10 @@ def drop_noise(
             "nothing here is more than noise from one sample to the next: record the machine at work before you "
             "fit a model"
         )
-    for candidate, known in zip(pool, share, strict=True):
-        if known < NOISE:
+    shown = steps_of(pool, every, used).effect(range(len(pool))) > SHOWS
+    families = {c.family for c, known in zip(pool, share, strict=True) if known >= NOISE}
+    for candidate, known, seen in zip(pool, share, shown, strict=True):
+        if known < NOISE and not (seen and candidate.family in families):
             candidate.reason = (
                 f"noise: one sample predicts {max(0.0, known):.0%} of the variance at the next, controls included"
             )
@@ -94,16 +98,12 @@ def drop_noise(
 
 def drop_idle_controls(steps: Steps, used: Sequence[Candidate]) -> None:
     """Leave out controls that show nowhere given the others, and those that move with another one."""
-    n, m = steps.X.shape[1], steps.U.shape[1]
-    if len(steps.X) < FEWEST or m < 2:
+    if len(steps.X) < FEWEST or len(used) < 2:
         return
     moving = np.ptp(steps.U, axis=0) > 0
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = np.abs(np.corrcoef(steps.U.T)) > 0.99
-    shows = np.zeros(m)
-    for j in range(m):
-        alone = replace(steps, X=np.hstack([steps.X, np.delete(steps.U, j, axis=1)]), U=steps.U[:, [j]])
-        shows[j] = np.max(alone.effect(range(n)), initial=0.0)
+    shows = steps.effect_of_each().max(axis=1, initial=0.0)
     for j, candidate in enumerate(used):
         twin = next((i for i in range(j) if alike[i, j] and not used[i].reason), None)
         if not moving[j]:

@@ -127,7 +127,12 @@ def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence
             if fnmatchcase(s.topic, topic) and (not field or fnmatchcase(_plain(c.path), _plain(field)))
         ]
         if not any(not c.reason for c in found):
-            why = f"; {found[0].path} is {found[0].reason}" if found else f"; topics there: {_topics(sources)}"
+            fields = [f"{s.topic}:{c.path}" for s in sources for c in s.candidates if pattern == c.path]
+            why = f"; topics there: {_topics(sources)}"
+            if found:
+                why = f"; {found[0].path} is {found[0].reason}"
+            elif fields:
+                why = f"; a field is asked for with its topic, {' or '.join(fields[:3])}"
             raise BagError(f"{where}: --{role}s {pattern} meets nothing that moves{why}")
         met[role] |= {id(c) for c in found}
     for source in sources:
@@ -151,7 +156,7 @@ def _plain(path: str) -> str:
 
 
 def _topics(sources: Sequence[Source]) -> str:
-    return shortlist([s.topic for s in sources], 20)
+    return shortlist(list(dict.fromkeys(s.topic for s in sources)), 20)
 
 
 def _held_columns(table: Source) -> Source | None:

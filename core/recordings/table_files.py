@@ -296,6 +296,10 @@ def _read_arrow(path: Path) -> RawTable:
                     f"a file of its size; write the columns and rows that are needed"
                 )
             table = pa.parquet.read_table(path, memory_map=False)
+            if table.num_rows != rows.num_rows:
+                raise BagError(
+                    f"{path}: is damaged: it states {rows.num_rows} rows, and {table.num_rows} are read; copy it again"
+                )
         else:
             table = pa.feather.read_table(path, memory_map=False)
         table.validate(full=True)

@@ -109,8 +109,9 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
         if values.ndim == 1 and values.dtype.kind in "iuf" and len(values) > 2 and (values[1:] > values[:-1]).all():
             return names[0], "it is taken for the time, as it grows from row to row"
     raise BagError(
-        f"{path}: no column is called time or looks like it; name it in the signals file, `table: {{time: COLUMN}}`; "
-        f"columns there: {shortlist(names, 50)}"
+        f"{path}: no column is called time or looks like it; rename the one that is, or name it in a signals file, "
+        f"`table: {{time: COLUMN}}`; if none is, add one, in s (for rows at one step, its multiples); columns there: "
+        f"{shortlist(names, 50)}"
     )
 
 
