@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.proposal.candidates import Candidate, Source
 from uncertain_lti.proposal.effects import held
 from uncertain_lti.sampling.steady_state import resolve_auto
@@ -40,14 +41,19 @@ def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidat
         finite = pooled[np.isfinite(pooled[:, j]), j]
         span = float(np.ptp(finite)) if len(finite) else 0.0
         candidate.steady = steady[j] if abs(steady[j]) > 1e-3 * span else 0.0
-        candidate.scale = scale[j] if scale[j] > 0.1 * span else span
+        candidate.scale = _listed(scale[j] if scale[j] > 0.1 * span else span)
 
 
 def set_own_scale(candidate: Candidate) -> None:
     """Median and range, for one in a comment."""
     finite = np.concatenate(candidate.values)
     finite = finite[np.isfinite(finite)]
-    candidate.steady, candidate.scale = float(np.median(finite)), float(np.ptp(finite))
+    candidate.steady, candidate.scale = float(np.median(finite)), _listed(float(np.ptp(finite)))
+
+
+def _listed(scale: float) -> float:
+    """The nearest scale that a signals file may have; 0 stays."""
+    return min(max(scale, 1.0 / LARGEST), LARGEST) if scale else 0.0
 
 
 def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
