@@ -195,7 +195,7 @@ def triangle(columns: Array) -> Array:
     any sum of products of two columns is that of R's columns.
     """
     c, N = columns.shape
-    width = max(500, 4 * c)  # stretches that stay in the cache
+    width = max(4 * c, min(500, 8192 // c))  # stretches that stay in the cache, and in one thread of BLAS
     whole = N - N % width
     parts = [columns[:, whole:].T]
     if whole:
