@@ -732,7 +732,7 @@ def test_what_still_waits_at_the_end_is_judged(world: World, tmp_path: Path) -> 
 def test_an_alarm_takes_a_snapshot_when_asked_to(world: World, tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "snapshots"
     model = by_hand()
-    options: dict[str, Any] = {"snapshot.folder": str(folder), "snapshot.on_alarm": True, "snapshot.after": 0.3}
+    options: dict[str, Any] = {"snapshot.folder": str(folder), "snapshot.on_alarm": True, "snapshot.after": 2.0}
     path = saved(model, tmp_path)
     process = world.monitor(path, **options)
     flags = world.listen(JointState, f"{NODE}/flags").connected()
