@@ -16,6 +16,7 @@ import signal
 import ssl
 import subprocess
 import sys
+import sysconfig
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -63,7 +64,8 @@ def run(tmp_path):
         shutil.copy(ROOT / name, checkout / name)
     bin = tmp_path / "bin"
     bin.mkdir()
-    for tool in "bash cat cksum dirname env gcc grep rm sed tail uname".split():
+    compiler = (sysconfig.get_config_var("CC") or "cc").split()[0]  # Debian's Python names its own
+    for tool in {*"bash cat cksum dirname env gcc grep rm sed tail uname".split(), compiler}:
         (bin / tool).symlink_to(shutil.which(tool))
 
     def call(*arguments: str, programs: dict[str, str] | None = None, cwd: Path | None = None, **environment: str):
