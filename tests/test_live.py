@@ -412,7 +412,7 @@ def test_a_scheduled_model_gives_live_what_it_gives_offline(world: World, tmp_pa
     outputs.hold_against(verdicts, ("a", "b"))
     answer = world.call(Trigger, "/envelope_monitor/snapshot", Trigger.Request())
     assert answer.success, answer.message
-    (snapshot,) = folder.glob("*.mcap")
+    (snapshot,) = until(lambda: list(folder.glob("*.mcap")), "the snapshot")
     again = offline(path, snapshot)
     assert [v.status for v in again] == [v.status for v in verdicts]
     assert [v.unknown_regime for v in again] == [v.unknown_regime for v in verdicts]
