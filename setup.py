@@ -42,7 +42,7 @@ COMPILED = {
     "monitor.verdict_messages": "-O1",
     "recordings.mcap_walk": "-O2",
     "recordings.message_reader": "-O3",
-    "sampling.sampler": "-O1",
+    "sampling.sampler": "-O2",
 }
 """Modules that are compiled, and how: the kernel, and typed Python of the live chain."""
 
