@@ -310,7 +310,7 @@ def test_validate_info_and_report_say_which_faults_are_seen(tmp_path, capsys):
     (tmp_path / "signals.yaml").write_text(SIGNALS)
     engine_bag(tmp_path / "run.mcap", steps=400)
     name = str(tmp_path / "m.model.json")
-    words = ["--signals", str(tmp_path / "signals.yaml"), "--additive", "noise", "--output", name, "--no-suggest"]
+    words = ["--signals", str(tmp_path / "signals.yaml"), "--additive", "noise", "--output", name]
     assert main(["fit", str(tmp_path / "run.mcap"), *words]) == 0
     page = tmp_path / "page.html"
     assert main(["report", name, str(tmp_path / "run.mcap"), "--output", str(page), "-q"]) == 0

@@ -254,7 +254,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
                 signals,
                 "--output",
                 model,
-                "--no-suggest",
                 "--criterion",
                 "lp",
                 "--additive",

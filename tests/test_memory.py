@@ -19,7 +19,7 @@ import pytest
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, fit, validate
 from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
-from uncertain_lti.proposal.memories import Remembered, memory_candidates, remember, suggest_memories
+from uncertain_lti.proposal.ways import Remembered, memory_candidates, remember
 from uncertain_lti.sampling.recall import recall, recalled, with_delays, with_memories
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status
@@ -185,23 +185,18 @@ def oscillating(seed: int, blind: bool = True) -> Transient:
     return Transient(t, x[:, :1] if blind else x, push, signals=signals if blind else None, max_gap=0.1)
 
 
-def test_a_memory_is_suggested_with_what_it_gains_on_left_out_data() -> None:
+def test_a_memory_that_pays_is_a_candidate_and_narrows_what_was_left_out() -> None:
     runs = [oscillating(seed) for seed in range(3)]
-    suggestion = suggest_memories(runs, additive="noise")
-    assert suggestion.facts["suggested"] == ["swing_rate"]
-    assert "{name: swing_rate, topic: /s, field: 'rate(data)'} among the controls" in suggestion.message
-    (first, *_) = suggestion.facts["memories"]
-    with_it = remember(runs, [Remembered("swing", Memory("rate"))])
-    assert with_it[0].control_names == ("push", "swing_rate") and first["width"] < 0.2
+    rate = Remembered("swing", Memory("rate"))
+    assert (rate,) in memory_candidates(runs)
+    with_it = remember(runs, [rate])
+    assert with_it[0].control_names == ("push", "swing_rate")
     narrow, wide = (validate(some, additive="noise") for some in (with_it, runs))
     widths = [np.mean([part.mean_width[0] for part in left.parts]) for left in (narrow, wide)]
-    assert widths[0] / widths[1] == pytest.approx(first["width"], rel=0.05)
-    model = fit(runs, "qp", additive="noise", alarm="containment", suggest=True)
-    message = next(m for m in model.fit_summary["messages"] if "memory" in m)
-    assert message == suggestion.message
+    assert widths[0] < 0.2 * widths[1]
 
 
-def test_no_memory_is_suggested_where_every_state_is_measured() -> None:
+def test_no_memory_is_a_candidate_where_every_state_is_measured() -> None:
     runs = [oscillating(seed, blind=False) for seed in range(2)]
     assert not any(one.of.startswith("x") for some in memory_candidates(runs) for one in some)
 

@@ -38,7 +38,7 @@ from uncertain_lti.proposal.scheduling import (
     choose_knots,
     decide,
 )
-from uncertain_lti.proposal.suggestion import promise, suggest_schedule, thinned
+from uncertain_lti.proposal.ways import promise, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
 from uncertain_lti.validation.fitted_model import validate_model
 
@@ -224,11 +224,10 @@ def test_a_further_signal_that_is_not_worth_knots_is_no_part_of_the_model():
     np.testing.assert_array_equal(*discrepancies)
 
 
-def test_a_further_signal_is_suggested_and_the_other_left_out():
+def test_a_further_signal_that_schedules_nothing_is_left_out_and_said():
     runs = with_further(RUNS)
-    model = fit(runs, schedule={}, suggest=True, **options())
+    model = fit(runs, schedule={}, **options())
     assert any("'weather' schedules nothing" in m for m in model.fit_summary["messages"])
-    assert model.fit_summary["suggestion"]["suggested"] in ("level", "x1")
     scheduled = fit(runs, schedule={"level": 3}, **options())
     assert [s.name for s in scheduled.signals.scheduling] == ["level"]
     point = OperatingPoint.of(*(getattr(runs[0].signals, kind) for kind in ("states", "controls", "scheduling")))
@@ -264,29 +263,6 @@ def test_the_identification_itself_chooses_no_knots():
         fitting.fit(RUNS, schedule={"x1": "auto"})
 
 
-def test_a_suggestion_names_the_signal_and_what_it_is_worth():
-    model = fit(RUNS, suggest=True, **options())
-    (message,) = (m for m in model.fit_summary["messages"] if "schedule" in m)
-    assert "scheduled on x1" in message and "mean width x 0." in message and "--schedule x1=auto" in message
-    assert model.fit_summary["suggestion"]["suggested"] == "x1"
-    assert model.schedule is None
-
-
-def test_no_schedule_is_suggested_for_a_linear_plant():
-    suggestion = suggest_schedule(LINEAR, **options())
-    assert suggestion.message == "" and suggestion.facts["tried"] == []
-
-
-def test_a_suggestion_says_what_the_recordings_lack():
-    suggestion = suggest_schedule(APART, **options())
-    assert "suggested" not in suggestion.facts
-    assert "not carried" in suggestion.message and "record " in suggestion.message
-
-
-def test_nothing_is_suggested_where_a_schedule_is_asked_for():
-    assert "suggestion" not in fit(RUNS, schedule={"x1": 2}, suggest=True, additive="noise").fit_summary
-
-
 def test_pieces_hold_transitions_of_the_recording_alone():
     long = run(9, 20_000)
     (some,) = thinned([long], 1000)
@@ -309,7 +285,7 @@ def test_the_public_fit_takes_what_the_identification_takes():
     inner, outer = inspect.signature(fitting.fit).parameters, inspect.signature(uncertain_lti.fit).parameters
     chosen = {"criterion", "drop_horizons", "horizons", "widths", "alarm_rule"}  # here what they are chosen by
     assert [outer[name] for name in inner if name not in chosen] == [inner[n] for n in inner if n not in chosen]
-    assert set(outer) - set(inner) == {"alarm", "false_alarms", "groups", "suggest"}
+    assert set(outer) - set(inner) == {"alarm", "false_alarms", "groups"}
 
     parameters = inspect.getdoc(uncertain_lti.fit).split("Parameters\n----------\n")[1].split("\n\nReturns")[0]
     described = {line.split(" : ")[0] for line in parameters.splitlines() if not line.startswith(" ")}

@@ -83,12 +83,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "constant", "growing"),
         help="their half-widths: growing with the state, constant, or what holds better on left-out data (auto)",
     )
-    parser.add_argument(
-        "--no-suggest",
-        action="store_true",
-        help="do not try, on a part of the recordings (some 4000 transitions), whether a schedule, or lags and "
-        "rates, would pay",
-    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
         "--discard",
@@ -148,7 +142,6 @@ def run(options: argparse.Namespace) -> int:
             alarm=options.alarm,
             false_alarms=options.false_alarms,
             groups=options.group,
-            suggest=not options.no_suggest,
             discard=options.discard,
             count=options.count,
             seek_carriers=True,

@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.english import plural
@@ -29,9 +28,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.horizons import choose_horizons, lengths_of
-from uncertain_lti.proposal.memories import suggest_memories
 from uncertain_lti.proposal.scheduling import choose_knots, knots_of
-from uncertain_lti.proposal.suggestion import suggest_schedule
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.horizon_rule import HorizonRule, WidthChoice
@@ -60,7 +57,6 @@ def fit(
     false_alarms: float | None = None,
     progress: Callable[[str], None] | None = None,
     groups: Sequence[Any] | str | None = None,
-    suggest: bool = False,
 ) -> UncertainLTI:
     """Fit dx/dt = (A ± ΔA) x + (B ± ΔB) u so that the one-step bounds contain every recorded sample, and arm it.
 
@@ -130,10 +126,6 @@ def fit(
         Called with one line of text per pass over the data, and per discard.
     groups : sequence or str, optional
         What is left out together: one name per recording, or a key, as in `validate`.
-    suggest : bool, default False
-        Try, where no schedule is asked for, whether one would pay, or a lag, rate or difference of a signal, on a part
-        of the recordings (`suggest_schedule`, `suggest_memories`). The answer is among the messages, its tables in
-        `model.fit_summary["suggestion"]`.
 
     Returns
     -------
@@ -171,8 +163,7 @@ def fit(
     rule = horizons_asked_for(transients, horizons, widths)
     chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
     automatic = [name for name, knots in chosen.items() if _is_auto(knots)]
-    suggest = suggest and not asked
-    leaves_out = alarm == "panel" or automatic or suggest or (rule is not None and rule.leaves_out)
+    leaves_out = alarm == "panel" or automatic or (rule is not None and rule.leaves_out)
     if groups is not None and not leaves_out:
         raise FitError("groups are given, and the fit leaves nothing out; leave them out, or take the panel as alarm")
     if automatic and transient_weights is not None:
@@ -253,14 +244,6 @@ def fit(
     added: dict[str, Any] = {"schedule": facts} if facts else {}
     if choice_of_horizons:
         added["horizon_choice"] = choice_of_horizons
-    if suggest:
-        if transient_weights is not None or not _per_state(weights):
-            added["suggestion"] = {"not_done": "the weights belong to the samples, of which a part is looked at"}
-        else:
-            memories = suggest_memories(transients, groups, progress, **options)
-            suggestion = suggest_schedule(transients, groups, progress, **options)
-            added["suggestion"] = {**suggestion.facts, "memory": memories.facts}
-            messages += [found.message for found in (memories, suggestion) if found.message]
     if added or messages:
         there = model.fit_summary.get("messages", [])
         model = model.replace(fit_summary={**model.fit_summary, **added, "messages": [*there, *messages]})
@@ -327,10 +310,3 @@ def _no_knots_named(signals: SignalMap | None, name: str) -> None:
 
 def _is_auto(knots: Knots) -> bool:
     return isinstance(knots, str) and knots == "auto"
-
-
-def _per_state(weights: Any) -> bool:
-    """Whether they are the same at every sample."""
-    if isinstance(weights, (list, tuple)) and any(np.ndim(w) for w in weights):
-        return False
-    return weights is None or np.ndim(weights) == 1

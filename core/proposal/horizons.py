@@ -24,7 +24,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.proposal.scheduling import EXCESS, FOLDS, PAYS, SLACK, WORSE, fold_of, jackknife
+from uncertain_lti.proposal.scheduling import EXCESS, PAYS, SLACK, WORSE, fold_of, jackknife
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.horizon_rule import HorizonRule
 from uncertain_lti.validation.left_out import validate
@@ -166,7 +166,7 @@ def choose_horizons(
         model = fit(transients, describe_data=False, horizons=lengths, widths=kind, drop_horizons=True, **options)
         dropped |= _dropped(model, lengths)
         try:
-            fold = fold_of(transients, groups, model, FOLDS)
+            fold = fold_of(transients, groups, model)
             left = validate(
                 transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap,
                 **{k: v for k, v in options.items() if k not in ("operating_point", "schedule")},

@@ -191,8 +191,8 @@ class Trials:
     """Numbers of knots, judged one after the other on the same left-out parts.
 
     `transients`: the recordings; `others`: scheduling signals with their knots or modes, which every candidate has;
-    `groups`: as in `validate`; `folds`: times that something is left out, at most; `progress`: called with one line of
-    text per candidate; `**options`: further arguments of `fit`.
+    `groups`: as in `validate`; `progress`: called with one line of text per candidate; `**options`: further ones of
+    `fit`.
     """
 
     def __init__(
@@ -201,7 +201,6 @@ class Trials:
         others: Mapping[str, Knots] | None = None,
         *,
         groups: Sequence[Any] | str | None = None,
-        folds: int = FOLDS,
         progress: Callable[[str], None] | None = None,
         **options: Any,
     ) -> None:
@@ -209,7 +208,7 @@ class Trials:
         model = fit(transients, schedule=self.others, describe_data=False, **options)
         self._baseline: Validation | None = None
         try:
-            self.fold = fold_of(transients, groups, model, folds)
+            self.fold = fold_of(transients, groups, model)
         except FitError as error:
             self.fold = Fold(None, None, None, "recording")
             self.base = Candidate(1, model, str(error))
@@ -284,23 +283,21 @@ def knots_of(model: UncertainLTI, signal: str) -> list[float]:
     return [value for axis, values in at if axis.signal == signal for value in values.tolist()]
 
 
-def fold_of(
-    transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI, folds: int
-) -> Fold:
+def fold_of(transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI) -> Fold:
     """What is left out at a time."""
     names, _ = resolve_groups(transients, groups)
     if not names and len(transients) == 1:
         usable = int(transients[0].usable.sum())
-        blocks = max(2, min(BLOCKS, folds, usable // 2))
+        blocks = max(2, min(BLOCKS, FOLDS, usable // 2))
         spans = [(transients[0], *span) for span in block_spans(transients[0], blocks)]
         return Fold(None, blocks, guard_interval(base, spans), "block")
     what = "group" if names else "recording"
     each = names or [str(i) for i in range(len(transients))]
     units = list(dict.fromkeys(each))
-    if len(units) <= folds:
+    if len(units) <= FOLDS:
         return Fold(names or None, None, None, what)
-    joined = {units[k]: str(i) for i, part in enumerate(np.array_split(np.arange(len(units)), folds)) for k in part}
-    return Fold([joined[name] for name in each], None, None, f"{folds}th part of the {what}s")
+    joined = {units[k]: str(i) for i, part in enumerate(np.array_split(np.arange(len(units)), FOLDS)) for k in part}
+    return Fold([joined[name] for name in each], None, None, f"{FOLDS}th part of the {what}s")
 
 
 def _judged(count: int, model: UncertainLTI, left: Validation, base: Validation) -> Candidate:
@@ -351,36 +348,35 @@ def jackknife(sums: Array, counts: Array) -> tuple[float, float]:
     return value, float(np.sqrt((number - 1) / number * np.sum((without - without.mean()) ** 2)))
 
 
-def _admissible(candidate: Candidate, base: Candidate, allowed: float) -> bool:
+def _admissible(candidate: Candidate, base: Candidate) -> bool:
     """Whether its coverage does not speak against it."""
     if candidate.refused:
         return False
     much = candidate.width[0] <= math.log(MUCH)
-    if much:
-        allowed = max(allowed, EXCESS_FOR_MUCH)
+    allowed = EXCESS_FOR_MUCH if much else EXCESS
     for parts in base.counted():
         more, error = candidate.more_outside(base, parts)
         if candidate.excess(base, parts) > allowed and more >= min(error, WORSE):
             return False
     like = base.counted()[-1]
     outside, one, judged = (float(a[like].sum()) for a in (candidate.outside, base.outside, base.judged))
-    return much or allowed > EXCESS or outside <= max(TIMES * one, NEGLIGIBLE * judged)
+    return much or outside <= max(TIMES * one, NEGLIGIBLE * judged)
 
 
-def best_of(candidates: Sequence[Candidate], allowed: float = EXCESS) -> Candidate:
+def best_of(candidates: Sequence[Candidate]) -> Candidate:
     """The least width among those that cover as well as one knot and whose widths pay; else one knot."""
     base = candidates[0]
-    good = [c for c in candidates[1:] if _admissible(c, base, allowed) and c.width[0] <= math.log(PAYS)]
+    good = [c for c in candidates[1:] if _admissible(c, base) and c.width[0] <= math.log(PAYS)]
     return min(good, key=lambda c: c.width[0], default=base)
 
 
-def decide(signal: str, candidates: Sequence[Candidate], trials: Trials, allowed: float = EXCESS) -> Choice:
+def decide(signal: str, candidates: Sequence[Candidate], trials: Trials) -> Choice:
     """The simplest candidate within the error of the best, with the reason."""
-    base, best = candidates[0], best_of(candidates, allowed)
+    base, best = candidates[0], best_of(candidates)
     chosen = best
     if best is not base:
         limit = min(sum(best.width), math.log(PAYS))
-        chosen = next(c for c in candidates[1:] if _admissible(c, base, allowed) and c.width[0] <= limit)
+        chosen = next(c for c in candidates[1:] if _admissible(c, base) and c.width[0] <= limit)
     reason = _reason(candidates, best, chosen)
     narrow = [c for c in candidates[1:] if not c.refused and c.width[0] <= math.log(PAYS)]  # none is admissible
     short = [c for c in candidates[1:] if c.refused and c.model is not None]

@@ -11,27 +11,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.assembly import assemble
+from uncertain_lti.identification.residuals import residuals
 from uncertain_lti.identification.sensors import late_controls
-from uncertain_lti.proposal.memories import Remembered, memory_candidates, operating_point, remember
-from uncertain_lti.proposal.suggestion import TRANSITIONS, promise, thinned
-from uncertain_lti.sampling.recall import with_delays
+from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.schedule import Axis, Schedule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.proposal.scheduling import Fold, fold_of
+from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.memory import Memory
+from uncertain_lti.validation.left_out import validate
 
 KNOTS = (2, 3, 5)
 """Numbers of knots tried on a promising signal."""
 PROMISING, SIGNALS = 0.9, 2
 """Largest least-squares residual with three knots, relative to one, up to which a signal is tried; and how many are."""
+TRANSITIONS = 4000
+"""Transitions by which promising signals are found, about; of larger recordings pieces are taken, ..."""
+PIECE = 200
+"""... of so many transitions."""
+PAYS, ALLOWED = 0.8, 0.02
+"""Memories pay whose mean width on left-out data is at most this share, with at most so much more outside."""
+FEWEST_STEPS, MOST_STEPS = 3, 0.05
+"""A control whose steps are events changes in at least so many transitions, and in at most this share of them."""
 LONGEST = 64
 """Steps of the longest horizon tried."""
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A memory that may be added to the signals.
+
+    `of`: the state or control whose samples it takes; `memory`: how.
+    """
+
+    of: str
+    memory: Memory
+
+    @property
+    def name(self) -> str:
+        """Name of the new signal."""
+        lag = f"_{self.memory.samples}" if self.memory.samples > 1 else ""
+        return f"{self.of}_{ {'lag': 'before', 'diff': 'change', 'rate': 'rate'}[self.memory.kind] }{lag}".replace(
+            " ", ""
+        )
 
 
 @dataclass(frozen=True)
@@ -110,3 +145,196 @@ def horizons(transients: Sequence[Transient], best: Setting, within: float) -> I
         if longest >= 2:
             options = {**best.options, "horizons": [steps], "widths": "constant"}
             yield best.beside(f"and over {steps} steps", options=options)
+
+
+def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) -> list[Transient]:
+    """Recordings with further controls that follow from their own earlier samples."""
+    return [with_memories(t, {one.name: (one.of, one.memory) for one in memories}) for t in transients]
+
+
+def memory_candidates(transients: Sequence[Transient], additive: str = "noise") -> list[tuple[Remembered, ...]]:
+    """Sets of memories that may narrow the envelope, by what least squares leaves unexplained.
+
+    Of the states whose residual follows from sample to sample (`residuals.Residuals.follows`) the rates (the
+    differences, if the step is constant) and the values one sample earlier; of the controls that seldom change the
+    values one sample earlier, and their changes.
+    """
+    first = transients[0]
+    point = operating_point(first)
+    try:
+        problem = assemble(transients, point, None, additive)  # type: ignore[arg-type]
+    except FitError:
+        return []
+    taken = {*first.state_names, *first.control_names, *first.scheduling_names}
+    remembered = {r.of for r in first.signals.recalled} if first.signals is not None else set()
+    found = residuals(problem)
+    follow = [i for i in range(problem.n) if found is not None and found.follows(i) and i not in remembered]
+    rate = "rate" if first.step is None else "diff"
+    events = []
+    for j in range(problem.n, problem.p):
+        changes = int(np.count_nonzero(np.diff(problem.z[:, j])))
+        if FEWEST_STEPS <= changes <= MOST_STEPS * problem.N and j not in remembered:
+            events.append(j)
+    names = [*first.state_names, *first.control_names]
+    sets = [
+        tuple(Remembered(names[i], Memory(kind)) for i in group)  # type: ignore[arg-type]
+        for group, kinds in ((follow, (rate, "lag")), (events, ("lag", "diff")))
+        for kind in kinds
+        if group
+    ]
+    return [chosen for chosen in sets if not taken & {one.name for one in chosen}]
+
+
+@dataclass(frozen=True)
+class ChosenMemories:
+    """Memories that pay, and what was tried.
+
+    `chosen`: empty where none pays; `facts`: plain data: `memories` that were tried, the share `inside` without, the
+    names `suggested`, and with them `width` and the share `inside_with`.
+    """
+
+    chosen: tuple[Remembered, ...]
+    facts: dict[str, Any]
+
+
+def choose_memories(
+    transients: Sequence[Transient],
+    groups: Sequence[Any] | str | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> ChosenMemories:
+    """Which lags, rates or differences narrow the envelope of left-out data, and what that gains.
+
+    Of the sets of `memory_candidates` those for the states are tried on about TRANSITIONS transitions, leaving out in
+    turn, then, beside the best of them, those for the controls.
+    """
+    sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), options.get("additive") or "noise")
+    if not sets:
+        return ChosenMemories((), {"memories": []})
+    base = thinned(transients, TRANSITIONS)
+    try:
+        model = fit(base, schedule={}, describe_data=False, **options)
+        fold = fold_of(base, groups, model)
+        before = _judged(base, model, fold, options)
+    except FitError as error:
+        return ChosenMemories((), {"not_done": str(error)})
+    tried: list[dict[str, Any]] = []
+    states = {*transients[0].state_names}
+    chosen: tuple[Remembered, ...] = ()
+    best = before
+    for kind in (True, False):
+        beside, widths = chosen, best
+        for some in (s for s in sets if (s[0].of in states) is kind):
+            if progress is not None:
+                progress(f"with {', '.join(one.name for one in some)}")
+            more = thinned(remember(transients, (*beside, *some)), TRANSITIONS)
+            try:
+                after = _judged(more, fit(more, schedule={}, describe_data=False, **options), fold, options)
+            except FitError as error:
+                tried.append({"added": [one.name for one in some], "refused": str(error)})
+                continue
+            ratio = math.exp(float(np.mean(np.log(after[0] / widths[0]))))
+            pays = ratio <= PAYS and after[1] >= before[1] - ALLOWED
+            tried.append({"added": [one.name for one in some], "width": ratio, "inside": after[1], "pays": pays})
+            if pays and np.mean(np.log(after[0] / best[0])) < 0:
+                best, chosen = after, (*beside, *some)
+    facts: dict[str, Any] = {"memories": tried, "inside": before[1], "suggested": [one.name for one in chosen]}
+    if chosen:
+        facts |= {"width": math.exp(float(np.mean(np.log(best[0] / before[0])))), "inside_with": best[1]}
+    return ChosenMemories(chosen, facts)
+
+
+def _judged(
+    transients: Sequence[Transient], model: UncertainLTI, fold: Fold, options: dict[str, Any]
+) -> tuple[Any, float]:
+    """Mean width of each state on left-out data, in recorded units, and the share inside."""
+    left = validate(transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap, **options)
+    judged = np.array([part.judged for part in left.parts], dtype=np.float64)
+    if not judged.sum():
+        raise FitError("nothing that was left out can be judged")
+    width = sum(part.judged * part.mean_width for part in left.parts if part.judged) / judged.sum()
+    outside = sum(part.violated for part in left.parts) / judged.sum()
+    return np.maximum(width, 1e-300), float(1.0 - outside)
+
+
+def operating_point(transient: Transient) -> OperatingPoint:
+    """That of the signals of a recording; of arrays 0, with scales of 1."""
+    signals = transient.signals
+    if signals is not None:
+        return OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
+    sizes = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
+    steady, scale = [np.zeros(k) for k in sizes], [np.ones(k) for k in sizes]
+    return OperatingPoint(steady[0], steady[1], scale[0], scale[1], steady[2], scale[2])
+
+
+def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:
+    """Pieces of each recording, evenly spread, so that about this many transitions are left in total."""
+    share = most / max(sum(len(t) for t in transients), 1)
+    return list(transients) if share >= 1 else [_pieces(t, share) for t in transients]
+
+
+def _pieces(transient: Transient, share: float) -> Transient:
+    length = min(PIECE, max(20, int(share * len(transient))))
+    count = max(1, round(share * len(transient) / length))
+    if count * (length + 2) >= len(transient):
+        return transient
+    starts = np.linspace(0, len(transient) - length - 2, count).astype(int)
+    keep = np.unique((starts[:, None] + np.arange(length + 2)).ravel())
+    x = transient.x[keep]
+    x[np.isin(keep, starts + length + 1)] = np.nan  # no transition from one piece to the next
+    names: dict[str, Any] = {}
+    if transient.signals is None:
+        names = {
+            "state_names": transient.state_names,
+            "control_names": transient.control_names,
+            "scheduling_names": transient.scheduling_names,
+        }
+    return Transient(
+        transient.t_ns[keep],
+        x,
+        transient.u[keep],
+        s=transient.s[keep],
+        name=transient.name,
+        signals=transient.signals,
+        max_gap=transient.max_gap,
+        min_step=transient.min_step,
+        step=transient.step or "recorded",
+        sources=transient.sources,
+        **names,
+    )
+
+
+def promise(transients: Sequence[Transient]) -> dict[str, float]:
+    """How far the largest residuals of least squares shrink with three knots on each signal.
+
+    The knots are the ends of the signal and one of a few places between, the best.
+    """
+    steps = [t.transitions() for t in transients]
+    first = transients[0]
+    names = [*first.state_names, *first.control_names, *first.scheduling_names]
+    x, u = np.concatenate([s.x for s in steps]), np.concatenate([s.u for s in steps])
+    dt = np.concatenate([s.dt for s in steps])
+    z = np.column_stack([x, u])
+    phi = dt * np.vstack([(z / np.maximum(np.abs(z).max(axis=0, initial=0.0), 1e-300)).T, np.ones(len(z))])
+    if len(z) < 9 * len(phi):
+        return dict.fromkeys(names, 1.0)
+    move = np.concatenate([s.x_next for s in steps]) - x
+    floor = np.maximum(1e-9 * np.ptp(x, axis=0), 1e-300)
+    whole = np.maximum(_largest(phi, move), floor)
+    found = {}
+    for name, values in zip(names, np.column_stack([z, np.concatenate([s.s for s in steps])]).T, strict=True):
+        low, high = float(values.min()), float(values.max())
+        places = {0.5 * (low + high), *np.quantile(values, [0.25, 0.5, 0.75]).tolist()}
+        found[name] = 1.0
+        for place in sorted(p for p in places if low < p < high):
+            weights = Schedule((Axis(name, knots=(low, place, high)),)).weights(values[None])
+            left = _largest((weights[:, None] * phi[None]).reshape(-1, len(z)), move)
+            found[name] = min(found[name], float(np.exp(np.mean(np.log(np.maximum(left, floor) / whole)))))
+    return found
+
+
+def _largest(phi: Array, move: Array) -> Array:
+    """Mean of the largest hundredth of the least-squares residuals of each state; phi (r, N), move (N, n)."""
+    theta = np.linalg.lstsq(phi.T, move, rcond=None)[0]
+    left = np.sort(np.abs(move - phi.T @ theta), axis=0)
+    return np.asarray(left[-max(1, len(left) // 100) :].mean(axis=0))
