@@ -110,7 +110,7 @@ def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     )
     event = (t, what)
     figures = {
-        "alarm.png": alarm_figure(model, offline),
+        "alarm.png": alarm_figure(model, offline, event=event, most=3),
         "envelope.png": envelope_figure(model, offline, states=SHOWN, event=event),
         "envelope_close.png": envelope_figure(model, offline, states=SHOWN, event=event, span=(t - 1.5, t + 1.5)),
         "matrices.png": matrices_figure(model),

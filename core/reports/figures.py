@@ -45,7 +45,13 @@ _MOST_ROWS = 48  # elements in a heat map
 _NUMBERS = 250  # cells whose numbers are written
 
 
-def alarm_figure(model: UncertainLTI, verdicts: Verdicts, span: tuple[float, float] | None = None) -> Any:
+def alarm_figure(
+    model: UncertainLTI,
+    verdicts: Verdicts,
+    span: tuple[float, float] | None = None,
+    event: tuple[float, str] | None = None,
+    most: int = 6,
+) -> Any:
     """What happened and when: the alarm's score over its threshold, then the states that did it as utilisation.
 
     Parameters
@@ -56,6 +62,10 @@ def alarm_figure(model: UncertainLTI, verdicts: Verdicts, span: tuple[float, flo
         Of `EnvelopeMonitor.check`.
     span : (float, float), optional
         Show only this time, s.
+    event : (float, str), optional
+        A time to mark, s, and what happened then.
+    most : int, default 6
+        States drawn at most.
 
     Returns
     -------
@@ -63,7 +73,7 @@ def alarm_figure(model: UncertainLTI, verdicts: Verdicts, span: tuple[float, flo
         Not written yet; see `save`.
     """
     charts.chosen_states(model, verdicts, None)
-    return _drawn(charts.alarm_chart(model, verdicts, charts.columns_of(verdicts, span=span)))
+    return _drawn(charts.alarm_chart(model, verdicts, charts.columns_of(verdicts, span=span), most), event)
 
 
 def envelope_figure(
@@ -327,8 +337,9 @@ def _drawn(chart: Chart, event: tuple[float, str] | None = None) -> Any:
         if event is not None:
             axis.axvline(event[0], color=RECORDED, linestyle="--", linewidth=1.0)
     if event is not None:
-        axes[0].annotate(_plain(event[1]), (event[0], 1.0), xycoords=("data", "axes fraction"), xytext=(4, -10),
-                         textcoords="offset points", fontsize=8)  # fmt: skip
+        side = "right" if event[0] > sum(chart.columns.limits) / 2 else "left"
+        place = axes[0].get_xaxis_transform()
+        axes[0].text(event[0], 0.95, f" {_plain(event[1])} ", transform=place, va="top", ha=side, fontsize=8)
     figure.text(0.1 / _WIDTH, 1 - 0.22 / total, _short(chart.heading, 110), fontsize=9)
     figure.legend(
         handles=[_key(*key) for key in chart.keys], loc="upper left", ncols=len(chart.keys), fontsize=7, frameon=False,

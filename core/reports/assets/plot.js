@@ -31,8 +31,13 @@
   const panels = () => [...page.recordings[recording].top, ...(views()[view] ?? []).filter((p) => shown.has(p.title))];
   const number = (v) => (v == null ? "–" : String(Number(v.toPrecision(7))));
 
-  function shade(u, c) {
+  function shade(u, levels, c) {
     const { left, top, width, height } = u.bbox;
+    if (levels.length > 1) {
+      const [low, high] = levels.map((v) => Math.min(Math.max(u.valToPos(v, "y", true), top), top + height));
+      u.ctx.fillStyle = c.band;
+      u.ctx.fillRect(left, high, width, low - high);
+    }
     const { min, max } = u.scales.x;
     const { alarms, silent } = page.recordings[recording];
     for (const [spans, colour] of [[alarms, c.alarm], [silent, c.silent]]) {
@@ -81,14 +86,14 @@
     const u = new uPlot({
       width: holder.clientWidth, height: 170, series, bands,
       scales: { x: { time: false }, y: panel.levels.length ? { range: limited(panel) } : {} },
-      axes: [axis, { ...axis, size: room }],
+      axes: [{ ...axis, size: 32 }, { ...axis, size: room }],
       cursor: {
         drag: { x: true, y: false, dist: 4 },
         sync: { key: "all", scales: ["x", null], filters: { pub } },
         bind: { mousedown: (self, target, handler) => (e) => (e.shiftKey ? move(self, e) : handler(e)) },
       },
       hooks: {
-        drawClear: [(self) => shade(self, c)],
+        drawClear: [(self) => shade(self, panel.levels, c)],
         draw: [(self) => limits(self, panel.levels, c)],
         setScale: [(self, key) => key === "x" && follow(self)],
       },
