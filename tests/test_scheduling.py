@@ -27,7 +27,7 @@ from uncertain_lti.cli.fit import _schedule
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Modes
-from uncertain_lti.model.free_run import free_run
+from uncertain_lti.model.free_run import run_over
 from uncertain_lti.proposal.scheduling import (
     EXCESS,
     EXCESS_FOR_MUCH,
@@ -220,7 +220,7 @@ def test_a_further_signal_that_is_not_worth_knots_is_no_part_of_the_model():
     np.testing.assert_array_equal(
         EnvelopeMonitor(model).check(runs[0]).upper, EnvelopeMonitor(model).check(LINEAR[0]).upper
     )
-    discrepancies = [free_run(model, t) for t in (runs[0], LINEAR[0])]
+    discrepancies = [run_over(model, t) for t in (runs[0], LINEAR[0])]
     np.testing.assert_array_equal(*discrepancies)
 
 

@@ -28,13 +28,13 @@ from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
+from uncertain_lti.model.elements import blocks_of, checked, object_of
 from uncertain_lti.model.horizon import Horizon, Run
-from uncertain_lti.model.objects import object_of
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature
-from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked
+from uncertain_lti.model.terms import ARRAYS, REQUIRED
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.signals.table_layout import TableLayout
 

@@ -26,10 +26,29 @@ LONGEST_RECURSION = 400
 """Rows of the matrix of the recursion up to which it remembers earlier samples; longer memories are left out of it."""
 
 
-def simulated(model: Any, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLike | None = None) -> Array:
-    """`UncertainLTI.simulate`.
+def simulate(model: Any, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLike | None = None) -> Array:
+    """Free run of the nominal model, x_{k+1} = x_k + Δt_k (A x_k + B u_k + c), as in eq. (3) with ΔA = ΔB = 0.
 
-    Returns (N+1, n): normalised states.
+    What a signal takes from earlier samples of a state (lag, diff, rate) follows the run, as soon as the run has
+    these samples.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    x0 : array (n,)
+        Normalised state at t_0.
+    u : array (N, m)
+        Normalised controls.
+    dt : float or array (N,)
+        Δt_k, s.
+    s : array (N, q), optional
+        Normalised further scheduling signals; for models that have some. A schedule on a state follows the run.
+
+    Returns
+    -------
+    array (N+1, n)
+        Normalised states; infinite or NaN where an unstable model runs away.
     """
     u = np.asarray(u, dtype=np.float64)
     dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(u),))
@@ -64,7 +83,7 @@ def _recall(model: Any, recalled: Recalled, z: Array, k: int, dt: Array) -> None
     z[k, recalled.position] = (value - steady[recalled.position]) / scale[recalled.position]
 
 
-def free_run(model: Any, transient: Transient) -> Array:
+def run_over(model: Any, transient: Transient) -> Array:
     """States of the run over each usable stretch of a recording.
 
     Returns (N+1, n): normalised; NaN where there is no run.
@@ -84,16 +103,65 @@ def free_run(model: Any, transient: Transient) -> Array:
     run = np.full(x.shape, np.nan)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
     for start, stop in edges.reshape(-1, 2):
-        run[start : stop + 1] = simulated(model, x[start], u[start:stop], dt[start:stop], s[start:stop])
+        run[start : stop + 1] = simulate(model, x[start], u[start:stop], dt[start:stop], s[start:stop])
     return run
 
 
-def discrepancy(model: Any, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
-    """`UncertainLTI.discrepancy`: (4) and (5).
+def free_run(model: Any, transient: Transient) -> Transient:
+    """Free run of the nominal model over a recording: its controls, and nothing of its states but the first.
 
-    Returns (n,): eq. (5).
+    The run begins again from the recorded sample at the start of every segment, and after every sample that is not
+    finite. `simulate` does the same for arrays of normalised quantities.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    transient : Transient
+        In recorded units.
+
+    Returns
+    -------
+    Transient
+        With the states of the run, in recorded units; NaN where there is no run.
+
+    Raises
+    ------
+    ModelError
+        The transient has other numbers of signals than the model.
     """
-    error = (free_run(model, transient) - model.operating_point.normalise_x(transient.x))[1:]
+    x = model.operating_point.recorded_x(run_over(model, transient))
+    return transient.replace(x=x, name=f"{transient.name}, free run of the model")
+
+
+def discrepancy(model: Any, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
+    """Discrepancies (4) and (5) between the free-running nominal model and a recorded transient.
+
+    The run starts again from the recorded sample at the start of every segment, and after every sample that
+    is not finite.
+
+    Parameters
+    ----------
+    model : UncertainLTI
+        The model.
+    transient : Transient
+        In recorded units.
+    W : array (n,), (N, n) or (N, n, n), optional
+        Weights of the arrival samples; default ones.
+
+    Returns
+    -------
+    sum_of_squares : float
+        Eq. (4), over k = 1..N.
+    largest : array (n,)
+        Eq. (5) for each state.
+
+    Raises
+    ------
+    ModelError
+        W has another shape.
+    """
+    error = (run_over(model, transient) - model.operating_point.normalise_x(transient.x))[1:]
     usable = transient.usable
     weights = np.ones(model.n) if W is None else np.asarray(W, dtype=np.float64)
     if weights.shape not in ((model.n,), (len(usable), model.n), (len(usable), model.n, model.n)):

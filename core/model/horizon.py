@@ -24,7 +24,6 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -34,10 +33,9 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.kernel.arithmetic import Judge, centre_and_half
-from uncertain_lti.model.objects import object_of
+from uncertain_lti.model.elements import Elements, blocks_of, object_of
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Schedule
-from uncertain_lti.model.terms import ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, blocks_of, checked, tables
 
 Widths = Literal["growing", "constant"]
 """Half-widths that grow with |x| and |u|, or are the same everywhere."""
@@ -67,7 +65,7 @@ class Windows:
         return self.start + (self.steps - 1)
 
 
-class Run:
+class Run(Elements):
     """A linear model that is run over the windows of the horizons in place of the nominal one.
 
     The centre of the narrowest envelope of one step may be unstable in a block whose ends few samples visit; over many
@@ -77,37 +75,14 @@ class Run:
     """
 
     def __init__(self, A: ArrayLike, B: ArrayLike, c: ArrayLike) -> None:
-        self.A: Array = checked(A, "run.A", None)
-        self.B: Array = checked(B, "run.B", None)
-        if self.A.ndim not in (2, 3) or self.A.shape[-1] != self.A.shape[-2] or not self.A.size:
-            raise ModelError(f"field 'run.A' has shape {self.A.shape}; it must be square, once for each block")
-        lead, n = self.A.shape[:-2], self.A.shape[-1]
-        if self.B.size == 0:
-            self.B = np.zeros((*lead, n, 0))
-        if self.B.shape[:-1] != (*lead, n):
-            raise ModelError(f"field 'run.B' has shape {self.B.shape}; it must have {plural(n, 'row')} in each block")
-        self.c: Array = checked(c, "run.c", (*lead, n))
-        for name in _OF_RUN:
-            getattr(self, name).flags.writeable = False
+        super().__init__({"A": A, "B": B, "c": c}, "run.")
 
     def __repr__(self) -> str:
-        return f"Run({plural(self.A.shape[-1], 'state')}; {plural(self.B.shape[-1], 'control')})"
-
-    @property
-    def tables(self) -> tuple[Array, Array, Array]:
-        """As `terms.tables`, with half-widths of 0."""
-        zeros = np.zeros_like(self.c)
-        still = {"dA": np.zeros_like(self.A), "dB": np.zeros_like(self.B), "dc": zeros, "v": zeros}
-        return tables({"A": self.A, "B": self.B, "c": self.c, **still})
+        return f"Run({plural(self.n, 'state')}; {plural(self.m, 'control')})"
 
     def to_dict(self) -> dict[str, Any]:
         """As it is in a model file."""
-        arrays = {name: getattr(self, name) for name in _OF_RUN}
-        if self.A.ndim == 2:
-            arrays = {name: value[None] for name, value in arrays.items()}
-        return {
-            "blocks": [{name: value[r].tolist() for name, value in arrays.items()} for r in range(len(arrays["c"]))]
-        }
+        return {"blocks": self.blocks_to_list(_OF_RUN)}
 
     @classmethod
     def from_dict(cls, data: Any, n: int, m: int, blocks: int | None) -> Run:
@@ -160,7 +135,7 @@ def windows_of(
         )
 
 
-class Horizon:
+class Horizon(Elements):
     """Elements of the envelope after a number of steps.
 
     `steps`: h, at least 2; `A` (n, n): correction of the centre, A', 1/s; `B` (n, m): B', 1/s; `dA` (n, n): half-widths
@@ -188,50 +163,19 @@ class Horizon:
             raise ModelError(f"horizon of {steps} steps: widths is {widths!r}; it must be growing or constant")
         self.steps, self.widths = steps, widths
         here = f"horizon of {steps} steps: "
-        self.A: Array = checked(A, f"{here}A", None)
-        self.B: Array
-        self.dA: Array
-        self.dB: Array
-        self.c: Array
-        self.dc: Array
-        self.v: Array
-        if self.A.ndim not in (2, 3) or self.A.shape[-1] != self.A.shape[-2] or not self.A.size:
-            raise ModelError(f"{here}A has shape {self.A.shape}; it must be square, once for each block of a schedule")
-        lead, n = self.A.shape[:-2], self.A.shape[-1]
-        given: dict[str, Any] = {"A": A, "B": B, "dA": dA, "dB": dB, "c": c, "dc": dc, "v": v}
-        whole = checked(B, f"{here}B", None)
-        m = whole.shape[-1] if whole.size else 0
-        for name in ARRAYS:
-            shape = (*lead, *SHAPES[name].shape(n, m))
-            value = np.zeros(shape) if given[name] is None and name not in REQUIRED else given[name]
-            array = checked(value, f"{here}{name}", shape, name in HALF_WIDTHS)
-            array.flags.writeable = False
-            setattr(self, name, array)
+        super().__init__({"A": A, "B": B, "dA": dA, "dB": dB, "c": c, "dc": dc, "v": v}, here)
         if widths == "constant" and (self.dA.any() or self.dB.any() or self.dc.any()):
-            raise ModelError(
-                f"horizon of {steps} steps: widths are constant, and dA, dB or dc is not 0; call it growing"
-            )
-        if residuals is not None and len(residuals.mean) != n:
-            raise ModelError(f"{here}residuals of {plural(len(residuals.mean), 'state')} for {plural(n, 'state')}")
+            raise ModelError(f"{here}widths are constant, and dA, dB or dc is not 0; call it growing")
+        if residuals is not None and len(residuals.mean) != self.n:
+            raise ModelError(f"{here}residuals of {plural(len(residuals.mean), 'state')} for {plural(self.n, 'state')}")
         self.residuals = residuals
 
     def __repr__(self) -> str:
         return f"Horizon({self.steps} steps, {self.widths} half-widths)"
 
-    @property
-    def lead(self) -> tuple[int, ...]:
-        """Number of blocks, (R,); () without a schedule."""
-        return self.A.shape[:-2]
-
-    @cached_property
-    def tables(self) -> tuple[Array, Array, Array]:
-        """Nominal elements and half-widths side by side, and what T does not multiply (`terms.tables`)."""
-        return tables({name: getattr(self, name) for name in ARRAYS})
-
     def with_residuals(self, residuals: Residuals | None) -> Horizon:
         """The same envelope with other residuals."""
-        arrays = {name: getattr(self, name) for name in ARRAYS}
-        return Horizon(self.steps, **arrays, widths=self.widths, residuals=residuals)
+        return Horizon(self.steps, **self.arrays, widths=self.widths, residuals=residuals)
 
     def columns_centre_and_half(
         self, z: Array, time: Array, centre: Array, half: Array, base: Array, schedule: Schedule | None = None
@@ -241,20 +185,13 @@ class Horizon:
         `z` (n + m + axes, K): state at the begin, mean control and scheduling vector at the begin, normalised; `time`
         (K,): T, s; `centre, half` (n, K): take the result, normalised; `base` (n, K): x̂, normalised.
         """
-        n, columns = self.tables[0].shape[-2:]
-        m = columns - n - 1
-        if schedule is None:
-            centre_and_half(self.tables, z[: n + m], time, centre, half, base=base)
-        else:
-            centre_and_half(self.tables, z[: n + m], time, centre, half, schedule.table, z[n + m :], base)
+        p = self.n + self.m
+        blocks, s = (None, None) if schedule is None else (schedule.table, z[p:])
+        centre_and_half(self.tables, z[:p], time, centre, half, blocks, s, base)
 
     def to_dict(self) -> dict[str, Any]:
         """As it is in a model file."""
-        arrays = {name: getattr(self, name) for name in ARRAYS}
-        if not self.lead:
-            arrays = {name: value[None] for name, value in arrays.items()}
-        blocks = [{name: value[r].tolist() for name, value in arrays.items()} for r in range(len(arrays["v"]))]
-        found = {"steps": self.steps, "widths": self.widths, "blocks": blocks}
+        found = {"steps": self.steps, "widths": self.widths, "blocks": self.blocks_to_list()}
         return found | ({} if self.residuals is None else {"residuals": self.residuals.to_dict()})
 
     @classmethod
@@ -278,16 +215,12 @@ class Horizon:
         return tuple(found)
 
 
-def checked_horizons(horizons: Sequence[Horizon], shape: tuple[int, ...], m: int) -> tuple[Horizon, ...]:
+def checked_horizons(horizons: Sequence[Horizon], model: Elements) -> tuple[Horizon, ...]:
     """Horizons of one model, the shortest first."""
     ordered = tuple(sorted(horizons, key=lambda horizon: horizon.steps))
     steps = [horizon.steps for horizon in ordered]
     if len(set(steps)) < len(steps):
         raise ModelError(f"horizons: two have as many steps, {reprlib.repr(steps)}; give each once")
     for horizon in ordered:
-        if horizon.A.shape != shape or horizon.B.shape != (*shape[:-1], m):
-            raise ModelError(
-                f"horizon of {horizon.steps} steps: A {horizon.A.shape} and B {horizon.B.shape} do not fit the model, "
-                f"whose A is {shape}, with {plural(m, 'control')}"
-            )
+        model.fits(horizon, f"horizon of {horizon.steps} steps")
     return ordered

@@ -19,18 +19,12 @@ Programmes, bounds, model file, monitor and reports take the terms from `TERMS`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import Array, real
-from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.limits import LARGEST
-from uncertain_lti.model.objects import object_of
+from uncertain_lti.base.arrays import Array
 
 
 @dataclass(frozen=True)
@@ -107,55 +101,3 @@ def tables(arrays: dict[str, Array]) -> tuple[Array, Array, Array]:
     rows = arrays["v"].shape
     others = [arrays[term.half] for term in TERMS if not term.times_dt]
     return side_by_side("nominal"), side_by_side("half"), np.sum(others, axis=0) if len(others) > 1 else others[0]
-
-
-def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_width: bool = False) -> Array:
-    """An array of a model, held to its shape."""
-    try:
-        if isinstance(value, Sequence) and not _numbers_only(value):
-            raise TypeError
-        array = real(value)
-    except (TypeError, ValueError, OverflowError):
-        raise ModelError(f"field '{name}' is not an array of numbers") from None
-    if shape is not None and array.shape != shape:
-        if array.size == 0 and 0 in shape:
-            return np.zeros(shape)
-        raise ModelError(f"field '{name}' has shape {array.shape}; it must be {shape}")
-    if not np.isfinite(array).all():
-        raise ModelError(f"field '{name}' holds a number that is not finite")
-    if (np.abs(array) > LARGEST).any():
-        raise ModelError(f"field '{name}' holds a number above {LARGEST:g}, which the arithmetic cannot carry")
-    if half_width and (array < 0).any():
-        raise ModelError(f"field '{name}' holds a negative half-width")
-    return array
-
-
-def _numbers_only(value: Any) -> bool:
-    """No texts, truth values or nulls, which numpy would turn into numbers."""
-    if isinstance(value, (list, tuple)):
-        return all(_numbers_only(v) for v in value)
-    return not isinstance(value, (str, bool)) and value is not None
-
-
-def blocks_of(
-    data: Any,
-    name: str,
-    n: int,
-    m: int,
-    blocks: int | None,
-    names: Sequence[str] = ARRAYS,
-    needed: Collection[str] = REQUIRED,
-    also: Collection[str] = (),
-) -> dict[str, Array]:
-    """The arrays of the blocks of a schedule, or of the only one, of a model file."""
-    if not isinstance(data, list) or len(data) != (blocks or 1):
-        one_each = "" if blocks is None else ", one per knot or mode"
-        raise ModelError(f"field '{name}' must be a list of {plural(blocks or 1, 'block')}{one_each}")
-    arrays: dict[str, list[Array]] = {array: [] for array in names}
-    for r, block in enumerate(data):
-        object_of(block, f"{name}[{r}]", {*names, *also}, needed)
-        for array, values in arrays.items():
-            shape = SHAPES[array].shape(n, m)
-            value = np.zeros(shape) if block.get(array) is None else block[array]
-            values.append(checked(value, f"{name}[{r}].{array}", shape, array in HALF_WIDTHS))
-    return {array: values[0] if blocks is None else np.stack(values) for array, values in arrays.items()}

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -24,30 +24,31 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
-from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended, centre_and_half, edges
+from uncertain_lti.kernel.arithmetic import blended, edges
+from uncertain_lti.model import free_run as nominal
+from uncertain_lti.model import interchange, overview
 from uncertain_lti.model.alarm_rule import (
     JOINT,
     AlarmRule,
     Rule,
     StatisticRule,
     checked_rules,
-    containment,
     with_containment,
 )
 from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.envelope import Envelope
 from uncertain_lti.model.file import arguments, read, structure, write
-from uncertain_lti.model.horizon import Horizon, Run, Windows, checked_horizons, unbroken_over, windows_of
+from uncertain_lti.model.horizon import Horizon, Run, checked_horizons
 from uncertain_lti.model.operating_point import OperatingPoint, normalised
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature, checked_signatures
-from uncertain_lti.model.terms import ADDITIVE, ARRAYS, HALF_WIDTHS, REQUIRED, SHAPES, Term, checked, tables
-from uncertain_lti.sampling.transient import Transient, Transitions
+from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 
-class UncertainLTI:
+class UncertainLTI(Envelope):
     r"""dx/dt = (A ± ΔA) x + (B ± ΔB) u + (c ± Δc), measured with noise of at most v.
 
     The bounds of one step from a recorded sample, Leibov (2006), eqs. (6)(7) with additive terms:
@@ -135,40 +136,12 @@ class UncertainLTI:
         fit_summary: Mapping[str, Any] | None = None,
         validation: Mapping[str, Any] | None = None,
     ) -> None:
-        self.dA: Array
-        self.dB: Array
-        self.c: Array
-        self.dc: Array
-        self.v: Array
-        self.schedule = schedule
         lead = () if schedule is None else (schedule.blocks,)
-        self.A = checked(A, "A", None)
-        n = self.A.shape[-1] if self.A.ndim else 0
-        if self.A.shape != (*lead, n, n) or n == 0:
-            each = f", once for each of {plural(lead[0], 'block')}" if lead else ""
-            raise ModelError(f"A has shape {self.A.shape}; it must be square, one row per state{each}")
-        self.B = checked(B, "B", None)
-        if self.B.size == 0:
-            self.B = np.zeros((*lead, n, 0))
-        if self.B.ndim != self.A.ndim or self.B.shape[:-1] != (*lead, n):
-            each = f" of {plural(lead[0], 'block')}" if lead else ""
-            raise ModelError(f"B has shape {self.B.shape}; it must have {plural(n, 'row')}, one per state{each}")
-        m = self.B.shape[-1]
-        given: dict[str, Any] = {"dA": dA, "dB": dB, "c": c, "dc": dc, "v": v}
-        for name, value in given.items():
-            shape = (*lead, *SHAPES[name].shape(n, m))
-            half_width = name in HALF_WIDTHS
-            value = np.zeros(shape) if value is None and name not in REQUIRED else value
-            setattr(self, name, checked(value, name, shape, half_width))
-        for name in ARRAYS:
-            getattr(self, name).flags.writeable = False
-        self.horizons = checked_horizons(horizons, self.A.shape, m)
-        self.run = run
-        if run is not None and (run.A.shape, run.B.shape) != (self.A.shape, self.B.shape):
-            raise ModelError(
-                f"run: A {run.A.shape} and B {run.B.shape} do not fit the model, whose A is {self.A.shape} and B "
-                f"{self.B.shape}"
-            )
+        super().__init__({"A": A, "B": B, "dA": dA, "dB": dB, "c": c, "dc": dc, "v": v}, lead=lead)
+        n, m = self.n, self.m
+        self.schedule, self.horizons, self.run = schedule, checked_horizons(horizons, self), run
+        if run is not None:
+            self.fits(run, "run")
         if signals is None:
             signals = SignalMap(
                 tuple(Signal(f"x{i + 1}", "", f"x{i + 1}") for i in range(n)),
@@ -201,7 +174,6 @@ class UncertainLTI:
             raise ModelError(f"field 'frozen' has {len(repeats.longest_repeat_s)} numbers for {plural(n, 'state')}")
         self.fit_summary = dict(fit_summary or {})
         self.validation = dict(validation or {})
-        self.tables = tables({name: getattr(self, name) for name in ARRAYS})
 
     def _alarm(self, alarm: Sequence[Rule] | None, alarm_rule: AlarmRule | None) -> tuple[Rule, ...]:
         rules = (alarm_rule or AlarmRule(),) if alarm is None else checked_rules(alarm)
@@ -221,32 +193,6 @@ class UncertainLTI:
             if rule.kind in JOINT:
                 self.residuals_at(rule.horizon, rule.kind)
         return rules
-
-    def residuals_at(self, horizon: int = 1, kind: str = "a joint statistic") -> Residuals:
-        """Mean and covariance of the healthy utilisation of one step, or of a horizon; see `Residuals`.
-
-        Parameters
-        ----------
-        horizon : int
-            Steps; 1 or those of a horizon.
-        kind : str
-            What needs them, for errors.
-
-        Returns
-        -------
-        Residuals
-            Of the recordings of the fit.
-
-        Raises
-        ------
-        ModelError
-            They are not known.
-        """
-        found = self.residuals if horizon == 1 else self.horizons[self.steps.index(horizon)].residuals
-        if found is None:
-            over = "" if horizon == 1 else f" over {horizon} steps"
-            raise ModelError(f"alarm: {kind} needs the covariance of the utilisation{over}; fit the model again")
-        return found
 
     def with_residuals_of(self, other: UncertainLTI, instead: bool = False) -> UncertainLTI:
         """The same model with the `residuals` of another fit, as far as it has the same horizons.
@@ -280,31 +226,6 @@ class UncertainLTI:
             horizons=[h.with_residuals(chosen(h.residuals, of.get(h.steps))) for h in self.horizons],
             signatures=self.signatures,
         )
-
-    @property
-    def alarm_rule(self) -> AlarmRule:
-        """Containment of one step; `AlarmRule()` where `alarm` has none, so that nothing but flags follows from it."""
-        return containment(self.alarm) or AlarmRule()
-
-    @property
-    def n(self) -> int:
-        """Number of states."""
-        return int(self.A.shape[-1])
-
-    @property
-    def m(self) -> int:
-        """Number of controls."""
-        return int(self.B.shape[-1])
-
-    @property
-    def q(self) -> int:
-        """Number of further scheduling signals, which are neither state nor control."""
-        return len(self.signals.scheduling)
-
-    @property
-    def steps(self) -> tuple[int, ...]:
-        """Steps of each horizon, the shortest first."""
-        return tuple(horizon.steps for horizon in self.horizons)
 
     @cached_property
     def blocks(self) -> tuple[UncertainLTI, ...]:
@@ -372,17 +293,6 @@ class UncertainLTI:
         """Names of the controls."""
         return tuple(s.name for s in self.signals.controls)
 
-    def additive(self) -> list[tuple[Term, Array, Array]]:
-        """Additive terms of the model.
-
-        Returns
-        -------
-        list of (Term, array (n,), array (n,)), or arrays (R, n) with a schedule
-            Each with its nominal elements, 0 where it has none, and its half-widths.
-        """
-        zeros = np.zeros_like(self.v)
-        return [(t, getattr(self, t.nominal) if t.nominal else zeros, getattr(self, t.half)) for t in ADDITIVE]
-
     def __repr__(self) -> str:
         text = f"UncertainLTI({plural(self.n, 'state')}: {', '.join(self.state_names)}; "
         text += f"{plural(self.m, 'control')}"
@@ -396,12 +306,6 @@ class UncertainLTI:
             count = plural(self.fit_summary.get("transitions"), "transition")
             text += f"; fitted by {self.fit_summary['criterion']} to {count}"
         return text + ")"
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        from uncertain_lti.model.overview import overview
-
-        return overview(self)
 
     # --- one-step bounds ---
 
@@ -449,311 +353,6 @@ class UncertainLTI:
         self.columns_centre_and_half(np.vstack(flat), np.broadcast_to(dt, lead).reshape(count), centre, half)
         return centre.T.reshape(*lead, self.n), half.T.reshape(*lead, self.n)
 
-    def columns_centre_and_half(
-        self, z: Array, dt: Array, centre: Array, half: Array, base: Array | None = None
-    ) -> None:
-        """`centre_and_half` of samples in columns, into given arrays.
-
-        Parameters
-        ----------
-        z : array (n + m + q, K)
-            Normalised [x; u; s].
-        dt : array (K,)
-            s.
-        centre, half : array (n, K)
-            Take the result.
-        base : array (n, K), optional
-            What the rates are added to; default the states.
-        """
-        z, rows = np.asarray(z, dtype=np.float64), self.n + self.m
-        if self.schedule is None:
-            centre_and_half(self.tables, z[:rows], dt, centre, half, base=base)
-        else:
-            blocks, s = self.schedule.table, z[self._positions]
-            centre_and_half(self.tables, z[:rows], dt, centre, half, blocks, s, base)
-
-    def normalised_columns(self, steps: Transitions) -> Array:
-        """[x; u; s] of transitions.
-
-        Parameters
-        ----------
-        steps : Transitions
-            K of them, recorded units.
-
-        Returns
-        -------
-        array (n + m + q, K)
-            Normalised.
-        """
-        point = self.operating_point
-        parts = point.normalise_x(steps.x), point.normalise_u(steps.u), point.normalise_s(steps.s)
-        return np.vstack([part.T for part in parts])
-
-    def regime(self, z: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Whether the blocks that hold at some samples can be trusted.
-
-        Parameters
-        ----------
-        z : array (n + m + q, K)
-            Normalised [x; u; s].
-
-        Returns
-        -------
-        listed : array of bool (K,)
-            There is a block: every mode is listed in the model. All, without a schedule.
-        unknown : array of bool (K,)
-            A scheduling signal lies beyond its end knots, or no recording visited a block that holds. None, without a
-            schedule.
-        """
-        count = z.shape[1]
-        if self.schedule is None:
-            return np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
-        s = z[self._positions]
-        places, weights = self.schedule.corners(s)
-        known = np.array([data.known for data in self.block_data])
-        return places[0] >= 0, self.schedule.unknown(s, places, weights, known)
-
-    @property
-    def scheduling_positions(self) -> tuple[int, ...]:
-        """Where the scheduling signals are in [x; u; s], one per axis; empty without a schedule."""
-        return tuple(self._positions)
-
-    def main_block(self, z: Array) -> NDArray[np.intp]:
-        """The block that has the largest weight, of two alike the first.
-
-        Parameters
-        ----------
-        z : array (n + m + q, K)
-            Normalised [x; u; s].
-
-        Returns
-        -------
-        array of int (K,)
-            Numbers of blocks; -1 for a mode that is not listed, and 0 without a schedule.
-        """
-        if self.schedule is None:
-            return np.zeros(z.shape[1], dtype=np.intp)
-        return self.schedule.main_block(z[self._positions])
-
-    def why_unknown(self, values: Sequence[float]) -> str:
-        """In words, why the regime of a sample is unknown.
-
-        Parameters
-        ----------
-        values : sequence of float (n + m + q,)
-            [x; u; s], recorded units.
-
-        Returns
-        -------
-        str
-            Names the scheduling signals, their values and the knots; empty where the regime is known.
-        """
-        if self.schedule is None:
-            return ""
-        found = []
-        point = self.operating_point
-        z = normalised(np.asarray(values, dtype=np.float64), point.steady, point.scale)[self._positions]
-        knots = self.schedule.recorded_values(self.signals.signals)
-        for axis, at, i, s in zip(self.schedule.axes, knots, self._positions, z.tolist(), strict=True):
-            if axis.knots and not axis.knots[0] <= s <= axis.knots[-1]:
-                found.append(f"{axis.signal} = {values[i]:.6g} is beyond its knots {at[0]:.6g} to {at[-1]:.6g}")
-        places, weights = (a[:, 0] for a in self.schedule.corners(z[:, None]))
-        for r in places[(weights > 0) & (places >= 0)].tolist():
-            if not self.block_data[r].known:
-                found.append(f"no recording visited {self.block_name(r)}")
-        return ", and ".join(found)
-
-    def why_unlisted(self, values: Sequence[float]) -> str:
-        """In words, which mode of a sample the model does not list.
-
-        Parameters
-        ----------
-        values : sequence of float (n + m + q,)
-            [x; u; s], recorded units.
-
-        Returns
-        -------
-        str
-            Names the scheduling signals, their values and the modes; empty where every mode is listed.
-        """
-        if self.schedule is None:
-            return ""
-        found = []
-        point = self.operating_point
-        z = normalised(np.asarray(values, dtype=np.float64), point.steady, point.scale)[self._positions]
-        modes = self.schedule.recorded_values(self.signals.signals)
-        for axis, at, i, s in zip(self.schedule.axes, modes, self._positions, z.tolist(), strict=True):
-            if axis.modes and s not in axis.modes:
-                listed = ", ".join(f"{mode:.6g}" for mode in at)
-                found.append(f"{axis.signal} = {values[i]:.6g} is not among the modes of the model, {listed}")
-        return ", and ".join(found)
-
-    def block_name(self, r: int) -> str:
-        """Where one block holds, in words.
-
-        Parameters
-        ----------
-        r : int
-            Number of the block.
-
-        Returns
-        -------
-        str
-            `fan_speed = 0.92`, for example, in recorded units; empty without a schedule.
-        """
-        return "" if self.schedule is None else self.schedule.block_name(r, self.signals.signals)
-
-    def own_rates(self, z: Array) -> Array:
-        """The elements a_ii of the nominal model, blended where there is a schedule.
-
-        Parameters
-        ----------
-        z : array (n + m + q, K)
-            Normalised [x; u; s].
-
-        Returns
-        -------
-        array (n, K)
-            1/s; NaN for a mode that is not listed.
-        """
-        own = np.diagonal(self.A, axis1=-2, axis2=-1)
-        if self.schedule is None:
-            return np.repeat(own[:, None], z.shape[1], axis=1)
-        return np.asarray(blended(own, *self.schedule.corners(z[self._positions])))
-
-    def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
-        """What judges one transition after another by the bounds of this model.
-
-        Parameters
-        ----------
-        margin : float
-            Multiplies the half-widths.
-        counted : array of bool (n,)
-            States whose violations count.
-
-        Returns
-        -------
-        Judge
-            With the same bits as `bounds`.
-        """
-        return self._judge(self.tables, margin, counted)
-
-    def _judge(self, elements: tuple[Array, Array, Array], margin: float, counted: NDArray[np.bool_]) -> Judge:
-        point, domain = self.operating_point, self.domain
-        return Judge(
-            *elements,
-            point.steady,
-            point.scale,
-            domain.least,
-            domain.greatest,
-            margin,
-            counted,
-            None if domain.measure is None else domain.measure.occupied,
-            self.schedule,
-            self._positions,
-            [data.known for data in self.block_data],
-        )
-
-    def _runner(self) -> Judge:
-        """Of the elements that are run over the windows of the horizons."""
-        return self._judge(self.tables if self.run is None else self.run.tables, 1.0, np.ones(self.n, dtype=bool))
-
-    def runs_of(self, judge: Judge) -> Runs | None:
-        """What judges the state several steps after each measured one.
-
-        Parameters
-        ----------
-        judge : Judge
-            Of `judge_of`.
-
-        Returns
-        -------
-        Runs or None
-            With the same bits as `over_horizons`; None without horizons.
-        """
-        if not self.horizons:
-            return None
-        return Runs(judge, self.horizons, None if self.run is None else self._runner())
-
-    def windows(self, k: NDArray[np.intp], z: Array, dt: Array, steps: Sequence[int]) -> Iterator[Windows]:
-        """`run`, or the nominal model, taken over so many transitions in a row.
-
-        Parameters
-        ----------
-        k : array of int (N,)
-            Sample that each transition begins with; where one does not follow the one before, windows end.
-        z : array (n + m + q, N)
-            Normalised [x; u; s] of the transitions, in order of time.
-        dt : array (N,)
-            s.
-        steps : sequence of int
-            Lengths, increasing.
-
-        Returns
-        -------
-        iterator of Windows
-            Of each length; good until the next one is asked for.
-        """
-        judge, vectors = self._runner(), z[self._positions]
-        begin = unbroken_over(k, vectors, self.schedule)
-        return windows_of(judge, z, vectors, dt, begin, steps, self.n, self.m)
-
-    def over_horizons(self, k: NDArray[np.intp], z: Array, dt: Array, x_next: Array) -> tuple[Array, Array]:
-        """Where in the envelopes over several steps the arrivals lie, and how far from their centres.
-
-        Parameters
-        ----------
-        k : array of int (N,)
-            Sample that each transition begins with.
-        z : array (n + m + q, N)
-            Normalised [x; u; s] of the transitions, in order of time.
-        dt : array (N,)
-            s.
-        x_next : array (N, n)
-            Normalised states at their ends.
-
-        Returns
-        -------
-        array (N, horizons, n)
-            (x - centre) / half, of a size of at most 1 exactly where contained; NaN where the window of the horizon is
-            broken.
-        array (N, horizons, n)
-            x - centre, normalised; NaN likewise.
-        """
-        found = np.full((2, len(dt), len(self.horizons), self.n), np.nan)
-        utilisation, residual = found
-        for j, (windows, centre, half) in enumerate(self.envelopes(k, z, dt)):
-            left, there = arrivals(x_next[windows.last].T, centre, half)
-            residual[windows.last, j], utilisation[windows.last, j] = left.T, there.T
-        return utilisation, residual
-
-    def envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:
-        """Envelopes over several steps.
-
-        Parameters
-        ----------
-        k : array of int (N,)
-            As of `windows`.
-        z : array (n + m + q, N)
-            As of `windows`.
-        dt : array (N,)
-            s.
-
-        Yields
-        ------
-        Windows
-            Of each horizon; good until the next one is asked for.
-        array (n, K)
-            Centre at their ends, normalised.
-        array (n, K)
-            Half-width there, normalised.
-        """
-        windows_of_each = self.windows(k, z, dt, self.steps)
-        for horizon, windows in zip(self.horizons, windows_of_each, strict=True):
-            centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
-            horizon.columns_centre_and_half(windows.z, windows.time, centre, half, windows.run, self.schedule)
-            yield windows, centre, half
-
     def bounds(
         self, x: ArrayLike, u: ArrayLike, dt: ArrayLike, margin: float = 1.0, s: ArrayLike | None = None
     ) -> tuple[Array, Array]:
@@ -786,86 +385,9 @@ class UncertainLTI:
 
     # --- the nominal model on its own ---
 
-    def simulate(self, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLike | None = None) -> Array:
-        """Free run of the nominal model, x_{k+1} = x_k + Δt_k (A x_k + B u_k + c), as in eq. (3) with ΔA = ΔB = 0.
-
-        What a signal takes from earlier samples of a state (lag, diff, rate) follows the run, as soon as the run has
-        these samples.
-
-        Parameters
-        ----------
-        x0 : array (n,)
-            Normalised state at t_0.
-        u : array (N, m)
-            Normalised controls.
-        dt : float or array (N,)
-            Δt_k, s.
-        s : array (N, q), optional
-            Normalised further scheduling signals; for models that have some. A schedule on a state follows the run.
-
-        Returns
-        -------
-        array (N+1, n)
-            Normalised states; infinite or NaN where an unstable model runs away.
-        """
-        from uncertain_lti.model.free_run import simulated
-
-        return simulated(self, x0, u, dt, s)
-
-    def free_run(self, transient: Transient) -> Transient:
-        """Free run of the nominal model over a recording: its controls, and nothing of its states but the first.
-
-        The run begins again from the recorded sample at the start of every segment, and after every sample that is not
-        finite. `simulate` does the same for arrays of normalised quantities.
-
-        Parameters
-        ----------
-        transient : Transient
-            In recorded units.
-
-        Returns
-        -------
-        Transient
-            With the states of the run, in recorded units; NaN where there is no run.
-
-        Raises
-        ------
-        ModelError
-            The transient has other numbers of signals than the model.
-        """
-        from uncertain_lti.model.free_run import free_run
-
-        x = self.operating_point.recorded_x(free_run(self, transient))
-        return transient.replace(x=x, name=f"{transient.name}, free run of the model")
-
-    def discrepancy(self, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
-        """Discrepancies (4) and (5) between the free-running nominal model and a recorded transient.
-
-        The run starts again from the recorded sample at the start of every segment, and after every sample that
-        is not finite.
-
-        Parameters
-        ----------
-        transient : Transient
-            In recorded units.
-        W : array (n,), (N, n) or (N, n, n), optional
-            Weights of the arrival samples; default ones.
-
-        Returns
-        -------
-        sum_of_squares : float
-            Eq. (4), over k = 1..N.
-        largest : array (n,)
-            Eq. (5) for each state.
-
-        Raises
-        ------
-        ModelError
-            W has another shape.
-        """
-        from uncertain_lti.model.free_run import discrepancy
-
-        return discrepancy(self, transient, W)
+    simulate = nominal.simulate
+    free_run = nominal.free_run
+    discrepancy = nominal.discrepancy
 
     def eigenvalues(self) -> NDArray[np.complex128]:
         """Eigenvalues of A.
@@ -898,12 +420,10 @@ class UncertainLTI:
         ModelError
             dt is left out and the model has no median step.
         """
-        from uncertain_lti.model.free_run import recursion
-
         dt = self.sampling.dt_median if dt is None else dt
         if dt is None:
             raise ModelError("spectral radius: the model has no dt_median; give dt")
-        return float(np.abs(np.linalg.eigvals(recursion(self, dt))).max())
+        return float(np.abs(np.linalg.eigvals(nominal.recursion(self, dt))).max())
 
     def replace(self, **changes: Any) -> UncertainLTI:
         """The same model with some constructor arguments replaced.
@@ -933,79 +453,11 @@ class UncertainLTI:
 
     # --- other tools ---
 
-    def to_control(self, dt: float | None = None, recorded: bool = False, knot: int | None = None) -> Any:
-        """The nominal model as a `control.StateSpace`; see `interchange.to_control`.
-
-        Parameters
-        ----------
-        dt : float, optional
-            As in `interchange.to_control`.
-        recorded : bool, default False
-            As in `interchange.to_control`.
-        knot : int, optional
-            As in `interchange.to_control`.
-
-        Returns
-        -------
-        control.StateSpace, or list of it
-            The nominal model; with a schedule and without `knot` one system per block. That between the knots is
-            `model.at(...).to_control()`.
-        """
-        from uncertain_lti.model.interchange import to_control
-
-        return to_control(self, dt, recorded, knot)
-
-    @staticmethod
-    def from_control(system: Any, **options: Any) -> UncertainLTI:
-        """From a `control.StateSpace` and half-widths; see `interchange.from_control`.
-
-        Parameters
-        ----------
-        system : control.StateSpace
-            As in `interchange.from_control`.
-        **options : object
-            Further arguments of `interchange.from_control`.
-
-        Returns
-        -------
-        UncertainLTI
-            The model.
-        """
-        from uncertain_lti.model.interchange import from_control
-
-        model: UncertainLTI = from_control(UncertainLTI, system, **options)
-        return model
-
-    def save_mat(self, path: str | os.PathLike[str]) -> None:
-        """Write a MATLAB file; see `interchange.save_mat`.
-
-        Parameters
-        ----------
-        path : path
-            The file.
-        """
-        from uncertain_lti.model.interchange import save_mat
-
-        save_mat(self, path)
-
-    @staticmethod
-    def load_mat(path: str | os.PathLike[str]) -> UncertainLTI:
-        """Read a MATLAB file; see `interchange.load_mat`.
-
-        Parameters
-        ----------
-        path : path
-            The file.
-
-        Returns
-        -------
-        UncertainLTI
-            The model.
-        """
-        from uncertain_lti.model.interchange import load_mat
-
-        model: UncertainLTI = load_mat(UncertainLTI, path)
-        return model
+    to_control = interchange.to_control
+    from_control = classmethod(interchange.from_control)
+    save_mat = interchange.save_mat
+    load_mat = classmethod(interchange.load_mat)
+    _repr_html_ = overview.overview
 
     # --- the file ---
 

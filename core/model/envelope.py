@@ -1,0 +1,224 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Envelope: what judging asks of a model, its bounds in columns, regimes, and windows of several steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended, centre_and_half
+from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
+from uncertain_lti.model.domain import Domain
+from uncertain_lti.model.elements import Elements
+from uncertain_lti.model.horizon import Horizon, Run, Windows, unbroken_over, windows_of
+from uncertain_lti.model.operating_point import OperatingPoint, normalised
+from uncertain_lti.model.residuals import Residuals
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.model.terms import ADDITIVE, Term
+from uncertain_lti.sampling.transient import Transitions
+from uncertain_lti.signals.signal_map import SignalMap
+
+
+class Envelope(Elements):
+    """The elements of a model over one step and several, with what they hold for."""
+
+    schedule: Schedule | None
+    block_data: tuple[BlockData, ...]
+    horizons: tuple[Horizon, ...]
+    run: Run | None
+    signals: SignalMap
+    operating_point: OperatingPoint
+    domain: Domain
+    residuals: Residuals | None
+    alarm: tuple[Rule, ...]
+    _positions: list[int]
+
+    @property
+    def alarm_rule(self) -> AlarmRule:
+        """Containment of one step; `AlarmRule()` where `alarm` has none, so that nothing but flags follows from it."""
+        return containment(self.alarm) or AlarmRule()
+
+    @property
+    def q(self) -> int:
+        """Number of further scheduling signals, which are neither state nor control."""
+        return len(self.signals.scheduling)
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """Steps of each horizon, the shortest first."""
+        return tuple(horizon.steps for horizon in self.horizons)
+
+    def additive(self) -> list[tuple[Term, Array, Array]]:
+        """Additive terms with their nominal elements, 0 where there are none, and half-widths, (n,) or (R, n) each."""
+        zeros = np.zeros_like(self.v)
+        return [(t, getattr(self, t.nominal) if t.nominal else zeros, getattr(self, t.half)) for t in ADDITIVE]
+
+    def residuals_at(self, horizon: int = 1, kind: str = "a joint statistic") -> Residuals:
+        """Mean and covariance of the healthy utilisation of one step, or of a horizon; `kind`: what needs them."""
+        found = self.residuals if horizon == 1 else self.horizons[self.steps.index(horizon)].residuals
+        if found is None:
+            over = "" if horizon == 1 else f" over {horizon} steps"
+            raise ModelError(f"alarm: {kind} needs the covariance of the utilisation{over}; fit the model again")
+        return found
+
+    def columns_centre_and_half(
+        self, z: Array, dt: Array, centre: Array, half: Array, base: Array | None = None
+    ) -> None:
+        """Centre and half-width (n, K) of the bounds, into given arrays.
+
+        `z` (n + m + q, K): normalised [x; u; s]; `dt` (K,): s; `base` (n, K): what the rates are added to; default the
+        states.
+        """
+        z, rows = np.asarray(z, dtype=np.float64), self.n + self.m
+        if self.schedule is None:
+            centre_and_half(self.tables, z[:rows], dt, centre, half, base=base)
+        else:
+            blocks, s = self.schedule.table, z[self._positions]
+            centre_and_half(self.tables, z[:rows], dt, centre, half, blocks, s, base)
+
+    def normalised_columns(self, steps: Transitions) -> Array:
+        """Normalised [x; u; s] (n + m + q, K) of K transitions in recorded units."""
+        point = self.operating_point
+        parts = point.normalise_x(steps.x), point.normalise_u(steps.u), point.normalise_s(steps.s)
+        return np.vstack([part.T for part in parts])
+
+    def regime(self, z: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Of samples z (n + m + q, K) whether every mode is listed, and whether the regime is unknown.
+
+        It is where a scheduling signal lies beyond its end knots, or no recording visited a block that holds.
+        """
+        count = z.shape[1]
+        if self.schedule is None:
+            return np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+        s = z[self._positions]
+        places, weights = self.schedule.corners(s)
+        known = np.array([data.known for data in self.block_data])
+        return places[0] >= 0, self.schedule.unknown(s, places, weights, known)
+
+    @property
+    def scheduling_positions(self) -> tuple[int, ...]:
+        """Where the scheduling signals are in [x; u; s], one per axis; empty without a schedule."""
+        return tuple(self._positions)
+
+    def main_block(self, z: Array) -> NDArray[np.intp]:
+        """The block of the largest weight at z (n + m + q, K), of two alike the first; -1 for an unlisted mode."""
+        if self.schedule is None:
+            return np.zeros(z.shape[1], dtype=np.intp)
+        return self.schedule.main_block(z[self._positions])
+
+    def why_unlisted(self, values: Sequence[float]) -> str:
+        """Which mode of a sample [x; u; s] in recorded units the model does not list, in words; empty where none."""
+        found = []
+        for axis, at, value, s in self._places(values):
+            if axis.modes and s not in axis.modes:
+                listed = ", ".join(f"{mode:.6g}" for mode in at)
+                found.append(f"{axis.signal} = {value:.6g} is not among the modes of the model, {listed}")
+        return ", and ".join(found)
+
+    def why_unknown(self, values: Sequence[float]) -> str:
+        """Why the regime of a sample [x; u; s] in recorded units is unknown, in words; empty where it is known."""
+        if self.schedule is None:
+            return ""
+        there = self._places(values)
+        found = [
+            f"{axis.signal} = {value:.6g} is beyond its knots {at[0]:.6g} to {at[-1]:.6g}"
+            for axis, at, value, s in there
+            if axis.knots and not axis.knots[0] <= s <= axis.knots[-1]
+        ]
+        places, weights = (a[:, 0] for a in self.schedule.corners([[s] for *_, s in there]))
+        visited = places[(weights > 0) & (places >= 0)].tolist()
+        found += [f"no recording visited {self.block_name(r)}" for r in visited if not self.block_data[r].known]
+        return ", and ".join(found)
+
+    def _places(self, values: Sequence[float]) -> list[tuple[Axis, Array, float, float]]:
+        """Each axis with its knots or modes, and its signal in a sample, in recorded units and normalised."""
+        if self.schedule is None:
+            return []
+        point, some = self.operating_point, self._positions
+        s = normalised(np.asarray(values, dtype=np.float64), point.steady, point.scale)[some].tolist()
+        at = self.schedule.recorded_values(self.signals.signals)
+        return list(zip(self.schedule.axes, at, [values[i] for i in some], s, strict=True))
+
+    def block_name(self, r: int) -> str:
+        """Where one block holds, in recorded units, such as `fan_speed = 0.92`; empty without a schedule."""
+        return "" if self.schedule is None else self.schedule.block_name(r, self.signals.signals)
+
+    def own_rates(self, z: Array) -> Array:
+        """Elements a_ii (n, K) of the nominal model at samples z (n + m + q, K), 1/s; NaN for an unlisted mode."""
+        own = np.diagonal(self.A, axis1=-2, axis2=-1)
+        if self.schedule is None:
+            return np.repeat(own[:, None], z.shape[1], axis=1)
+        return np.asarray(blended(own, *self.schedule.corners(z[self._positions])))
+
+    def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
+        """What judges one transition after another, as `bounds` does; `counted` (n,): states whose violations count."""
+        return self._judge(self.tables, margin, counted)
+
+    def _judge(self, elements: tuple[Array, Array, Array], margin: float, counted: NDArray[np.bool_]) -> Judge:
+        point, domain = self.operating_point, self.domain
+        return Judge(
+            *elements,
+            point.steady,
+            point.scale,
+            domain.least,
+            domain.greatest,
+            margin,
+            counted,
+            None if domain.measure is None else domain.measure.occupied,
+            self.schedule,
+            self._positions,
+            [data.known for data in self.block_data],
+        )
+
+    def _runner(self) -> Judge:
+        """Of the elements that are run over the windows of the horizons."""
+        return self._judge(self.tables if self.run is None else self.run.tables, 1.0, np.ones(self.n, dtype=bool))
+
+    def runs_of(self, judge: Judge) -> Runs | None:
+        """What judges the state several steps after a measured one, as `over_horizons` does, if there are any."""
+        if not self.horizons:
+            return None
+        return Runs(judge, self.horizons, None if self.run is None else self._runner())
+
+    def windows(self, k: NDArray[np.intp], z: Array, dt: Array, steps: Sequence[int]) -> Iterator[Windows]:
+        """What is run, over so many transitions in a row, of each length; good until the next one is asked for.
+
+        `k` (N,): sample that each transition begins with; where one does not follow the one before, windows end; `z`
+        (n + m + q, N): normalised, in order of time; `dt` (N,): s; `steps`: lengths, increasing.
+        """
+        judge, vectors = self._runner(), z[self._positions]
+        begin = unbroken_over(k, vectors, self.schedule)
+        return windows_of(judge, z, vectors, dt, begin, steps, self.n, self.m)
+
+    def over_horizons(self, k: NDArray[np.intp], z: Array, dt: Array, x_next: Array) -> tuple[Array, Array]:
+        """Where the arrivals x_next (N, n) lie in the envelopes over several steps, and how far from their centres.
+
+        `k`, `z`, `dt`: as of `windows`. Both (N, horizons, n): (x - centre) / half, of a size of at most 1 exactly
+        where contained, and x - centre, normalised; NaN where the window of the horizon is broken.
+        """
+        found = np.full((2, len(dt), len(self.horizons), self.n), np.nan)
+        utilisation, residual = found
+        for j, (windows, centre, half) in enumerate(self.envelopes(k, z, dt)):
+            left, there = arrivals(x_next[windows.last].T, centre, half)
+            residual[windows.last, j], utilisation[windows.last, j] = left.T, there.T
+        return utilisation, residual
+
+    def envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:
+        """Windows of each horizon, with centre and half-width (n, K) of its envelope; arguments as of `windows`."""
+        windows_of_each = self.windows(k, z, dt, self.steps)
+        for horizon, windows in zip(self.horizons, windows_of_each, strict=True):
+            centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
+            horizon.columns_centre_and_half(windows.z, windows.time, centre, half, windows.run, self.schedule)
+            yield windows, centre, half
