@@ -26,7 +26,7 @@ import numpy as np
 from bag_writer import JAZZY, Layout, Message, Topic, cdr, float64, header, message, write
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
-from uncertain_lti.cli.deployed import check_recording
+from uncertain_lti.cli.judge import check_recording
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.horizon import Horizon, Run

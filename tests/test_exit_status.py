@@ -98,7 +98,7 @@ def test_a_robot_that_only_monitors_is_told_what_recordings_need(folder, package
         assert package not in ("lz4", "mcap")
 
 
-@pytest.mark.parametrize("module", ["uncertain_lti.base.english", "uncertain_lti.cli.check", "argparse"])
+@pytest.mark.parametrize("module", ["uncertain_lti.base.english", "uncertain_lti.cli.judge", "argparse"])
 def test_a_damaged_installation_is_no_alarm(module):
     start = "from uncertain_lti.cli.program import main"
     broken = f"import sys; {start}; sys.modules[{module!r}] = None; sys.exit(main())"
@@ -212,16 +212,16 @@ def test_a_folder_that_cannot_be_written(folder, tmp_path, what):
 
 
 def test_a_fault_of_the_program_is_no_alarm(folder, monkeypatch, capsys):
-    from uncertain_lti.cli import check
+    from uncertain_lti.cli import judge
 
     def broken(name):
         raise KeyError("nobody expected this")
 
-    monkeypatch.setattr(check, "load_model", broken)
+    monkeypatch.setattr(judge, "load_model", broken)
     assert main(commands(folder)["check"]) == 70
     said = capsys.readouterr().err
     assert "Traceback" in said and "fault of the program" in said.splitlines()[-1]
-    monkeypatch.setattr(check, "load_model", lambda name: bytearray(1 << 62))
+    monkeypatch.setattr(judge, "load_model", lambda name: bytearray(1 << 62))
     assert main(commands(folder)["check"]) == 2
     assert "not enough memory" in capsys.readouterr().err
 

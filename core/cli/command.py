@@ -47,8 +47,8 @@ GROUP = (
 class Command:
     """One command of `uncertain-lti`.
 
-    Each file of this room declares one as `COMMAND`, and `main.COMMANDS` lists the files. The file imports at its top
-    nothing that takes time to load: every command is declared whenever one is run.
+    The files of this room declare them, and `main.COMMANDS` lists them. A file imports at its top nothing that
+    takes time to load: every command is declared whenever one is run.
 
     `name`: the word on the command line; `help`: what the command does, for the list of commands; `add_arguments`:
     declares the arguments on a parser; `run`: runs the command with the parsed options and returns the exit status.
@@ -150,6 +150,11 @@ def add_output(parser: argparse.ArgumentParser, required: bool) -> None:
 def add_force(parser: argparse.ArgumentParser) -> None:
     """Declare the option that lets `model_target` replace a model."""
     parser.add_argument("--force", action="store_true", help="write over a model that is there already")
+
+
+def add_json(parser: argparse.ArgumentParser, about: str = "print JSON") -> None:
+    """Declare the output for programs."""
+    parser.add_argument("--json", action="store_true", help=about)
 
 
 def read_labelled(

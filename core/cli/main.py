@@ -27,44 +27,14 @@ from uncertain_lti import __version__
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.packages import absent
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import (
-    check,
-    completion,
-    fit,
-    info,
-    init,
-    layout,
-    plot,
-    report,
-    reproduce,
-    ros,
-    signature,
-    start,
-    topics,
-    tune,
-    validate,
-)
+from uncertain_lti.cli import delegated, fit, judge, signature, start, tune, validate
 from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output
 
 COMMANDS: tuple[Command, ...] = (
-    start.COMMAND,
-    topics.COMMAND,
-    init.COMMAND,
-    fit.COMMAND,
-    tune.COMMAND,
-    check.COMMAND,
-    report.COMMAND,
-    plot.COMMAND,
-    layout.COMMAND,
-    validate.COMMAND,
-    signature.COMMAND,
-    info.COMMAND,
-    reproduce.COMMAND,
-    ros.PLAY,
-    ros.RECORD,
-    ros.DEMO,
-    completion.COMMAND,
-)
+    start.START, start.TOPICS, start.INIT, fit.COMMAND, tune.COMMAND, judge.CHECK, judge.REPORT, judge.PLOT,
+    delegated.LAYOUT, validate.COMMAND, signature.COMMAND, delegated.INFO, delegated.REPRODUCE, delegated.PLAY,
+    delegated.RECORD, delegated.DEMO, delegated.COMPLETION,
+)  # fmt: skip
 """Every command, in the order of the help."""
 
 

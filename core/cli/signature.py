@@ -18,6 +18,7 @@ from uncertain_lti.cli.command import (
     DONE,
     SILENT,
     Command,
+    add_json,
     add_model,
     add_output,
     add_recordings,
@@ -27,20 +28,17 @@ from uncertain_lti.cli.command import (
     print_summary,
     read_labelled,
 )
-from uncertain_lti.cli.deployed import add_margin_arguments
+from uncertain_lti.cli.judge import add_margin_arguments
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `uncertain-lti signature`."""
     add_model(parser)
-    add_recordings(
-        parser,
-        about="a fault, and a recording of it in which the alarm is raised; several recordings may have one label",
-        metavar="LABEL=BAG",
-    )
+    about = "a fault, and a recording of it in which the alarm is raised; several recordings may have one label"
+    add_recordings(parser, about=about, metavar="LABEL=BAG")
     add_output(parser, required=True)
     add_margin_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add_json(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -61,24 +59,18 @@ def run(options: argparse.Namespace) -> int:
     learnt = learn_signatures(model, checked, options.force)
     model.replace(signatures=learnt.signatures).save(output)
     if options.json:
-        print_json(
-            {
-                "model": str(output),
-                "signatures": [
-                    {"label": s.label, "recordings": s.recordings, "verdicts": s.verdicts, "steps": list(s.steps)}
-                    for s in learnt.signatures
-                ],
-                "named": [{"recording": r, "label": label, "named": found} for r, label, found in learnt.named],
-                "alike": [{"labels": [a, b], "match": match} for a, b, match in learnt.alike],
-            }
-        )
+        faults = [
+            {"label": s.label, "recordings": s.recordings, "verdicts": s.verdicts, "steps": list(s.steps)}
+            for s in learnt.signatures
+        ]
+        named = [{"recording": r, "label": label, "named": found} for r, label, found in learnt.named]
+        alike = [{"labels": [a, b], "match": match} for a, b, match in learnt.alike]
+        print_json({"model": str(output), "signatures": faults, "named": named, "alike": alike})
     else:
         print_summary(options, signature_text(learnt))
         print_summary(options, f"model written to {output}")
     return DONE
 
 
-COMMAND = Command(
-    "signature", "learn what known faults look like from labelled recordings", add_arguments, run, quiet=SILENT
-)
-"""The command."""
+_HELP = "learn what known faults look like from labelled recordings"
+COMMAND = Command("signature", _HELP, add_arguments, run, quiet=SILENT)

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Command `uncertain-lti start`: from recordings to a monitor, by `init`, `fit` and `report` as they are."""
+"""Commands `topics`, `init` and `start`: from recordings that nobody described yet to a signals file and a monitor."""
 
 from __future__ import annotations
 
@@ -20,36 +20,137 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
+from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.cli.command import (
+    DONE,
     SILENT,
     Command,
     add_force,
+    add_json,
     add_recordings,
     model_target,
     print_json,
+    print_notes,
     print_summary,
 )
 
+_LONGEST_NAME = 200  # letters
+_LONGEST_LIST = 100_000
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti start`."""
+
+# --- topics ----------------------------------------------------------------------------------------------------------
+
+
+def _add_topics(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bag", metavar="BAG", help="recording (MCAP, .db3, .bag, table), or folder of one")
+    add_json(parser)
+
+
+def run_topics(options: argparse.Namespace) -> int:
+    """Print the topics of a recording and what each holds."""
+    from uncertain_lti.recordings.formats import open_recording
+    from uncertain_lti.reports.tables import number, table
+
+    bag = open_recording(options.bag)
+    facts = bag.facts(options.progress.iterate("reading"))
+    if options.json:
+        held = [
+            {**{key: getattr(f.info, key) for key in ("topic", "type", "count", "readable", "reason")}, "rate": f.rate,
+             "bursts": f.bursts, "largest_gap": f.largest_gap, "header_stamps": f.stamps,
+             "log_minus_header": f.stamp_offset, "fields": list(f.fields)}
+            for f in facts
+        ]  # fmt: skip
+        print_json({"recording": str(bag.path), "warnings": bag.warnings, "topics": held})
+        return DONE
+    print_notes(options, bag.warnings)
+    rows = []
+    for f in facts:
+        stamps: str = f.stamps
+        if f.stamp_offset is not None and abs(f.stamp_offset) > 1.0:
+            stamps += f", log {f.stamp_offset:+.0f} s"
+        name, kind = printable(f.info.topic, _LONGEST_NAME), printable(f.info.type, _LONGEST_NAME)
+        rate = f"{number(f.rate)} in bursts" if f.bursts else number(f.rate)
+        rows.append([name, kind, str(f.info.count), rate, number(f.largest_gap), stamps])
+    print(table(("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps"), rows))
+    for f in facts:
+        if not f.info.readable or f.info.reason:
+            print(printable(f"{printable(f.info.topic, _LONGEST_NAME)}: {f.info.reason}"))
+        if f.fields:
+            print(printable(f"{printable(f.info.topic, _LONGEST_NAME)}: {', '.join(f.fields)}", _LONGEST_LIST))
+    return DONE
+
+
+# --- init ------------------------------------------------------------------------------------------------------------
+
+
+def _add_init(parser: argparse.ArgumentParser) -> None:
+    add, field = parser.add_argument, "TOPIC[:FIELD]"
+    add_recordings(parser, " of the same machine")
+    add("--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)")
+    states = "what may be a state, in place of what looks like one; * stands for any letters"
+    add("--states", metavar=field, nargs="+", default=[], help=states)
+    add("--controls", metavar=field, nargs="+", default=[], help="likewise for the controls")
+    like = "of many alike (joints, motors) the one that the file is drawn up for, such as j3"
+    add("--like", metavar="MEMBER", default="", help=like)
+    add_json(parser, "print what is proposed as JSON, with the text of the file")
+
+
+def run_init(options: argparse.Namespace) -> int:
+    """Write or print the proposed signals file."""
+    from uncertain_lti.base.english import shortlist
+    from uncertain_lti.base.files import whole_file
+    from uncertain_lti.proposal.init import propose
+
+    output = options.output
+    if output is not None and os.path.exists(output):
+        raise SignalError(f"{output}: is there already; choose another output, or move it away")
+    reading, chosen = options.progress.iterate("reading"), {"states": options.states, "controls": options.controls}
+    proposal = propose(options.bags, reading, **chosen, like=options.like)
+    print_notes(options, proposal.warnings)
+    if output is None and not options.json:
+        print(proposal.text, end="")
+        return DONE
+    if output is not None:
+        try:
+            with whole_file(output) as stream:
+                stream.write(proposal.text.encode())
+        except OSError as error:
+            raise SignalError(f"{output}: cannot be written: {error.strerror}; choose another place") from None
+    if options.json:
+        proposed = {
+            kind: [
+                {"name": c.name, "topic": c.topic, "field": c.path, "unit": c.unit, "delay": c.delay} for c in of_kind
+            ]
+            for kind, of_kind in (("states", proposal.states), ("controls", proposal.controls))
+        }
+        more = {"members": list(proposal.members), "warnings": list(proposal.warnings), "text": proposal.text}
+        print_json({"output": output, **proposed, **more})
+        return DONE
+    alike = f"and the same for each of {shortlist(proposal.members, 12)}\n" if proposal.members else ""
+    options.progress.say(
+        f"states: {', '.join(c.name for c in proposal.states)}\n"
+        f"controls: {', '.join(c.name for c in proposal.controls) or 'none found'}\n{alike}"
+        f"signals file written to {output}: read it and edit it, it says why; then\n"
+        f"  uncertain-lti fit {shlex.join(options.bags)} --signals {shlex.quote(output)} --output machine.model.json"
+    )
+    return DONE
+
+
+# --- start -----------------------------------------------------------------------------------------------------------
+
+
+def _add_start(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser, " of the healthy machine")
-    parser.add_argument(
-        "--check", metavar="BAG", nargs="+", default=[], help="recordings to report on (default: those that are fitted)"
-    )
-    parser.add_argument(
-        "--output",
-        metavar="NAME",
-        default="machine",
-        help="write NAME.yaml, which is used as it is if it is there already, NAME.model.json and NAME.html "
-        "(default: machine)",
-    )
+    check = "recordings to report on (default: those that are fitted)"
+    parser.add_argument("--check", metavar="BAG", nargs="+", default=[], help=check)
+    output = "write NAME.yaml, which is used as it is if it is there already, NAME.model.json and NAME.html"
+    parser.add_argument("--output", metavar="NAME", default="machine", help=f"{output} (default: machine)")
     add_force(parser)
-    parser.add_argument("--json", action="store_true", help="print what init, fit and report say, as JSON")
+    add_json(parser, "print what init, fit and report say, as JSON")
 
 
-def run(options: argparse.Namespace) -> int:
+def run_start(options: argparse.Namespace) -> int:
     """Propose signals, fit, report, and print what puts the model on the robot; the exit status of the report."""
     from uncertain_lti.reports.findings_text import findings_text
     from uncertain_lti.reports.page_file import page_target
@@ -102,11 +203,11 @@ def _on_the_robot(model: str) -> str:
     )
 
 
-COMMAND = Command(
-    "start",
-    "from recordings of the healthy machine to a monitor: init, fit and report in one go",
-    add_arguments,
-    run,
-    quiet=SILENT,
-    verbose="report every scan of the data, and what took how long",
-)
+_TOPICS = "list the topics of a recording, and which fields could be signals"
+_INIT = "propose a signals file for a recording, with reasons, for you to edit"
+_INIT_QUIET = "print errors only (and without --output the file): no summary, no notes, no progress"
+_START = "from recordings of the healthy machine to a monitor: init, fit and report in one go"
+_SCANS = "report every scan of the data, and what took how long"
+TOPICS = Command("topics", _TOPICS, _add_topics, run_topics, "print the list and errors only: no notes, no progress")
+INIT = Command("init", _INIT, _add_init, run_init, _INIT_QUIET)
+START = Command("start", _START, _add_start, run_start, SILENT, _SCANS)

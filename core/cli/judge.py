@@ -1,0 +1,349 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Commands `check`, `report` and `plot`: judge recordings as the node would, and say, write or draw what came out."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from uncertain_lti.base.english import plural, shortlist
+from uncertain_lti.base.errors import BagError, ModelError, SignalError
+from uncertain_lti.cli.command import (
+    ALARM,
+    BAD_INPUT,
+    DONE,
+    SILENT,
+    UNKNOWN,
+    Command,
+    add_json,
+    add_model,
+    add_recordings,
+    complain,
+    load_model,
+    print_json,
+    print_notes,
+    print_summary,
+)
+
+if TYPE_CHECKING:
+    from uncertain_lti import UncertainLTI
+    from uncertain_lti.monitor.deployed import DeployedMonitor
+    from uncertain_lti.monitor.verdicts import Verdicts
+    from uncertain_lti.recordings.recording import Progress, Recording
+    from uncertain_lti.reports.interactive import Plotted
+    from uncertain_lti.sampling.sampler_arrays import Decisions
+
+
+def add_margin_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare another rule of containment than the model's."""
+    add, own = parser.add_argument, "(default: the model's)"
+    rules = f"alarm: the rules of another model file, or of JSON as its field alarm has them {own}"
+    add("--rules", metavar="FILE", help=rules)
+    add("--violations", type=int, help=f"alarm: number of violations {own}")
+    add("--window", type=int, help=f"alarm: number of last verdicts they are counted in {own}")
+    add("--margin", type=float, help=f"factor on the half-widths {own}")
+
+
+def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of the alarm rule, as the node has them as parameters."""
+    add_margin_arguments(parser)
+    add, first = parser.add_argument, "so many s after the first sample"
+    masked = "states, separated by commas, that never raise the alarm"
+    enable = "no alarm unless this holds: TOPIC FIELD OPERATOR NUMBER, such as '/engine/mode data == 3'"
+    grace = f"no alarm for {first}, a reset, and after --enable began to hold"
+    add("--masked", default="", metavar="STATES", help=masked)
+    add("--enable", default="", metavar="CONDITION", help=enable)
+    add("--grace", type=float, default=0.0, metavar="S", help=grace)
+    add("--latch", action="store_true", help="an alarm lasts to the end of the recording")
+    add("--from", dest="start", type=float, metavar="S", help=f"judge from {first} on")
+    add("--to", dest="stop", type=float, metavar="S", help=f"judge up to {first}")
+
+
+def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> DeployedMonitor:
+    """The monitor that the options of `add_rule_arguments` describe."""
+    from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.model.file import read_rules
+    from uncertain_lti.monitor.arming import Condition
+    from uncertain_lti.monitor.deployed import DeployedMonitor
+    from uncertain_lti.monitor.live_rule import listed_states
+
+    if options.rules is not None:
+        rules = read_rules(options.rules)
+        try:
+            model = model.replace(alarm=rules)
+        except ModelError as error:
+            raise ModelError(f"{options.rules}: does not fit the model: {error}") from None
+    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin, listed_states(options.masked))
+    condition = Condition.parse(options.enable)
+    return DeployedMonitor(monitor, condition, options.grace, options.latch, options.start, options.stop)
+
+
+def check_recording(
+    deployed: DeployedMonitor, recording: Recording, progress: Progress | None = None
+) -> tuple[Verdicts, Decisions]:
+    """Read one recording and judge it as the node would."""
+    from uncertain_lti.sampling.reading import read_as_fitted_with_decisions, read_field
+
+    signals = deployed.monitor.model.signals
+    transient, decisions = read_as_fitted_with_decisions(recording, signals, progress)
+    if (condition := deployed.condition) is None:
+        return deployed.check(transient), decisions
+    heard = read_field(recording, signals, decisions, condition.topic, condition.field)
+    return deployed.check(transient, *heard), decisions
+
+
+class Judged:
+    """Recordings judged one by one; of several, one that cannot be read is `refused` and keeps none of the others."""
+
+    def __init__(self, options: argparse.Namespace, model: UncertainLTI, bags: Sequence[Recording]) -> None:
+        self.options, self.bags = options, bags
+        self.deployed = deployed_monitor(options, model)
+        self.model = self.deployed.monitor.model  # with the rules that are judged by
+        self.refused: list[dict[str, str]] = []
+        self.alarm = False
+
+    def __iter__(self) -> Iterator[tuple[Recording, Verdicts, Decisions]]:
+        options = self.options
+        for bag in self.bags:
+            try:
+                verdicts, decisions = check_recording(self.deployed, bag, options.progress.iterate("reading"))
+            except (BagError, SignalError) as error:
+                if len(self.bags) == 1:
+                    raise
+                complain(options.command, str(error))
+                self.refused.append({"recording": str(bag.path), "error": str(error)})
+                continue
+            print_notes(options, verdicts.transient.notes)
+            self.alarm = self.alarm or bool(verdicts.alarm.any())
+            yield bag, verdicts, decisions
+        if self.refused:
+            all_of_them = plural(len(self.bags), "recording")
+            complain(options.command, f"{len(self.refused)} of {all_of_them} not checked, as said above")
+
+    @property
+    def status(self) -> int:
+        """Exit status of what was judged so far."""
+        return ALARM if self.alarm else BAD_INPUT if self.refused else DONE
+
+
+def _judged(options: argparse.Namespace) -> Judged:
+    """Recordings judged by the model that is named first."""
+    from uncertain_lti.recordings.formats import group_recordings
+
+    model = load_model(options.model)
+    return Judged(options, model, group_recordings(options.bags, layout=model.signals.table))
+
+
+# --- check -----------------------------------------------------------------------------------------------------------
+
+
+def _add_check(parser: argparse.ArgumentParser) -> None:
+    add_model(parser, published=True)
+    add_recordings(parser)
+    add_rule_arguments(parser)
+    add_json(parser, "print JSON with a verdict per sample")
+    copy = "write a copy of the recording with bounds, utilisation and flags on topics of their own; for several "
+    parser.add_argument("--write", metavar="OUT.mcap", help=f"{copy}recordings a folder")
+
+
+def run_check(options: argparse.Namespace) -> int:
+    """Check each recording and return whether the alarm was raised."""
+    from uncertain_lti.reports.check_data import check_data, outcome
+    from uncertain_lti.reports.check_text import check_text
+
+    judged = _judged(options)
+    model, bags, deployed = judged.model, judged.bags, judged.deployed
+    copies: dict[Recording, Path] = {}
+    if options.write is not None:
+        from uncertain_lti.reports.annotate import annotate, targets
+
+        copies = dict(zip(bags, targets(options.write, bags), strict=True))
+    results = []
+    for bag, verdicts, decisions in judged:
+        data = check_data(model, verdicts, samples=options.json)
+        results.append(data)
+        print_summary(options, check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
+        if (copy := copies.get(bag)) is not None:
+            writing = options.progress.iterate("writing")
+            made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, deployed.monitor.rule, writing)
+            print_notes(options, made.notes)
+            data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
+            messages = plural(made.messages, "message")
+            print_summary(options, f"{messages} and the verdicts below {made.topics} written to {made.path}")
+    status = judged.status
+    if status == DONE and any(r["outcome"] == "unknown" for r in results):
+        status = UNKNOWN
+    if options.json:
+        of_all = "unknown" if status == BAD_INPUT else outcome(results)
+        ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}
+        about: dict[str, Any] = {"model": options.model, "deployed": deployed.words(), **ended}
+        print_json({**about, "recordings": results, "not_checked": judged.refused})
+    return status
+
+
+# --- report ----------------------------------------------------------------------------------------------------------
+
+
+def _add_report(parser: argparse.ArgumentParser) -> None:
+    add_model(parser, published=True)
+    add_recordings(parser, " to check against it")
+    add_rule_arguments(parser)
+    parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
+    add_json(parser, "print the same facts as JSON")
+
+
+def run_report(options: argparse.Namespace) -> int:
+    """Write the page or print its facts, and return whether the alarm was raised."""
+    from uncertain_lti.reports.findings import findings
+    from uncertain_lti.reports.findings_text import findings_text
+    from uncertain_lti.reports.page_file import page_target, write_page
+
+    judged = _judged(options)
+    output = options.output or (None if options.json else "report.html")
+    if output is not None:
+        page_target(output, options.model, judged.bags)
+    checked = [verdicts for _, verdicts, _ in judged]
+    if not checked:
+        return BAD_INPUT
+    facts = findings(judged.model, options.model, checked, judged.deployed.monitor.rule, judged.deployed.words())
+    print_summary(options, findings_text(facts))
+    if output is not None:
+        from uncertain_lti.reports.html import html_report
+
+        write_page(output, html_report(judged.model, checked, facts, options.progress.iterate("drawing", "sections")))
+        print_summary(options, f"report written to {output}")
+    if options.json:
+        print_json({**facts, "not_checked": judged.refused})
+    return judged.status
+
+
+# --- plot ------------------------------------------------------------------------------------------------------------
+
+
+def _add_plot(parser: argparse.ArgumentParser) -> None:
+    about = "a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
+    add_recordings(parser, about=f"{about}(what happened, and when)", metavar="WHAT")
+    parser.add_argument("--signals", metavar="FILE", help="signals file: draw its signals, not every number that moves")
+    to = "page (.html, with zoom and hover) or image (.png, .svg, .pdf) to write (default: plot.html, of a model alone "
+    parser.add_argument("--output", metavar="FILE", help=f"{to}plot.png)")
+    add_rule_arguments(parser)
+    add_json(parser, "print the path, and whether the alarm was raised, as JSON")
+
+
+def run_plot(options: argparse.Namespace) -> int:
+    """Write the plot."""
+    from uncertain_lti.recordings.formats import group_recordings
+    from uncertain_lti.reports.page_file import HOLDS, page_target
+
+    named = _names_model(options.bags[0])
+    model = load_model(options.bags[0]) if named else None
+    paths = options.bags[1:] if named else options.bags
+    if model is not None and options.signals:
+        raise ModelError(f"--signals {options.signals}: the model has its signals; leave the option out")
+    bags = group_recordings(paths, layout=None if model is None else model.signals.table) if paths else []
+    output = Path(options.output or ("plot.html" if bags else "plot.png"))
+    page = output.suffix == ".html"
+    if output.suffix not in HOLDS:
+        raise BagError(f"{output}: a plot is a page or an image; end the name in .html, .png, .svg or .pdf")
+    if page and not bags:
+        raise ModelError(f"{output}: a model alone is drawn as an image; end the name in .png, .svg or .pdf")
+    if not page and model is None:
+        raise BagError(f"{output}: recordings without a model are drawn as a page; end the name in .html")
+    if not page and len(bags) > 1:
+        raise BagError(f"{output}: an image shows one recording; name one, or end the name in .html")
+    page_target(output, options.bags[0] if named else "", bags)
+    status = DONE
+    if model is None:
+        _write_page("Recorded", bags, _recorded(options, bags), output)
+    elif bags:
+        status = _plot_judged(options, Judged(options, model, bags), output)
+    else:
+        from uncertain_lti.reports.figures import matrices_figure, save
+
+        save(matrices_figure(model), output, 200)
+    print_summary(options, f"plot written to {output}")
+    if options.json:
+        recordings = [str(bag.path) for bag in bags]
+        print_json({"plot": str(output), "recordings": recordings, "alarm": status == ALARM, "exit_status": status})
+    return status
+
+
+def _names_model(path: str) -> bool:
+    """Whether the first word names a model: the published one, or a file that begins as JSON does."""
+    if not os.path.exists(path):
+        return path == "leibov2006" or path.endswith(".json")
+    if not os.path.isfile(path):
+        return False
+    with open(path, "rb") as stream:
+        return stream.read(100).lstrip()[:1] == b"{"
+
+
+def _plot_judged(options: argparse.Namespace, judged: Judged, output: Path) -> int:
+    plotted: list[Plotted] = []
+    checked = False
+    for _, verdicts, _ in judged:
+        checked = True
+        if output.suffix == ".html":
+            from uncertain_lti.reports.interactive import plotted_check
+
+            plotted.append(plotted_check(judged.model, verdicts, len(judged.bags)))
+        else:
+            from uncertain_lti.reports.figures import alarm_figure, save
+
+            save(alarm_figure(judged.model, verdicts), output, 200)
+    if not checked:
+        raise BagError("no recording could be checked, so nothing is drawn; name one that has the topics of the model")
+    if plotted:
+        _write_page(os.path.basename(options.bags[0]), judged.bags, plotted, output)
+    return judged.status
+
+
+def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Plotted]:
+    from uncertain_lti.reports.interactive import plotted_fields, plotted_transient
+
+    if options.signals:
+        from uncertain_lti import read_transients
+
+        reading = options.progress.iterate("reading")
+        runs = read_transients([bag.path for bag in bags], options.signals, progress=reading)
+        for transient in runs:
+            print_notes(options, transient.notes)
+        return [plotted_transient(transient, len(runs)) for transient in runs]
+    from uncertain_lti.proposal.reading import moving_numbers
+
+    plotted = []
+    for bag in bags:
+        fields, left = moving_numbers(bag, options.progress.iterate("reading"))
+        print_notes(options, bag.warnings)
+        if not fields:
+            raise BagError(f"{bag.path}: no number in it moves; `uncertain-lti topics {bag.path}` lists what it holds")
+        note = "Every number that moves, over the time of arrival." + f" Left out: {shortlist(left, 8)}." * bool(left)
+        plotted.append(plotted_fields(str(bag.path), fields, note, len(bags)))
+    return plotted
+
+
+def _write_page(title: str, bags: Sequence[Recording], plotted: list[Plotted], output: Path) -> None:
+    from uncertain_lti.reports.interactive import interactive_page
+    from uncertain_lti.reports.page_file import write_page
+
+    names = [os.path.basename(bag.path) or str(bag.path) for bag in bags]
+    write_page(output, interactive_page(f"{title}: {shortlist(names, 1)}", plotted))
+
+
+_LONG = "say what took how long"
+_REPORT = "write a page that says whether a model may be relied on, and what happened in recordings"
+_PLOT = "draw a model, recordings, or what happened in recordings by a model"
+CHECK = Command("check", "check a recording against a model", _add_check, run_check, quiet=SILENT, verbose=_LONG)
+REPORT = Command("report", _REPORT, _add_report, run_report, quiet=SILENT, verbose=_LONG)
+PLOT = Command("plot", _PLOT, _add_plot, run_plot, quiet=SILENT, verbose=_LONG)
